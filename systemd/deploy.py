@@ -1,8 +1,9 @@
 """Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
 
-A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and golden sweeps with
-the box's runtime, and the bundle runs on trial from the next start on. If the delivery is interrupted at any
-moment, the box has the old bundle or the new one; run the command again to finish.
+A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and
+golden sweeps with the box's runtime, and the bundle runs on trial from the next start on. If the
+delivery is interrupted at any moment, the box has the old bundle or the new one; run the command
+again to finish.
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ from appliance.deployment import signature
 from appliance.inference.classifier import Classifier
 
 READY_S, STARTS = 60, 5
-"""After three failed starts a box goes back by itself; one that is not READY after five will not be."""
+"""After three failed starts a box goes back by itself; one that is not READY after five will not
+be."""
 LIMIT_S = 300
 """Longest time for all of one box."""
 
 
 @dataclass(frozen=True)
 class BundleArchive:
-    """A bundle as it is copied to boxes. sha: its name in their stores. name: for a person. archive: a tar of its
-    files."""
+    """A bundle as it is copied to boxes. sha: its name in their stores. name: for a person.
+    archive: a tar of its files."""
 
     sha: str
     name: str
@@ -43,10 +45,16 @@ def main(argv: list[str] | None = None) -> int:
     """Deliver to all boxes; the exit code."""
     parser = options("Delivers a signed bundle to boxes, where it runs on trial.", LIMIT_S)
     parser.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    parser.add_argument("--signers", type=Path, metavar="FILE", help="check the signature here, too, by this file")
-    parser.add_argument("--shadow", action="store_true", help="as the candidate, which classifies beside")
     parser.add_argument(
-        "--other-skin", action="store_true", help="another skin than the one that streams there comes with it"
+        "--signers", type=Path, metavar="FILE", help="check the signature here, too, by this file"
+    )
+    parser.add_argument(
+        "--shadow", action="store_true", help="as the candidate, which classifies beside"
+    )
+    parser.add_argument(
+        "--other-skin",
+        action="store_true",
+        help="another skin than the one that streams there comes with it",
     )
     args = parser.parse_args(argv)
     try:
@@ -58,8 +66,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def checked(folder: Path, signers: Path | None) -> BundleArchive:
-    """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises ApplianceError where it does
-    not."""
+    """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises
+    ApplianceError where it does not."""
     files = bundle.files(folder)
     loaded = bundle.from_files(files, str(folder))
     Classifier(loaded, SystemClock()).self_test()
@@ -97,12 +105,16 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
 
 
 def where(box: FleetBox) -> tuple[str, str]:
-    """Paths on the box: the folder of its store and its status file. Raises Failed where it would not use a delivered
-    bundle."""
+    """Paths on the box: the folder of its store and its status file. Raises Failed where it would
+    not use a delivered bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
-    settings = tomllib.loads(box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} config"))
+    settings = tomllib.loads(
+        box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} config")
+    )
     if own := settings["classifier"]["bundle"]:
-        raise Failed(f"its settings name a bundle, classifier.bundle = {own!r}; take that out of them first")
+        raise Failed(
+            f"its settings name a bundle, classifier.bundle = {own!r}; take that out of them first"
+        )
     return str(settings["store"]["folder"]), str(settings["store"]["status"])
 
 
@@ -110,15 +122,24 @@ def _runs(box: FleetBox, packed: BundleArchive, store: str, status: str) -> bool
     """Whether the box runs the bundle now, and will after a restart."""
     look = f"readlink {store}/current && cat {status}"
     link, _, text = box.run("asking what runs", f"{look} || true", user="root").partition("\n")
-    return link == f"bundles/{packed.sha}" and bool(text) and json.loads(text)["bundle"] == packed.sha[:8]
+    return (
+        link == f"bundles/{packed.sha}"
+        and bool(text)
+        and json.loads(text)["bundle"] == packed.sha[:8]
+    )
 
 
 def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) -> str:
-    """What the box does with the bundle now, in words. Raises Failed where it has gone back already."""
-    listed = json.loads(box.run("asking for its bundles", f"{PALPATE} bundles --json", user="palpate"))
+    """What the box does with the bundle now, in words. Raises Failed where it has gone back
+    already."""
+    listed = json.loads(
+        box.run("asking for its bundles", f"{PALPATE} bundles --json", user="palpate")
+    )
     entry = next((one for one in listed if one["sha"] == packed.sha), None)
     if entry is None or entry["role"] not in ("current", "on trial", "candidate"):
-        raise Failed(f"the box went back to what it had: {entry['detail'] if entry else 'the bundle is gone'}")
+        raise Failed(
+            f"the box went back to what it had: {entry['detail'] if entry else 'the bundle is gone'}"
+        )
     if shadow != (entry["role"] == "candidate"):
         raise Failed(f"the bundle is {entry['role']} there; somebody else was at work, too")
     role = f"{entry['role']}: {entry['detail']}" if entry["detail"] else entry["role"]

@@ -1,5 +1,5 @@
-"""The key with which a box signs the labels that it enrols. In: a folder. Out: commands that make key and signer there,
-where they are missing (appliance/deployment/enrolment_key.py)."""
+"""The key with which a box signs the labels that it enrols. In: a folder. Out: commands that make
+key and signer there, where they are missing (appliance/deployment/enrolment_key.py)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ FOLDER = "/etc/palpate/enrolment"
 def make(folder: str = FOLDER, user: str = "palpate", group: str = "palpate") -> str:
     """Commands for root: `key`, which `user` alone may read, and `signer`, root's, who is believed.
 
-    Where only the signer is left, no other key is made: the labels that were enrolled before would not be believed any more.
+    Where only the signer is left, no other key is made: the labels that were enrolled before would
+    not be believed any more.
     """
     return f"""(
 install -d -m 750 -g {group} {folder}

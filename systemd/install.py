@@ -1,9 +1,11 @@
-"""Installs or upgrades the runtime on bare Debian boxes. In: which boxes, this checkout. Out: a line for each box.
+"""Installs or upgrades the runtime on bare Debian boxes. In: which boxes, this checkout. Out: a
+line for each box.
 
-A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules, board files, manual.
-All paths outside lead into it through the link /opt/palpate, which is swapped by one rename when the folder is complete
-and has passed its self-test. So after an interruption at any moment a box starts with the old runtime and the old unit,
-or with the new ones; run the command again to finish. The boxes need internet only for missing Debian packages.
+A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules,
+board files, manual. All paths outside lead into it through the link /opt/palpate, which is swapped
+by one rename when the folder is complete and has passed its self-test. So after an interruption at
+any moment a box starts with the old runtime and the old unit, or with the new ones; run the command
+again to finish. The boxes need internet only for missing Debian packages.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from appliance.core.config import boards
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
 PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client", "openssl")
-"""Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen), the page's certificate."""
+"""Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen), the page's
+certificate."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """Names of an architecture: by Debian, and in Python's wheels."""
 LINK = "/opt/palpate"
@@ -36,7 +39,8 @@ PATHS = {
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
     "firmware_config/70-palpate.rules": "/etc/udev/rules.d/70-palpate.rules",
     **{
-        f"firmware_config/{f.name}": f"/etc/palpate/{f.name}" for f in sorted((ROOT / "firmware_config").glob("*.toml"))
+        f"firmware_config/{f.name}": f"/etc/palpate/{f.name}"
+        for f in sorted((ROOT / "firmware_config").glob("*.toml"))
     },
     "docs/manual.md": "/usr/share/doc/palpate/manual.md",
     "docs/manual": "/usr/share/doc/palpate/manual",
@@ -49,7 +53,10 @@ PATHS = {
 SKINS = "firmware_config/skins"
 """The delivered skin profiles; each is linked by itself, since there may be others beside them."""
 LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS.items()} | {
-    **{f"/etc/palpate/skins/{f.name}": f"{LINK}/share/palpate/skins/{f.name}" for f in (ROOT / SKINS).glob("*.toml")},
+    **{
+        f"/etc/palpate/skins/{f.name}": f"{LINK}/share/palpate/skins/{f.name}"
+        for f in (ROOT / SKINS).glob("*.toml")
+    },
     "/etc/systemd/system/multi-user.target.wants/palpate.service": "../palpate.service",
     "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
 }
@@ -66,12 +73,13 @@ try:
 except errors.ApplianceError as e:
     sys.exit(str(e))
 """
-"""Program that a new release must run without an error: reads the settings, and runs the golden sweeps of the packaged
-bundle and of the one in use."""
+"""Program that a new release must run without an error: reads the settings, and runs the golden
+sweeps of the packaged bundle and of the one in use."""
 PACKAGES_S = BUILD_S = 600
 """Limits for installing packages and for building the environment, on a slow card."""
 SETUP_S = 120
-"""Limit for keys and certificates to be made and flushed to the disk, and for the self-test, on a slow board."""
+"""Limit for keys and certificates to be made and flushed to the disk, and for the self-test, on a
+slow board."""
 READY_S, STARTS = 40, 2
 """A release has failed that is not READY after so many seconds, or has ended so often."""
 LIMIT_S = 1800
@@ -81,9 +89,15 @@ LIMIT_S = 1800
 def main(argv: list[str] | None = None) -> int:
     """Install on all boxes; the exit code."""
     parser = options("Installs or upgrades the runtime on bare Debian boxes.", LIMIT_S)
-    parser.add_argument("--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5")
-    parser.add_argument("--signers", type=Path, metavar="FILE", help="allowed_signers: whose bundles the box takes")
-    parser.add_argument("--wheel", type=Path, default=WHEEL, help="of this checkout (made by make wheel)")
+    parser.add_argument(
+        "--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5"
+    )
+    parser.add_argument(
+        "--signers", type=Path, metavar="FILE", help="allowed_signers: whose bundles the box takes"
+    )
+    parser.add_argument(
+        "--wheel", type=Path, default=WHEEL, help="of this checkout (made by make wheel)"
+    )
     args = parser.parse_args(argv)
     for file in (args.wheel, *([args.signers] if args.signers else [])):
         if not file.is_file():
@@ -95,14 +109,19 @@ def main(argv: list[str] | None = None) -> int:
     signers = args.signers.read_text() if args.signers else ""
     with tempfile.TemporaryDirectory() as folder:
         archives = ReleaseArchives(args.wheel, [*PATHS, SKINS], Path(folder))
-        return each(args, lambda box: install(box, archives, known_board(box.data("board", args.board)), signers))
+        return each(
+            args,
+            lambda box: install(box, archives, known_board(box.data("board", args.board)), signers),
+        )
 
 
 def known_board(board: str) -> str:
     """`board`, "" for none. Raises Failed where no board file of this checkout has that name."""
     known = boards(ROOT / "firmware_config")
     if board and board not in known:
-        raise Failed(f"BOARD={board} has no file firmware_config/board-{board}.toml; boards there: {', '.join(known)}")
+        raise Failed(
+            f"BOARD={board} has no file firmware_config/board-{board}.toml; boards there: {', '.join(known)}"
+        )
     return board
 
 
@@ -110,7 +129,9 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
     """Install this release on one box, whatever it has now; the line for this box."""
     machine = survey(box)
     packages(box)
-    python = box.run("asking for Python", "python3 -c 'import platform; print(platform.python_version())'")
+    python = box.run(
+        "asking for Python", "python3 -c 'import platform; print(platform.python_version())'"
+    )
     if tuple(map(int, python.split(".")[:2])) < (3, 11):
         raise Failed(f"its Python is {python}; Palpate needs 3.11 or later, which Debian 12 has")
     name, archive = archives.of(machine, python)
@@ -119,8 +140,16 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         box.report(f"copying {name}, {archive.stat().st_size / 1e6:.0f} MB")
         box.put(archive, f".palpate-{name}.tar")
         box.report("building its environment")
-        box.run("building the environment", build(release), user="root", stdin=f".palpate-{name}.tar", limit_s=BUILD_S)
-    box.run("tidying up", "rm -f .palpate-*.tar")  # of an install that was cut after it had built, too
+        box.run(
+            "building the environment",
+            build(release),
+            user="root",
+            stdin=f".palpate-{name}.tar",
+            limit_s=BUILD_S,
+        )
+    box.run(
+        "tidying up", "rm -f .palpate-*.tar"
+    )  # of an install that was cut after it had built, too
     setup = prepare(release, board, signers)
     said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:
@@ -130,40 +159,63 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
 
 
 def survey(box: FleetBox) -> str:
-    """The box's architecture as wheels name it. Raises Failed where Palpate does not run on such a box."""
+    """The box's architecture as wheels name it. Raises Failed where Palpate does not run on such a
+    box."""
     output = box.run(
-        "looking at its system", '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true'
+        "looking at its system",
+        '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true',
     )
     system, _, arch = output.partition("\n")
     if arch not in MACHINES:
-        raise Failed(f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 or amd64")
+        raise Failed(
+            f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 or amd64"
+        )
     # systemd reads units before it mounts anything, and the unit is in the release
     if box.run("looking at /opt", "stat -c %m /opt") != "/":
-        raise Failed("/opt is a file system of its own there; it must be part of the root file system")
+        raise Failed(
+            "/opt is a file system of its own there; it must be part of the root file system"
+        )
     if box.run(f"looking at {LINK}", f"test -e {LINK} && test ! -L {LINK} && echo folder || true"):
-        raise Failed(f"{LINK} is a folder there, not the link that this command swaps; move it away first")
+        raise Failed(
+            f"{LINK} is a folder there, not the link that this command swaps; move it away first"
+        )
     return MACHINES[arch]
 
 
 def packages(box: FleetBox) -> None:
-    """Install the Debian packages that are missing. Raises Failed where they cannot be installed."""
+    """Install the Debian packages that are missing. Raises Failed where they cannot be
+    installed."""
     status = "dpkg-query -W -f '${db:Status-Status} ${binary:Package}\\n' " + " ".join(PACKAGES)
     output = box.run("looking for packages", f"{status} 2>/dev/null || true")
-    present = {line.split()[1].split(":")[0] for line in output.splitlines() if line.startswith("installed ")}
+    present = {
+        line.split()[1].split(":")[0]
+        for line in output.splitlines()
+        if line.startswith("installed ")
+    }
     missing = " ".join(name for name in PACKAGES if name not in present)
     if not missing:
         return
     box.report(f"installing {missing}")
     get = f"DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=120 install --no-install-recommends {missing}"
     try:
-        box.run("apt-get", f"{get} || {{ apt-get update -q && {get}; }}", user="root", limit_s=PACKAGES_S)
+        box.run(
+            "apt-get",
+            f"{get} || {{ apt-get update -q && {get}; }}",
+            user="root",
+            limit_s=PACKAGES_S,
+        )
     except Failed as e:
-        mirrors = "" if remedy(str(e)) else "; give the box a way to Debian's mirrors, or install it there"
+        mirrors = (
+            ""
+            if remedy(str(e))
+            else "; give the box a way to Debian's mirrors, or install it there"
+        )
         raise Failed(f"{missing} cannot be installed: {e}{mirrors}") from e
 
 
 def build(release: str) -> str:
-    """Commands that build a release from the archive on standard input, write it to the disk, and stamp it as complete.
+    """Commands that build a release from the archive on standard input, write it to the disk, and
+    stamp it as complete.
 
     The commands of an earlier install, whose desktop died, may still run: a lock waits for them.
     """
@@ -180,8 +232,8 @@ sync -f {release}"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
-    """Commands that set up users, folders, settings and links outside the release, and print a line for each file that
-    was there and for a changed board. The old release can run with them, too."""
+    """Commands that set up users, folders, settings and links outside the release, and print a line
+    for each file that was there and for a changed board. The old release can run with them, too."""
     share = f"{release}/share/palpate"
     lines = [
         "set -e; umask 022",
@@ -223,21 +275,26 @@ def _put(file: str, text: str) -> str:
 
 
 def self_test(release: str) -> str:
-    """The command that runs SELF_TEST in the new runtime as the service's user, with the settings and bundles of the
-    box."""
+    """The command that runs SELF_TEST in the new runtime as the service's user, with the settings
+    and bundles of the box."""
     as_user = "setpriv --reuid=palpate --regid=palpate --init-groups"
     return f"{as_user} {release}/bin/python -I -c {shlex.quote(SELF_TEST)} {release}/share/palpate"
 
 
 def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
-    """Swap the link and start the service from it, unless that is done already; the line for this box.
+    """Swap the link and start the service from it, unless that is done already; the line for this
+    box.
 
     restart: start it even if this release runs, since its settings have changed.
     """
     before = box.run("looking for the old release", f"readlink {LINK} || true")
     runs = f"""pid=$(systemctl show palpate -p MainPID --value)
 [ "$pid" != 0 ] && grep -q {release}/ /proc/$pid/maps && echo runs || true"""
-    if not restart and before == Path(release).name and box.run("looking at the process", runs, user="root"):
+    if (
+        not restart
+        and before == Path(release).name
+        and box.run("looking at the process", runs, user="root")
+    ):
         return f"{name} runs already"
     if before != Path(release).name:
         box.run("swapping the link", swap(release, before), user="root")
@@ -246,9 +303,15 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
     except Failed as e:
         raise Failed(f"{e}{_swap_back(box, release)}") from e
     # they are of the release before until then; what is off stays off
-    box.run("restarting page and bridges", "systemctl try-restart palpate-watch 'palpate-bridge@*'", user="root")
+    box.run(
+        "restarting page and bridges",
+        "systemctl try-restart palpate-watch 'palpate-bridge@*'",
+        user="root",
+    )
     keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
-    tidy = f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
+    tidy = (
+        f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
+    )
     box.run("removing older releases", tidy, user="root", limit_s=120)
     if not ready:
         return f"{name} installed; it waits: {box.result['waits']}"
@@ -278,10 +341,13 @@ mv -T {LINK}.new {LINK}; sync -f /opt"""
 
 
 def _start(box: FleetBox) -> bool:
-    """Let systemd and udev read the files behind the link, and start the service; see FleetBox.restart."""
+    """Let systemd and udev read the files behind the link, and start the service; see
+    FleetBox.restart."""
     udev = "udevadm control --reload && udevadm trigger"
     box.run(
-        "reading the unit", f"systemctl daemon-reload; ! command -v udevadm > /dev/null || {{ {udev}; }}", user="root"
+        "reading the unit",
+        f"systemctl daemon-reload; ! command -v udevadm > /dev/null || {{ {udev}; }}",
+        user="root",
     )
     return box.restart(READY_S, STARTS)
 

@@ -1,8 +1,8 @@
-"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for each architecture and
-Python.
+"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for
+each architecture and Python.
 
-Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need no internet for
-them.
+Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need
+no internet for them.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ GLIBC = 36
 
 
 class ReleaseArchives:
-    """What is copied to a box: one archive for each architecture and Python, made when the first box needs it.
+    """What is copied to a box: one archive for each architecture and Python, made when the first
+    box needs it.
 
-    wheel: of Palpate. shares: files and folders of this checkout that are copied as well. folder: for the archives.
+    wheel: of Palpate. shares: files and folders of this checkout that are copied as well. folder:
+    for the archives.
     """
 
     def __init__(self, wheel: Path, shares: Sequence[str], folder: Path) -> None:
@@ -53,8 +55,12 @@ class ReleaseArchives:
         lock = locked(LOCK.read_text(), python, machine)
         content = hashlib.sha256(f"{python.rpartition('.')[0]}\n{lock}".encode())
         with zipfile.ZipFile(self._wheel) as wheel:  # not the file itself: it has dates in it
-            content.update(repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode())
-        for file in sorted(path for share in self._shares for path in (share, *share.rglob("*")) if path.is_file()):
+            content.update(
+                repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode()
+            )
+        for file in sorted(
+            path for share in self._shares for path in (share, *share.rglob("*")) if path.is_file()
+        ):
             content.update(f"{file.relative_to(ROOT)}\n".encode() + file.read_bytes())
         name = f"{__version__}-{content.hexdigest()[:8]}"
         archive = self._folder / f"{name}-{machine}.tar"
@@ -73,11 +79,13 @@ def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 def locked(text: str, python: str, machine: str) -> str:
-    """The lock without the lines for another Python or architecture: pip evaluates markers for the Python it runs on,
-    also when it fetches for another."""
+    """The lock without the lines for another Python or architecture: pip evaluates markers for the
+    Python it runs on, also when it fetches for another."""
     box = {
-        "python_full_version": python, "python_version": python.rpartition(".")[0], "platform_machine": machine,
-    }  # fmt: skip
+        "python_full_version": python,
+        "python_version": python.rpartition(".")[0],
+        "platform_machine": machine,
+    }
     kept = []
     for block in re.split(r"(?m)^(?=\w)", text):
         first, rest = block.partition("\\\n")[::2]
@@ -89,9 +97,15 @@ def locked(text: str, python: str, machine: str) -> str:
 
 
 def fetch(lock: str, python: str, machine: str) -> Path:
-    """A folder with the lock and its wheels, kept for the next time. Raises Failed where pip cannot fetch them."""
+    """A folder with the lock and its wheels, kept for the next time. Raises Failed where pip cannot
+    fetch them."""
     short = python.rpartition(".")[0]
-    target = ROOT / "build" / "wheels" / f"{machine}-{short}-{hashlib.sha256(lock.encode()).hexdigest()[:8]}"
+    target = (
+        ROOT
+        / "build"
+        / "wheels"
+        / f"{machine}-{short}-{hashlib.sha256(lock.encode()).hexdigest()[:8]}"
+    )
     if target.exists():
         return target
     tags = [f"--platform=manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
@@ -99,11 +113,30 @@ def fetch(lock: str, python: str, machine: str) -> Path:
     with storage.folder(target) as part:
         (part / "requirements.lock").write_text(lock)
         command: tuple[str | Path, ...] = (
-            sys.executable, "-m", "pip", "--disable-pip-version-check", "-q", "download", "--no-deps",
-            "--only-binary", ":all:", "--implementation", "cp", "--python-version", short, *tags,
-            f"--platform=manylinux2014_{machine}", "--require-hashes", "-r", part / "requirements.lock", "-d", part,
-        )  # fmt: skip
+            sys.executable,
+            "-m",
+            "pip",
+            "--disable-pip-version-check",
+            "-q",
+            "download",
+            "--no-deps",
+            "--only-binary",
+            ":all:",
+            "--implementation",
+            "cp",
+            "--python-version",
+            short,
+            *tags,
+            f"--platform=manylinux2014_{machine}",
+            "--require-hashes",
+            "-r",
+            part / "requirements.lock",
+            "-d",
+            part,
+        )
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise Failed(f"wheels for {machine}, Python {short}: {done.stderr.strip().splitlines()[-1]}")
+            raise Failed(
+                f"wheels for {machine}, Python {short}: {done.stderr.strip().splitlines()[-1]}"
+            )
     return target

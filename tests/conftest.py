@@ -48,17 +48,29 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             commands=None,
             capture=None,
         ) -> Rigged:
-            simulated = simulated or devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+            simulated = simulated or devices.build(
+                skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim"
+            )
             settings = config.load(None, sets, site=NO_SITE)
             far_end, name = stack.enter_context(pseudo_terminal.pair())
-            port = SerialSink(replace(settings.serial, port=name), simulated.clock, simulated.source)
+            port = SerialSink(
+                replace(settings.serial, port=name), simulated.clock, simulated.source
+            )
             kept: list[Sweep] = []
             watching = [OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers]
             if commands is None:
-                box = assembly.box(settings, model, simulated, port, stack, observers=watching, capture=capture)
+                box = assembly.box(
+                    settings, model, simulated, port, stack, observers=watching, capture=capture
+                )
             else:  # a box that records
                 box = assembly.recorder(
-                    settings, simulated.format, simulated, port, stack, observers=watching, commands=commands
+                    settings,
+                    simulated.format,
+                    simulated,
+                    port,
+                    stack,
+                    observers=watching,
+                    commands=commands,
                 )
             return Rigged(box, simulated, far_end, port, kept=kept)
 

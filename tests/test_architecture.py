@@ -1,4 +1,5 @@
-"""What a machine can check of the architecture: imports, the content of the wheel, the form of modules, tests and texts."""
+"""What a machine can check of the architecture: imports, the content of the wheel, the form of
+modules, tests and texts."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ import pytest
 from tests.factories import emulated_machines
 from tests.factories.paths import ROOT
 
-SOURCES = sorted([*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")])
+SOURCES = sorted(
+    [*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")]
+)
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
 GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cuts")]
 BOX = [p for p in SOURCES if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
@@ -50,9 +53,13 @@ def imports(path: Path) -> set[str]:
 
 
 def module_imports(*packages: str) -> dict[str, set[str]]:
-    """For each module of the packages those of them that it imports, also under TYPE_CHECKING and in functions."""
+    """For each module of the packages those of them that it imports, also under TYPE_CHECKING and
+    in functions."""
     paths = [path for name in packages for path in ROOT.glob(f"{name}/**/*.py")]
-    dotted = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
+    dotted = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in paths
+    }
     found: dict[str, set[str]] = {name: set() for name in dotted}
     for name, path in dotted.items():
         for node in ast.walk(ast.parse(path.read_text())):
@@ -65,11 +72,18 @@ def module_imports(*packages: str) -> dict[str, set[str]]:
 
 
 def circles(graph: dict[str, set[str]]) -> list[str]:
-    """The modules that can be reached from themselves, with the imports that lead on to such modules."""
+    """The modules that can be reached from themselves, with the imports that lead on to such
+    modules."""
     left = graph
-    while True:  # what imports nothing of the rest, or is imported by nothing of it, is in no circle
+    while (
+        True
+    ):  # what imports nothing of the rest, or is imported by nothing of it, is in no circle
         imported = set().union(*left.values())
-        kept = {name: names & left.keys() for name, names in left.items() if names & left.keys() and name in imported}
+        kept = {
+            name: names & left.keys()
+            for name, names in left.items()
+            if names & left.keys() and name in imported
+        }
         if kept == left:
             return [f"{name} -> {', '.join(sorted(names))}" for name, names in sorted(kept.items())]
         left = kept
@@ -77,7 +91,8 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 
 @pytest.mark.slow
 def test_no_module_imports_itself_through_others():
-    """No circle between modules, type hints and imports in functions included; one that is there would be found."""
+    """No circle between modules, type hints and imports in functions included; one that is there
+    would be found."""
     graph = module_imports("appliance", "train")
     assert "appliance.core.errors" in graph["appliance.deployment.store"]
     assert circles(graph) == []
@@ -93,11 +108,16 @@ def test_packages_import_downwards_only():
 
 @pytest.mark.parametrize("path", BOX, ids=lambda p: str(p.relative_to(ROOT)))
 def test_the_box_imports_five_libraries(path: Path):
-    """Only the five libraries of the design, and itself by full names; those of an extra only in the part that it is for."""
-    extras = (names for part, names in EXTRAS.items() if path.is_relative_to(ROOT / "appliance" / part))
+    """Only the five libraries of the design, and itself by full names; those of an extra only in
+    the part that it is for."""
+    extras = (
+        names for part, names in EXTRAS.items() if path.is_relative_to(ROOT / "appliance" / part)
+    )
     extra = set().union(*extras)
     for name in imports(path):
-        assert name.split(".")[0] in ALLOWED | extra | set(sys.stdlib_module_names), f"{path.name} imports {name}"
+        assert name.split(".")[0] in ALLOWED | extra | set(sys.stdlib_module_names), (
+            f"{path.name} imports {name}"
+        )
 
 
 @pytest.mark.parametrize("path", TESTS, ids=lambda p: str(p.relative_to(ROOT)))
@@ -124,13 +144,16 @@ def test_the_simulator_is_not_loaded_unless_named():
 
 
 def test_onnxruntime_starts_no_thread_of_its_own():
-    """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one thread."""
+    """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one
+    thread."""
     code = (
         "import os; from appliance.bundle import bundle; from appliance.core import clock; from appliance.inference import classifier; import onnxruntime;"
         "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); box.self_test();"
         "print(len(os.listdir('/proc/self/task')))"
     )
-    env = {k: v for k, v in os.environ.items() if not k.startswith("ORT_")} | {"OPENBLAS_NUM_THREADS": "1"}
+    env = {k: v for k, v in os.environ.items() if not k.startswith("ORT_")} | {
+        "OPENBLAS_NUM_THREADS": "1"
+    }
     assert run(sys.executable, "-c", code, cwd=ROOT, env=env).splitlines()[-1] == "1"
 
 
@@ -160,7 +183,9 @@ def test_no_wall_clock_no_pickle_no_bare_except(path: Path):
         assert "time.sleep" not in text
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_every_test_says_what_it_holds(path: Path):
     """Each test has a docstring."""
     for node in ast.walk(ast.parse(path.read_text())):
@@ -169,18 +194,31 @@ def test_every_test_says_what_it_holds(path: Path):
 
 
 def asserts(test: ast.FunctionDef) -> bool:
-    """Whether a test can fail by a judgement: assert, pytest.raises, fail or warns, or a helper named after checking."""
+    """Whether a test can fail by a judgement: assert, pytest.raises, fail or warns, or a helper
+    named after checking."""
     if any(isinstance(node, ast.Assert) for node in ast.walk(test)):
         return True
     calls = [node.func for node in ast.walk(test) if isinstance(node, ast.Call)]
-    names = {f.attr if isinstance(f, ast.Attribute) else f.id for f in calls if isinstance(f, ast.Attribute | ast.Name)}
-    return any(re.fullmatch(r"raises|fail|warns|_?check|_?(check|assert|expect)_\w+", name) for name in names)
+    names = {
+        f.attr if isinstance(f, ast.Attribute) else f.id
+        for f in calls
+        if isinstance(f, ast.Attribute | ast.Name)
+    }
+    return any(
+        re.fullmatch(r"raises|fail|warns|_?check|_?(check|assert|expect)_\w+", name)
+        for name in names
+    )
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_every_test_asserts(path: Path):
-    """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or expect_."""
-    tests = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
+    """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or
+    expect_."""
+    tests = [
+        node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)
+    ]
     assert not [test.name for test in tests if test.name.startswith("test_") and not asserts(test)]
 
 
@@ -196,11 +234,23 @@ def test_each_class_name_stands_once():
 
 
 BANNED = (
-    "the room of", "taping", "stranger", "underside", "yardstick", "climb", "ladder", "story", "glance", "shelf", "keeper",
-    "doubt", "box's own", "what ends the program without being the bundle's doing",
-)  # fmt: skip
-"""What the project does not say, since there is a standard word: module, attachment, unknown material, backend, reference model,
-search, sizes, page, look, store, observer, uncertainty."""
+    "the room of",
+    "taping",
+    "stranger",
+    "underside",
+    "yardstick",
+    "climb",
+    "ladder",
+    "story",
+    "glance",
+    "shelf",
+    "keeper",
+    "doubt",
+    "box's own",
+    "what ends the program without being the bundle's doing",
+)
+"""What the project does not say, since there is a standard word: module, attachment, unknown
+material, backend, reference model, search, sizes, page, look, store, observer, uncertainty."""
 
 
 @pytest.mark.parametrize("path", [*SOURCES, *TESTS], ids=lambda p: str(p.relative_to(ROOT)))
@@ -235,18 +285,22 @@ def test_the_wheel_holds_the_appliance_alone(wheel: Path):
 
 @pytest.mark.slow
 def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
-    """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok, away from the checkout."""
+    """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok,
+    away from the checkout."""
     run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     python = tmp_path / "venv" / "bin" / "python"
     pip = (python, "-m", "pip", "install", "-q", "--disable-pip-version-check")
     run(*pip, "--require-hashes", "-r", ROOT / "appliance" / "requirements.lock", cwd=tmp_path)
     run(*pip, "--no-deps", wheel, cwd=tmp_path)
-    out = run(tmp_path / "venv" / "bin" / "palpate", "check", "--sim", "skin", "--virtual", cwd=tmp_path)
+    out = run(
+        tmp_path / "venv" / "bin" / "palpate", "check", "--sim", "skin", "--virtual", cwd=tmp_path
+    )
     assert out.count("ok  ") == 4
 
 
 def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
-    """`make desktop` in a fresh checkout installs both commands and starts no test; the documents name it."""
+    """`make desktop` in a fresh checkout installs both commands and starts no test; the documents
+    name it."""
     (tmp_path / "train").mkdir()
     for name in ("Makefile", "pyproject.toml", "train/pyproject.toml"):
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
@@ -262,7 +316,8 @@ def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
 
 
 def test_the_lock_covers_both_processors():
-    """Every requirement is pinned with hashes; the binary ones have wheels for x86_64 and aarch64 among them."""
+    """Every requirement is pinned with hashes; the binary ones have wheels for x86_64 and aarch64
+    among them."""
     text = (ROOT / "appliance" / "requirements.lock").read_text()
     entries = re.split(r"\n(?=[a-z])", text)
     assert len(entries) >= 5

@@ -1,4 +1,5 @@
-"""docs/security.md names tests for what it claims: each of them is there, and every way in has one."""
+"""docs/security.md names tests for what it claims: each of them is there, and every way in has
+one."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ def test_every_test_that_is_named_exists():
     missing = []
     for file, test in named:
         text = (ROOT / file).read_text() if (ROOT / file).is_file() else ""
-        there = {node.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)}
+        there = {
+            node.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)
+        }
         if not text or (test and test not in there):
             missing.append(f"{file}::{test}")
     assert not missing
@@ -42,5 +45,16 @@ def test_every_way_in_is_told_whole():
 def test_the_ways_in_are_those_of_the_box():
     """Each interface that the settings and units open has its row."""
     named = " ".join(row[0] for row in rows())
-    for way in ("USB", "serial", "GPIO", "ssh", "feed", "page", "bridges", "bundle", "enrolled", "recordings"):
+    for way in (
+        "USB",
+        "serial",
+        "GPIO",
+        "ssh",
+        "feed",
+        "page",
+        "bridges",
+        "bundle",
+        "enrolled",
+        "recordings",
+    ):
         assert way in named, way

@@ -1,4 +1,5 @@
-"""The site that .github/workflows/site.yml publishes: its own steps gather the files, and every way between them leads somewhere."""
+"""The site that .github/workflows/site.yml publishes: its own steps gather the files, and every way
+between them leads somewhere."""
 
 from __future__ import annotations
 
@@ -63,4 +64,8 @@ def test_the_workflow_publishes_what_main_holds():
         ("pages", "write"),
         ("id-token", "write"),
     ]
-    assert [action for action in re.findall(r"uses: (\S+)@v\d+", text) if not action.startswith("actions/")] == []
+    assert [
+        action
+        for action in re.findall(r"uses: (\S+)@v\d+", text)
+        if not action.startswith("actions/")
+    ] == []

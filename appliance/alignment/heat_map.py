@@ -1,5 +1,5 @@
-"""Heat maps of a skin as lines of a terminal, for `palpate skin show` and `palpate watch`. In: loads. Out: lines with the
-control sequences of 256 colours.
+"""Heat maps of a skin as lines of a terminal, for `palpate skin show` and `palpate watch`. In:
+loads. Out: lines with the control sequences of 256 colours.
 """
 
 from __future__ import annotations
@@ -17,16 +17,24 @@ Map = Sequence[Sequence[float]]
 """Load of one axis, [rows][columns]."""
 
 
-def side_by_side(load: Sequence[Map], full: float, width: int, signs: str = BLOCKS) -> Iterator[list[str]]:
-    """The maps of the axes, as many beside one another as there is room for in `width`; each time the lines of one row of
-    maps. full: load that is shown as the strongest. signs: see alignment.terminal."""
+def side_by_side(
+    load: Sequence[Map], full: float, width: int, signs: str = BLOCKS
+) -> Iterator[list[str]]:
+    """The maps of the axes, as many beside one another as there is room for in `width`; each time
+    the lines of one row of maps. full: load that is shown as the strongest. signs: see
+    alignment.terminal."""
     axes, cols = len(load), len(load[0][0]) if load else 0
     if not load:
         return
-    cell = max(1, min(WIDEST, (width - 4) // cols if axes == 1 else (width // axes - len(GAP)) // cols))
+    cell = max(
+        1, min(WIDEST, (width - 4) // cols if axes == 1 else (width // axes - len(GAP)) // cols)
+    )
     beside = max(1, (width + len(GAP)) // (cols * cell + len(GAP) + 1))
     for at in range(0, axes, beside):
-        drawn = [_map(axis, _head(at + i, axes), full, cell, signs) for i, axis in enumerate(load[at : at + beside])]
+        drawn = [
+            _map(axis, _head(at + i, axes), full, cell, signs)
+            for i, axis in enumerate(load[at : at + beside])
+        ]
         yield [" " + GAP.join(parts) for parts in zip_longest(*drawn, fillvalue="")]
 
 

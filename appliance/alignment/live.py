@@ -1,5 +1,5 @@
-"""Where the skin is touched, for `palpate align`. In: frames of a finger at rest. Out: a View, five times a second, to
-displays."""
+"""Where the skin is touched, for `palpate align`. In: frames of a finger at rest. Out: a View, five
+times a second, to displays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from appliance.signal.unloaded import UnloadedTracker
 VIEW_NS = 200_000_000
 """From one View to the next."""
 SPAN_S = 0.3
-"""How much of the latest signal is averaged: long compared with the vibrations of a pulse or a robot's controller."""
+"""How much of the latest signal is averaged: long compared with the vibrations of a pulse or a
+robot's controller."""
 NO_BUNDLE = "none for this skin"
 SHOWN = 10
 """The strongest load shown is at first so many times the contact threshold."""
@@ -32,9 +33,10 @@ SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its threshold, in counts, and
-    place: its positions in training, both None without such a bundle, or where it does not know them. unloaded: counts
-    [R, C] along the normal that an unloaded skin gives by the bundle; 0 without. fingertip: setting `sensor.fingertip`."""
+    """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its
+    threshold, in counts, and place: its positions in training, both None without such a bundle, or
+    where it does not know them. unloaded: counts [R, C] along the normal that an unloaded skin
+    gives by the bundle; 0 without. fingertip: setting `sensor.fingertip`."""
 
     format: SweepFormat
     bundle: str = NO_BUNDLE
@@ -54,11 +56,17 @@ class Expected:
         """All but format and bundle, for the feed."""
         place = asdict(self.place) if self.place else None
         unloaded = np.asarray(self.unloaded).tolist()
-        return {"contact": self.contact, "place": place, "unloaded": unloaded, "fingertip": self.fingertip}
+        return {
+            "contact": self.contact,
+            "place": place,
+            "unloaded": unloaded,
+            "fingertip": self.fingertip,
+        }
 
     @classmethod
     def read(cls, fmt: SweepFormat, known: Mapping[str, Any], bundle: str) -> Expected:
-        """From what `json` gave; nothing where `known` is empty. Raises KeyError, TypeError, ValueError or BundleError."""
+        """From what `json` gave; nothing where `known` is empty. Raises KeyError, TypeError,
+        ValueError or BundleError."""
         if not known:
             return cls(fmt, bundle or NO_BUNDLE)
         place = typed(ContactPositions, known["place"]) if known["place"] else None
@@ -66,17 +74,22 @@ class Expected:
         if unloaded.shape not in ((), (fmt.rows, fmt.cols)):
             raise ValueError(f"unloaded counts of {unloaded.shape}")
         return cls(
-            fmt, bundle or NO_BUNDLE, known["contact"], place, unloaded,
+            fmt,
+            bundle or NO_BUNDLE,
+            known["contact"],
+            place,
+            unloaded,
             str(known["fingertip"]),
-        )  # fmt: skip
+        )
 
 
 class ContactTracker:
     """Makes Views of the frames of a skin.
 
-    Of a skin with several axes it looks at the normal one alone. The unloaded value of a taxel is the lowest it has been
-    since the skin was connected: so nobody has to press a key, and a finger that lay on the skin at the start is noticed
-    when it is lifted (with a bundle, whose threshold is above what an unloaded skin gives).
+    Of a skin with several axes it looks at the normal one alone. The unloaded value of a taxel is
+    the lowest it has been since the skin was connected: so nobody has to press a key, and a finger
+    that lay on the skin at the start is noticed when it is lifted (with a bundle, whose threshold
+    is above what an unloaded skin gives).
     """
 
     def __init__(self, expected: Expected, source: str) -> None:
@@ -101,7 +114,8 @@ class ContactTracker:
             self._unloaded.put(taxels)
 
     def view(self, skin: str, trouble: str) -> View:
-        """The View of this moment. skin: its state (PROTOCOL.md). trouble: why it does not stream."""
+        """The View of this moment. skin: its state (PROTOCOL.md). trouble: why it does not
+        stream."""
         self._number, self._skin = self._number + 1, skin
         if skin != "streaming":
             return self._view("no-skin", f"no skin: {skin}", trouble)
@@ -117,9 +131,13 @@ class ContactTracker:
         return self._touched(load, centre(self._latest, self._lowest, contact))
 
     def _touched(self, load: NDArray[np.float64], found: Point | None) -> View:
-        """The View of a streaming skin with this load [R, C], raw counts, and centre of contact (None: no contact)."""
+        """The View of a streaming skin with this load [R, C], raw counts, and centre of contact
+        (None: no contact)."""
         place = self._expected.place
-        shown: dict[str, Any] = {"load": tuple(map(tuple, load.round(1).tolist())), "full": self._full}
+        shown: dict[str, Any] = {
+            "load": tuple(map(tuple, load.round(1).tolist())),
+            "full": self._full,
+        }
         lowest = self._lowest - self._expected.unloaded
         least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
         if self._expected.contact is not None and least >= self._expected.contact:
@@ -127,27 +145,44 @@ class ContactTracker:
             hint = f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies on the skin"
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
-            return self._view("no-contact", "nothing touches the skin", "rest the finger on the tube", **shown)
+            return self._view(
+                "no-contact", "nothing touches the skin", "rest the finger on the tube", **shown
+            )
         if place is None:
             hint = "this bundle does not say where the skin sat in training; export it again"
             if self._expected.bundle == NO_BUNDLE:
                 hint = "no bundle fits this skin, so there is no trained position; palpate record needs none"
             elif self._expected.contact is None:
                 hint = "this bundle cannot tell contact, so it has no trained position; train one on sweeps of palpate record"
-            return self._view("no-positions", "the contact's centre alone", hint, **shown, centre=found)
+            return self._view(
+                "no-positions", "the contact's centre alone", hint, **shown, centre=found
+            )
         offset = place.offset(found)
         at = found[0] * place.pitch_mm, found[1] * place.pitch_mm
         shown |= {"centre": at, "nearest": (at[0] - offset[0], at[1] - offset[1])}
         if place.within(offset):
             away = f"{np.hypot(*offset):.1f} mm from the nearest trained position"
-            return self._view("in-place", IN_PLACE, f"{away}; up to {place.limit_mm:.1f} mm is fine", **shown)
+            return self._view(
+                "in-place", IN_PLACE, f"{away}; up to {place.limit_mm:.1f} mm is fine", **shown
+            )
         hint = "move the skin on the finger as far that way, then look again"
         return self._view("off", advice(offset, self._shape), hint, **shown)
 
     def _view(self, state: str, message: str, hint: str, **shown: Any) -> View:
         known = self._expected
-        return View(self._number, self._source, known.bundle, self._skin, state, message, hint, self._shape,
-                    place=known.place, fingertip=known.fingertip, **shown)  # fmt: skip
+        return View(
+            self._number,
+            self._source,
+            known.bundle,
+            self._skin,
+            state,
+            message,
+            hint,
+            self._shape,
+            place=known.place,
+            fingertip=known.fingertip,
+            **shown,
+        )
 
 
 class Alignment:
@@ -176,11 +211,14 @@ class Alignment:
 
 
 def run(
-    settings: Config, expected: Expected, devices: Devices, displays: Iterable[Display],
+    settings: Config,
+    expected: Expected,
+    devices: Devices,
+    displays: Iterable[Display],
     stopped: Callable[[], bool],
-) -> None:  # fmt: skip
-    """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames late, which does no
-    harm."""
+) -> None:
+    """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames
+    late, which does no harm."""
     shown_on = tuple(displays)
     with closing(Alignment(settings, expected, devices)) as alignment:
         next_ns = devices.clock.now_ns()

@@ -1,8 +1,8 @@
-"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and again, or plain
-lines.
+"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and
+again, or plain lines.
 
-Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the output is no
-terminal, or a dumb one, it gets one line a second.
+Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the
+output is no terminal, or a dumb one, it gets one line a second.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ Shown = TypeVar("Shown")
 LINE_NS = 1_000_000_000
 """Time between two plain lines."""
 ENTER, LEAVE = "\033[?1049h\033[?25l", "\033[?1049l\033[?25h"
-"""Control sequences: to the alternate screen without a cursor, and back to what was on the terminal before."""
+"""Control sequences: to the alternate screen without a cursor, and back to what was on the terminal
+before."""
 BLOCKS, ASCII = " ░▒▓█◉+┌─┐│└┘", " .:*#@+.-.|''"
-"""Signs for five loads, the contact's centre, a trained position and a frame: for UTF-8, and for any terminal."""
+"""Signs for five loads, the contact's centre, a trained position and a frame: for UTF-8, and for
+any terminal."""
 LEFT, TOP, SPARE = 8, 6, 12
 """Column and line where the grid begins, and the number of lines outside it."""
 BOLD, PLAIN = "\033[1m", "\033[0m"
@@ -37,8 +39,8 @@ def abilities(out: TextIO) -> tuple[bool, str]:
 
 
 class LiveScreen(ABC, Generic[Shown]):
-    """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores the terminal at the end.
-    live: `out` is a terminal on which pictures can be drawn.
+    """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores
+    the terminal at the end. live: `out` is a terminal on which pictures can be drawn.
 
     A subclass says what it looks like: `_picture` and `_line`.
     """
@@ -57,11 +59,14 @@ class LiveScreen(ABC, Generic[Shown]):
         self._write(LEAVE if self.live else "")
 
     def show(self, view: Shown) -> None:
-        """Draw `view` over the one before, in one write so that nothing flickers; or print a line, once a second."""
+        """Draw `view` over the one before, in one write so that nothing flickers; or print a line,
+        once a second."""
         if self.live:
             width, height = os.get_terminal_size(self._out.fileno())
             lines = self._picture(view, width or 80, height or 24)
-            self._write("\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J")
+            self._write(
+                "\033[H" + "".join(f"{line}\033[K\n" for line in lines[:-1]) + f"{lines[-1]}\033[J"
+            )
         elif (now_ns := self._clock.now_ns()) >= self._next_ns:
             self._next_ns = now_ns + LINE_NS
             self._write(self._line(view) + "\n")
@@ -93,7 +98,11 @@ class Screen(LiveScreen[View]):
 
 def line(view: View) -> str:
     """A View in one line, the message first."""
-    at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}" if view.centre else ""
+    at = (
+        f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}"
+        if view.centre
+        else ""
+    )
     return f"{view.origin and f'{view.origin}  '}{view.message}{at}  ({view.hint})"
 
 
@@ -103,7 +112,10 @@ class Canvas:
     def __init__(self, view: View, signs: str, width: int, height: int, address: str) -> None:
         self._view, self._signs = view, signs
         rows, cols = view.shape
-        self._cell = max(1, min(3, (height - SPARE) // rows)), max(4, min(8, (width - LEFT) // cols))
+        self._cell = (
+            max(1, min(3, (height - SPARE) // rows)),
+            max(4, min(8, (width - LEFT) // cols)),
+        )
         self._height, self._width = height, width
         self._cells: dict[tuple[int, int], tuple[str, str]] = {}
         self._words(address)
@@ -138,13 +150,16 @@ class Canvas:
         below = TOP + rows * self._cell[0] + 1
         if view.centre:
             row, col = view.centre
-            self._put(below, 1, f"centre: row {row:.1f}, column {col:.1f} {view.unit} from taxel 1.1")
+            self._put(
+                below, 1, f"centre: row {row:.1f}, column {col:.1f} {view.unit} from taxel 1.1"
+            )
         trained = f"   {self._signs[6]} where it was in training" if view.place else ""
         self._put(below + 1, 1, f"{self._signs[5]} the contact's centre{trained}   Ctrl-C ends")
         self._put(below + 2, 1, address)
 
     def _grid(self) -> None:
-        """A field of characters for the load of each taxel, with the number in its middle; a frame around all."""
+        """A field of characters for the load of each taxel, with the number in its middle; a frame
+        around all."""
         (high, wide), view = self._cell, self._view
         left_up, flat, right_up, upright, left_down, right_down = list(self._signs[7:])
         for c in range(view.shape[1]):
@@ -157,13 +172,22 @@ class Canvas:
                 self._put(top + y, LEFT - 1, upright.ljust(wide * view.shape[1]) + upright)
             for c, load in enumerate(loads):
                 self._taxel(top, LEFT + c * wide, load)
-        self._put(TOP + len(view.load) * high, LEFT - 1, left_down + flat * (wide * view.shape[1] - 1) + right_down)
+        self._put(
+            TOP + len(view.load) * high,
+            LEFT - 1,
+            left_down + flat * (wide * view.shape[1] - 1) + right_down,
+        )
 
     def _taxel(self, top: int, left: int, load: float) -> None:
         """One field; the last character of its width is the gap to the next."""
         (high, wide), share = self._cell, max(0.0, min(1.0, load / self._view.full))
         for y in range(high):
-            self._put(top + y, left, self._signs[round(4 * share)] * (wide - 1), f"\033[38;5;{HEAT[round(5 * share)]}m")
+            self._put(
+                top + y,
+                left,
+                self._signs[round(4 * share)] * (wide - 1),
+                f"\033[38;5;{HEAT[round(5 * share)]}m",
+            )
         number = f"{load:.0f}"
         if wide >= len(number) + 3:
             number = f" {number} "
@@ -183,4 +207,6 @@ class Canvas:
         pitch = self._view.place.pitch_mm if self._view.place else 1.0
         (high, wide), (rows, cols) = self._cell, self._view.shape
         row, col = (point[0] / pitch + 0.5) * high, (point[1] / pitch + 0.5) * wide
-        return TOP + int(max(0, min(rows * high - 1, row))), LEFT + int(max(0, min(cols * wide - 1, col)))
+        return TOP + int(max(0, min(rows * high - 1, row))), LEFT + int(
+            max(0, min(cols * wide - 1, col))
+        )

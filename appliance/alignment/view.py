@@ -12,11 +12,12 @@ from appliance.signal.contact import ContactPositions, Point
 class View:
     """Where the skin is touched at one moment, and what the person may do.
 
-    number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: its state (PROTOCOL.md).
-    state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or "in-place". message: that in words. hint:
-    what the person may do. load: raw counts above the unloaded skin, [rows][columns]; empty before there are any. full:
-    load that is shown as the strongest. centre: of the contact, and nearest: the trained position nearest to it, mm
-    from the centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `sensor.fingertip`.
+    number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: its state
+    (PROTOCOL.md). state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or
+    "in-place". message: that in words. hint: what the person may do. load: raw counts above the
+    unloaded skin, [rows][columns]; empty before there are any. full: load that is shown as the
+    strongest. centre: of the contact, and nearest: the trained position nearest to it, mm from the
+    centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `sensor.fingertip`.
     """
 
     number: int

@@ -1,4 +1,5 @@
-"""`palpate bridge tcp|modbus|ros`: options, and what each starts. In: arguments. Out: an exit code."""
+"""`palpate bridge tcp|modbus|ros`: options, and what each starts. In: arguments. Out: an exit
+code."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ EVERY_S = 1.0
 
 
 def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
-    """Take from the settings of the box what no option says. Raises ConfigError where they have no line for the bridge."""
+    """Take from the settings of the box what no option says. Raises ConfigError where they have no
+    line for the bridge."""
     if args.listen is None:
         args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
@@ -68,7 +70,9 @@ def run_modbus(args: argparse.Namespace) -> int:
         stop = stop_event()
         source = _source(args)
         try:
-            server = TcpServer(ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most)
+            server = TcpServer(
+                ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most
+            )
             await server.open(host, port)
             _say("modbus", server, source.name, args)
             await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
@@ -89,7 +93,9 @@ def run_tcp(args: argparse.Namespace) -> int:
     async def serve() -> None:
         stop = stop_event()
         name, opener = _port(args)
-        bridge = TcpBridge(name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop())
+        bridge = TcpBridge(
+            name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop()
+        )
         try:
             await bridge.server.open(host, port)
             _say("tcp", bridge.server, name, args)
@@ -118,15 +124,21 @@ RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
 
 def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> None:
     host, port = server.address
-    commands = "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
+    commands = (
+        "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
+    )
     log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")
     if args.allow_writes and not ip_address(host).is_loopback:
-        log.warning(f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network of the cell")
+        log.warning(
+            f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network of the cell"
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """`python -m appliance.bridges`."""
-    parser = argparse.ArgumentParser("python -m appliance.bridges", description="Bridges from a Palpate box.")
+    parser = argparse.ArgumentParser(
+        "python -m appliance.bridges", description="Bridges from a Palpate box."
+    )
     commands = parser.add_subparsers(required=True, metavar="BRIDGE", dest="bridge")
     add_arguments(lambda name, text: commands.add_parser(name, help=text, description=text))
     args = parser.parse_args(argv)

@@ -1,4 +1,5 @@
-"""The box as a Modbus TCP server. In: a Source. Out: registers, inputs and coils (docs/robots/modbus.md).
+"""The box as a Modbus TCP server. In: a Source. Out: registers, inputs and coils
+(docs/robots/modbus.md).
 
 All registers that one request reads are of one moment. A coil is a command: it acts when it rises.
 """
@@ -10,7 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.bridges import modbus_pdu as pdu
-from appliance.bridges.modbus_pdu import ExceptionCode, ModbusRequest, Reading, RequestRefused, Writing
+from appliance.bridges.modbus_pdu import (
+    ExceptionCode,
+    ModbusRequest,
+    Reading,
+    RequestRefused,
+    Writing,
+)
 from appliance.bridges.server import TcpPeer
 from appliance.bridges.source import BoxView, Source
 from appliance.core.clock import Clock
@@ -31,7 +38,8 @@ LABEL_WORDS = 16
 IDLE_S = 60.0
 """A connection without a request for this long is closed."""
 PACE_S = 0.005
-"""Rest after each request of a connection: whatever peers do, the other programs of the computer keep their share of it."""
+"""Rest after each request of a connection: whatever peers do, the other programs of the computer
+keep their share of it."""
 REQUEST_S = 5.0
 """Longest time for the rest of a request, and for a peer to take a reply."""
 
@@ -64,8 +72,13 @@ REGISTERS = (
     Register("state of the skin", _state_code),
     Register("answers", lambda view: view.answers),
     Register("status", lambda view: STATUS_CODES[view.answer.status] if view.answer else 0),
-    Register("label code", lambda view: view.code(view.answer.label) if view.answer and view.answer.known else 0),
-    Register("likeliest label code", lambda view: view.code(view.answer.label) if view.answer else 0),
+    Register(
+        "label code",
+        lambda view: view.code(view.answer.label) if view.answer and view.answer.known else 0,
+    ),
+    Register(
+        "likeliest label code", lambda view: view.code(view.answer.label) if view.answer else 0
+    ),
     Register("probability", _of_answer(lambda view: 1000 * view.answer.probability)),  # type: ignore[union-attr]
     Register("margin", _of_answer(lambda view: 1000 * view.answer.margin)),  # type: ignore[union-attr]
     Register("latency", _of_answer(lambda view: 100 * view.answer.latency_ms)),  # type: ignore[union-attr]
@@ -81,10 +94,20 @@ REGISTERS = (
     Register("labels", lambda view: len(view.labels)),
 )
 ADDRESSES: Mapping[str, int] = {
-    register.name: sum(before.words for before in REGISTERS[:i]) for i, register in enumerate(REGISTERS)
+    register.name: sum(before.words for before in REGISTERS[:i])
+    for i, register in enumerate(REGISTERS)
 } | {"label": sum(register.words for register in REGISTERS)}
 """Address of the first word of each entry; the label's text comes last."""
-COUNTERS = {"heartbeat", "answers", "sweep", "answered", "frames", "lost frames", "missed answers", "damaged sentences"}
+COUNTERS = {
+    "heartbeat",
+    "answers",
+    "sweep",
+    "answered",
+    "frames",
+    "lost frames",
+    "missed answers",
+    "damaged sentences",
+}
 """These wrap; anything else stays at the largest number that fits."""
 
 
@@ -114,7 +137,8 @@ def inputs(view: BoxView, *, alive: bool) -> list[bool]:
 
 
 class ModbusBridge:
-    """Serves connections. writes: whether coils may be written. One command is under way at a time."""
+    """Serves connections. writes: whether coils may be written. One command is under way at a
+    time."""
 
     def __init__(self, source: Source, clock: Clock, *, writes: bool) -> None:
         self._source, self._clock, self._writes = source, clock, writes
@@ -150,7 +174,11 @@ class ModbusBridge:
             return coils
         view = self._source.view()
         alive = view.alive(self._clock.now_ns())
-        return inputs(view, alive=alive) if function == pdu.READ_INPUTS else registers(view, alive=alive)
+        return (
+            inputs(view, alive=alive)
+            if function == pdu.READ_INPUTS
+            else registers(view, alive=alive)
+        )
 
     async def _write(self, wanted: Writing, coils: list[bool]) -> None:
         if not self._writes:

@@ -1,4 +1,5 @@
-"""Modbus TCP as bytes (Modbus Application Protocol V1.1b3; Modbus Messaging on TCP/IP V1.0b). Pure functions.
+"""Modbus TCP as bytes (Modbus Application Protocol V1.1b3; Modbus Messaging on TCP/IP V1.0b). Pure
+functions.
 
 In: bytes of a connection. Out: requests, and replies to them.
 """
@@ -68,7 +69,8 @@ class Writing:
 def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes]:
     """The requests in `data`, which continues `rest`, and the new unfinished rest.
 
-    Raises FormatError for what is not Modbus TCP: where the next request would begin is then unknown.
+    Raises FormatError for what is not Modbus TCP: where the next request would begin is then
+    unknown.
     """
     data, found = rest + data, []
     while len(data) >= HEADER.size:
@@ -94,11 +96,14 @@ def refusal(pdu: bytes, fault: ExceptionCode) -> bytes:
 
 
 def parse(pdu: bytes) -> Reading | Writing:
-    """What a request wants. Raises RequestRefused: FUNCTION for one that is not served, VALUE for a wrong length or number."""
+    """What a request wants. Raises RequestRefused: FUNCTION for one that is not served, VALUE for a
+    wrong length or number."""
     function, data = pdu[0], pdu[1:]
     if function in (READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS):
         address, count = _pair(data)
-        if len(data) != 4 or not 1 <= count <= (MOST_BITS if function <= READ_INPUTS else MOST_REGISTERS):
+        if len(data) != 4 or not 1 <= count <= (
+            MOST_BITS if function <= READ_INPUTS else MOST_REGISTERS
+        ):
             raise RequestRefused(ExceptionCode.VALUE)
         return Reading(function, address, count)
     if function == WRITE_COIL:
@@ -109,9 +114,15 @@ def parse(pdu: bytes) -> Reading | Writing:
     if function == WRITE_COILS:
         address, count = _pair(data)
         packed = data[5:]
-        if not 1 <= count <= MOST_COILS or data[4:5] != bytes([len(packed)]) or len(packed) != -(-count // 8):
+        if (
+            not 1 <= count <= MOST_COILS
+            or data[4:5] != bytes([len(packed)])
+            or len(packed) != -(-count // 8)
+        ):
             raise RequestRefused(ExceptionCode.VALUE)
-        return Writing(function, address, tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count)))
+        return Writing(
+            function, address, tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count))
+        )
     raise RequestRefused(ExceptionCode.FUNCTION)
 
 
@@ -123,7 +134,8 @@ def _pair(data: bytes) -> tuple[int, int]:
 
 
 def read(wanted: Reading, values: Sequence[int]) -> bytes:
-    """The reply to a reading of these bits or registers. Raises RequestRefused where it reaches beyond them."""
+    """The reply to a reading of these bits or registers. Raises RequestRefused where it reaches
+    beyond them."""
     chosen = values[wanted.address : wanted.address + wanted.count]
     if len(chosen) < wanted.count:
         raise RequestRefused(ExceptionCode.ADDRESS)

@@ -1,4 +1,5 @@
-"""The options of the bridges, for both ways of starting one; nothing of a bridge is imported for them."""
+"""The options of the bridges, for both ways of starting one; nothing of a bridge is imported for
+them."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ MOST = 16
 """Connections at a time."""
 PORTS = {"tcp": 1503, "modbus": 1502}
 LINKS = {"tcp": "/run/palpate-tcp/line", "modbus": "/run/palpate-modbus/line"}
-"""The box's line on the box itself, where `serial.port` has this value; their folders are of palpate-bridge@.service."""
+"""The box's line on the box itself, where `serial.port` has this value; their folders are of
+palpate-bridge@.service."""
 TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
@@ -27,12 +29,17 @@ def add_arguments(add: Callable[[str, str], argparse.ArgumentParser]) -> None:
         command = add(name, TEXTS[name])
         if name == "ros":
             command.add_argument(
-                "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...",
+                "--ros-args",
+                nargs=argparse.REMAINDER,
+                default=[],
+                metavar="...",
                 help="parameters and names, as ROS has them; comes last",
-            )  # fmt: skip
+            )
             continue
         box = command.add_mutually_exclusive_group()
-        box.add_argument("--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT")
+        box.add_argument(
+            "--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT"
+        )
         link = f"on the box: make PATH, for serial.port; the default where that is {LINKS[name]}"
         box.add_argument("--link", type=Path, metavar="PATH", help=link)
         if name == "modbus":
@@ -43,12 +50,20 @@ def add_arguments(add: Callable[[str, str], argparse.ArgumentParser]) -> None:
                 metavar="PATH",
                 help=f"on the box: read its feed ({FEED}); else the default",
             )
-        command.add_argument("--baud", type=int, default=BAUD, metavar="N", help=f"of the serial line ({BAUD})")
+        command.add_argument(
+            "--baud", type=int, default=BAUD, metavar="N", help=f"of the serial line ({BAUD})"
+        )
         listen = f"default: bridge.address of the settings, port {PORTS[name]}"
         command.add_argument("--listen", metavar="HOST:PORT", help=listen)
         writes = "peers may start, stop, tare and abort, also where bridge.allow_writes is false"
         command.add_argument("--allow-writes", action="store_true", help=writes)
-        command.add_argument("--most", type=_number, default=MOST, metavar="N", help=f"connections at a time ({MOST})")
+        command.add_argument(
+            "--most",
+            type=_number,
+            default=MOST,
+            metavar="N",
+            help=f"connections at a time ({MOST})",
+        )
 
 
 def _number(text: str) -> int:

@@ -1,5 +1,6 @@
-"""The box as a ROS 2 node, with a lifecycle. In: its serial line or its feed, parameters. Out: verdicts, state, frames,
-diagnostics and services (docs/robots/ros2.md), in messages that every ROS 2 has, and the action of palpate_msgs.
+"""The box as a ROS 2 node, with a lifecycle. In: its serial line or its feed, parameters. Out:
+verdicts, state, frames, diagnostics and services (docs/robots/ros2.md), in messages that every ROS
+2 has, and the action of palpate_msgs.
 """
 
 from __future__ import annotations
@@ -38,9 +39,14 @@ ENCODINGS = {
 }
 """Of sensor_msgs/Image: encoding, type of struct and bytes of a raw count, by data type."""
 PARAMETERS: Mapping[str, Any] = {
-    "port": "", "feed": "", "baud": BAUD, "frame_id": "palpate", "frames_hz": 0.0, "autostart": True,
+    "port": "",
+    "feed": "",
+    "baud": BAUD,
+    "frame_id": "palpate",
+    "frames_hz": 0.0,
+    "autostart": True,
     "allow_writes": False,
-}  # fmt: skip
+}
 FIXED = frozenset({"allow_writes"})
 """What no other node may set."""
 LOOK_S = 0.5
@@ -52,29 +58,44 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 def values(fields: Mapping[str, Any]) -> list[KeyValue]:
     """Fields as texts: true and false in lower case, numbers as Python writes them."""
-    return [KeyValue(key=name, value=str(v).lower() if isinstance(v, bool) else str(v)) for name, v in fields.items()]
+    return [
+        KeyValue(key=name, value=str(v).lower() if isinstance(v, bool) else str(v))
+        for name, v in fields.items()
+    ]
 
 
 def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
-    """An answer: OK with the label, WARN if the label cannot be used, ERROR if nothing was learned of the object."""
+    """An answer: OK with the label, WARN if the label cannot be used, ERROR if nothing was learned
+    of the object."""
     level = DiagnosticStatus.ERROR if answer.faulty else DiagnosticStatus.WARN
-    fields = asdict(answer) | {"early": answer.early, "known": answer.known, "unsure": answer.unsure, "code": code}
+    fields = asdict(answer) | {
+        "early": answer.early,
+        "known": answer.known,
+        "unsure": answer.unsure,
+        "code": code,
+    }
     return DiagnosticStatus(
-        level=DiagnosticStatus.OK if answer.known else level, name="palpate: verdict", hardware_id=answer.bundle,
-        message=answer.label if answer.known else f"{answer.status}: {answer.what_to_do}", values=values(fields),
-    )  # fmt: skip
+        level=DiagnosticStatus.OK if answer.known else level,
+        name="palpate: verdict",
+        hardware_id=answer.bundle,
+        message=answer.label if answer.known else f"{answer.status}: {answer.what_to_do}",
+        values=values(fields),
+    )
 
 
 def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStatus:
-    """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if something was lost since
-    `before`."""
+    """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if
+    something was lost since `before`."""
     state = view.state
     hurt = [
         f"{count} {what}"
         for count, what in (
             (view.missed - before.missed, "answers did not arrive"),
             (view.damaged - before.damaged, "sentences were damaged"),
-            (state.lost_frames - before.state.lost_frames if state and before.state else 0, "frames were lost"),
+            (
+                state.lost_frames - before.state.lost_frames if state and before.state else 0,
+                "frames were lost",
+            ),
         )
         if count > 0
     ]
@@ -83,29 +104,42 @@ def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStat
     elif state.skin != "streaming":
         level, text = DiagnosticStatus.ERROR, f"the skin is {state.skin}"
     else:
-        level, text = (DiagnosticStatus.WARN, ", ".join(hurt)) if hurt else (DiagnosticStatus.OK, "streaming")
+        level, text = (
+            (DiagnosticStatus.WARN, ", ".join(hurt)) if hurt else (DiagnosticStatus.OK, "streaming")
+        )
     fields = (asdict(state) | {"ready": state.ready}) if state else {}
     fields |= {"missed": view.missed, "damaged": view.damaged, "trouble": view.trouble}
     return DiagnosticStatus(
-        level=level, name="palpate: box", message=text, hardware_id=state.bundle if state else "", values=values(fields)
+        level=level,
+        name="palpate: box",
+        message=text,
+        hardware_id=state.bundle if state else "",
+        values=values(fields),
     )
 
 
 def image(taxels: Sequence[Any], dtype: str) -> Image:
-    """A frame of raw counts, rows along the sliding; one channel an axis. A count that is no number becomes nan."""
+    """A frame of raw counts, rows along the sliding; one channel an axis. A count that is no number
+    becomes nan."""
     kind, letter, size = ENCODINGS[dtype]
     rows = [[cell if isinstance(cell, list) else [cell] for cell in row] for row in taxels]
-    counts = [float("nan") if count is None else count for row in rows for cell in row for count in cell]
+    counts = [
+        float("nan") if count is None else count for row in rows for cell in row for count in cell
+    ]
     channels = len(rows[0][0])
     step = len(rows[0]) * channels * size
     return Image(
-        height=len(rows), width=len(rows[0]), encoding=f"{kind}{channels}", step=step,
+        height=len(rows),
+        width=len(rows[0]),
+        encoding=f"{kind}{channels}",
+        step=step,
         data=pack(f"<{len(counts)}{letter}", *counts),
-    )  # fmt: skip
+    )
 
 
 class PalpateNode(LifecycleNode):  # type: ignore[misc]
-    """The node `palpate`. What the box says arrives in another thread and is published by the executor."""
+    """The node `palpate`. What the box says arrives in another thread and is published by the
+    executor."""
 
     def __init__(self) -> None:
         super().__init__("palpate")
@@ -141,21 +175,30 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
         if self.setting("feed"):
             frames_hz = float(self.setting("frames_hz"))
-            self._source = FeedSource(self.setting("feed"), heard=heard, frame=heard, frames_hz=frames_hz)
+            self._source = FeedSource(
+                self.setting("feed"), heard=heard, frame=heard, frames_hz=frames_hz
+            )
         else:
             self._source = LineSource(self.setting("port"), baud=self.setting("baud"), heard=heard)
         self._verdicts = self.create_lifecycle_publisher(DiagnosticArray, "~/verdict", RELIABLE)
         self._states = self.create_lifecycle_publisher(DiagnosticArray, "~/state", LATCHED)
         self._frames = self.create_lifecycle_publisher(Image, "~/frames", qos_profile_sensor_data)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        asking = MutuallyExclusiveCallbackGroup()  # a command may take seconds, verdicts do not wait for it
-        self._made = [(self.destroy_guard_condition, guard), (self.destroy_publisher, self._diagnostics)]
+        asking = (
+            MutuallyExclusiveCallbackGroup()
+        )  # a command may take seconds, verdicts do not wait for it
+        self._made = [
+            (self.destroy_guard_condition, guard),
+            (self.destroy_publisher, self._diagnostics),
+        ]
         self._made += [
             (self.destroy_timer, self.create_timer(1.0, self._report)),
             (self.destroy_timer, self.create_timer(1.0, self._refresh, callback_group=asking)),
         ]
         for name, command in SERVICES.items():
-            service = self.create_service(Trigger, f"~/{name}", self._service(command), callback_group=asking)
+            service = self.create_service(
+                Trigger, f"~/{name}", self._service(command), callback_group=asking
+            )
             self._made.append((self.destroy_service, service))
         return TransitionCallbackReturn.SUCCESS
 
@@ -187,7 +230,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         try:
             from appliance.bridges.ros_action import SweepAction
         except ImportError as e:
-            self.get_logger().info(f"~/sweep is not offered ({e}); build palpate_msgs, see docs/robots/ros2.md")
+            self.get_logger().info(
+                f"~/sweep is not offered ({e}); build palpate_msgs, see docs/robots/ros2.md"
+            )
             return None
         return SweepAction(self, self._box)
 
@@ -196,7 +241,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         if self._source is None:
             raise ApplianceError("the node is not configured")
         if not self.setting("allow_writes"):
-            raise CommandRefused("commands are refused; start the bridge with -p allow_writes:=true")
+            raise CommandRefused(
+                "commands are refused; start the bridge with -p allow_writes:=true"
+            )
         return self._source
 
     def _service(self, command: str) -> Callable[[Any, Any], Any]:
@@ -260,7 +307,9 @@ def run(arguments: Sequence[str]) -> None:
     """Serve until SIGINT or SIGTERM. arguments: those of ROS."""
     rclpy.init(args=["palpate", "--ros-args", *arguments] if arguments else ["palpate"])
     node = PalpateNode()
-    executor = MultiThreadedExecutor(num_threads=4)  # news; a command; a sweep; goals and cancelling meanwhile
+    executor = MultiThreadedExecutor(
+        num_threads=4
+    )  # news; a command; a sweep; goals and cancelling meanwhile
     executor.add_node(node)
     try:
         while rclpy.ok():  # a signal wakes the executor before it ends the context: a wait without end might sleep on

@@ -1,4 +1,5 @@
-"""The action ~/sweep of the ROS 2 node; imported only where palpate_msgs is installed. In: goals. Out: sweeps by command."""
+"""The action ~/sweep of the ROS 2 node; imported only where palpate_msgs is installed. In: goals.
+Out: sweeps by command."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ END_S = 10.0
 
 
 class SweepAction:
-    """Serves one goal at a time and rejects others meanwhile. box: the box, for commands; raises ApplianceError."""
+    """Serves one goal at a time and rejects others meanwhile. box: the box, for commands; raises
+    ApplianceError."""
 
     def __init__(self, node: Node, box: Callable[[], Source]) -> None:
         self._box, self._log = box, node.get_logger()
@@ -31,9 +33,14 @@ class SweepAction:
         self._ending = threading.Event()
         self._current: CommandedSweep | None = None
         ActionServer(
-            node, Sweep, "~/sweep", self._execute, goal_callback=self._admit,
-            cancel_callback=lambda goal: CancelResponse.ACCEPT, callback_group=ReentrantCallbackGroup(),
-        )  # fmt: skip
+            node,
+            Sweep,
+            "~/sweep",
+            self._execute,
+            goal_callback=self._admit,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
 
     def hear(self, news: object) -> None:
         """Take what was heard of the box."""
@@ -51,7 +58,9 @@ class SweepAction:
     def _admit(self, goal: Any) -> GoalResponse:
         if self._busy.acquire(blocking=False):
             return GoalResponse.ACCEPT
-        self._log.warning("~/sweep: a goal was rejected, another one is under way", throttle_duration_sec=LOG_S)
+        self._log.warning(
+            "~/sweep: a goal was rejected, another one is under way", throttle_duration_sec=LOG_S
+        )
         return GoalResponse.REJECT
 
     def _execute(self, goal: Any) -> Any:
@@ -73,7 +82,11 @@ class SweepAction:
 
         def say(phase: str, answer: Answer | None) -> None:
             said = (
-                {"status": str(answer.status), "label": answer.label, "probability": answer.probability}
+                {
+                    "status": str(answer.status),
+                    "label": answer.label,
+                    "probability": answer.probability,
+                }
                 if answer
                 else {}
             )
@@ -87,8 +100,20 @@ class SweepAction:
             answer = self._current.run(goal.request)
         except ApplianceError as e:
             return None, Sweep.Result(message=str(e))
-        names = ("sweep", "label", "probability", "margin", "fused", "lost", "latency_ms", "share", "bundle")
+        names = (
+            "sweep",
+            "label",
+            "probability",
+            "margin",
+            "fused",
+            "lost",
+            "latency_ms",
+            "share",
+            "bundle",
+        )
         return answer, Sweep.Result(
-            status=str(answer.status), code=box.view().code(answer.label), message=answer.what_to_do,
+            status=str(answer.status),
+            code=box.view().code(answer.label),
+            message=answer.what_to_do,
             **{name: getattr(answer, name) for name in names},
-        )  # fmt: skip
+        )

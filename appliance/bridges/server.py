@@ -1,6 +1,8 @@
-"""A TCP server with limits, for the bridges. In: how one connection is served. Out: at most `most` at a time.
+"""A TCP server with limits, for the bridges. In: how one connection is served. Out: at most `most`
+at a time.
 
-A connection that has been silent is given up for a new one, so that idle or dead peers never keep a controller out.
+A connection that has been silent is given up for a new one, so that idle or dead peers never keep a
+controller out.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ Serve = Callable[["TcpPeer"], Awaitable[None]]
 class TcpPeer:
     """One connection."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, now_s: Callable[[], float]
+    ) -> None:
         self.heard_s = now_s()
         self._reader, self._writer, self._now_s = reader, writer, now_s
 
@@ -53,7 +57,8 @@ class TcpPeer:
         self._writer.transport.abort()
 
     async def close(self) -> None:
-        """End the connection; what the peer does not take in CLOSE_S is thrown away, so that the program can end."""
+        """End the connection; what the peer does not take in CLOSE_S is thrown away, so that the
+        program can end."""
         with suppress(OSError, TimeoutError):
             self._writer.close()
             await asyncio.wait_for(self._writer.wait_closed(), CLOSE_S)
@@ -61,7 +66,8 @@ class TcpPeer:
 
 
 class TcpServer:
-    """Serves connections to `address`. peers: those that are open. refused: how many found it full."""
+    """Serves connections to `address`. peers: those that are open. refused: how many found it
+    full."""
 
     def __init__(self, serve: Serve, most: int) -> None:
         self.peers: set[TcpPeer] = set()
@@ -75,11 +81,14 @@ class TcpServer:
             server = await asyncio.start_server(self._connected, host, port, limit=8192, backlog=64)
         except (OSError, OverflowError) as e:
             why = str(getattr(e, "strerror", None) or e).lower()
-            raise ConfigError(f"--listen {host}:{port}: {why}; name an address of this machine and a free port") from e
+            raise ConfigError(
+                f"--listen {host}:{port}: {why}; name an address of this machine and a free port"
+            ) from e
         self.address = server.sockets[0].getsockname()[:2]
 
     def _make_room(self, now_s: float) -> bool:
-        """Whether one more may come; gives up the one that has been silent longest if there is no room."""
+        """Whether one more may come; gives up the one that has been silent longest if there is no
+        room."""
         if len(self.peers) < self._most:
             return True
         quietest = min(self.peers, key=lambda peer: peer.heard_s)
@@ -97,7 +106,9 @@ class TcpServer:
             return
         connection = writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)  # else the kernel holds some megabytes
+        connection.setsockopt(
+            socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER
+        )  # else the kernel holds some megabytes
         peer = TcpPeer(reader, writer, now_s)
         self.peers.add(peer)
         try:
@@ -130,5 +141,7 @@ def address(text: str) -> tuple[str, int]:
     """HOST:PORT. Raises ConfigError."""
     host, colon, port = text.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise ConfigError(f"--listen {text}: not an address; use HOST:PORT, for example 127.0.0.1:1502")
+        raise ConfigError(
+            f"--listen {text}: not an address; use HOST:PORT, for example 127.0.0.1:1502"
+        )
     return host.strip("[]"), int(port)

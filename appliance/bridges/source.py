@@ -1,5 +1,5 @@
-"""What a bridge shows of the box. In: its serial line, a pseudo-terminal that the box opens, or its feed. Out: a BoxView,
-and commands where the line carries them.
+"""What a bridge shows of the box. In: its serial line, a pseudo-terminal that the box opens, or its
+feed. Out: a BoxView, and commands where the line carries them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,15 @@ from appliance.core.status import Status
 from appliance.tools import pseudo_terminal
 
 STALE_S = 3.5
-"""Without a sentence for this long the box counts as dead; it sends a state once a second (serial.state_s)."""
+"""Without a sentence for this long the box counts as dead; it sends a state once a second
+(serial.state_s)."""
 COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
-    "START": Palpate.start, "STOP": Palpate.stop, "NEW": Palpate.new_object, "TARE": Palpate.tare, "ABORT": Palpate.abort,
-}  # fmt: skip
+    "START": Palpate.start,
+    "STOP": Palpate.stop,
+    "NEW": Palpate.new_object,
+    "TARE": Palpate.tare,
+    "ABORT": Palpate.abort,
+}
 """What a bridge may pass on to the box."""
 
 
@@ -37,9 +42,10 @@ COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
 class BoxView:
     """The box as it was last heard.
 
-    answers: how many were heard. beats: how many states were heard. heard_ns: when the last of either came, 0 for never.
-    labels: of the bundle `bundle`; empty while they are not known. missed, damaged: as in Palpate; with the feed, missed
-    counts its lost lines. trouble: why nothing is heard, "" for no reason.
+    answers: how many were heard. beats: how many states were heard. heard_ns: when the last of
+    either came, 0 for never. labels: of the bundle `bundle`; empty while they are not known.
+    missed, damaged: as in Palpate; with the feed, missed counts its lost lines. trouble: why
+    nothing is heard, "" for no reason.
     """
 
     state: BoxState | None = None
@@ -72,7 +78,8 @@ class Source(Protocol):
         ...
 
     def refresh(self) -> None:
-        """Ask for what does not come by itself; may take seconds. To be called about once a second."""
+        """Ask for what does not come by itself; may take seconds. To be called about once a
+        second."""
         ...
 
     def send(self, command: str) -> str:
@@ -80,7 +87,8 @@ class Source(Protocol):
         ...
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Wait until a sweep can begin, so that every earlier one is answered. Raises NoAnswer or CommandRefused."""
+        """Wait until a sweep can begin, so that every earlier one is answered. Raises NoAnswer or
+        CommandRefused."""
         ...
 
     def close(self) -> None:
@@ -89,12 +97,18 @@ class Source(Protocol):
 
 
 class LineSource:
-    """The box over its serial line. heard: is called with each answer and state, in the thread that reads."""
+    """The box over its serial line. heard: is called with each answer and state, in the thread that
+    reads."""
 
     def __init__(
-        self, name: str, opener: Callable[[], Any] | None = None, *, baud: int = BAUD,
-        heard: Callable[[Heard], None] | None = None, clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        opener: Callable[[], Any] | None = None,
+        *,
+        baud: int = BAUD,
+        heard: Callable[[Heard], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
         self.name = name
         self._clock, self._also = clock or SystemClock(), heard
         self._view = BoxView()
@@ -102,7 +116,12 @@ class LineSource:
 
     def view(self) -> BoxView:
         """The box as it was last heard."""
-        return replace(self._view, missed=self._box.missed, damaged=self._box.damaged, trouble=self._box.trouble)
+        return replace(
+            self._view,
+            missed=self._box.missed,
+            damaged=self._box.damaged,
+            trouble=self._box.trouble,
+        )
 
     def refresh(self) -> None:
         """Ask for the labels of a bundle that is new."""
@@ -140,9 +159,14 @@ class FeedSource:
     """
 
     def __init__(
-        self, path: str, *, heard: Callable[[Heard], None] | None = None,
-        frame: Callable[[Mapping[str, Any]], None] | None = None, frames_hz: float = 0, clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        path: str,
+        *,
+        heard: Callable[[Heard], None] | None = None,
+        frame: Callable[[Mapping[str, Any]], None] | None = None,
+        frames_hz: float = 0,
+        clock: Clock | None = None,
+    ) -> None:
         self.name = path
         self.format: Mapping[str, Any] = {}
         self._clock, self._also, self._frame = clock or SystemClock(), heard, frame
@@ -161,7 +185,9 @@ class FeedSource:
 
     def send(self, command: str) -> str:
         """Raises CommandRefused: the feed is read-only."""
-        raise CommandRefused(f"{command}: the feed is read-only; give the bridge a serial line with --port or --link")
+        raise CommandRefused(
+            f"{command}: the feed is read-only; give the bridge a serial line with --port or --link"
+        )
 
     def wait_ready(self, timeout_s: float) -> None:
         """Raises CommandRefused: nothing can be begun."""
@@ -178,7 +204,11 @@ class FeedSource:
             if line is not None:
                 try:
                     self._take(line)
-                except (KeyError, TypeError, ValueError):  # of a later version; what is known is shown
+                except (
+                    KeyError,
+                    TypeError,
+                    ValueError,
+                ):  # of a later version; what is known is shown
                     self._view = replace(self._view, damaged=self._view.damaged + 1)
         self._feed.close()
 
@@ -209,10 +239,20 @@ class FeedSource:
             return BoxState(time_s=line["time_ns"] / 1e9, sweeping=bool(line["sweeping"]), **values)
         state = self._view.state
         return Answer(
-            line["sweep"], line["time_ns"] / 1e9, Status(line["status"]), line["label"], line["probability"],
-            line["margin"], line["fused"], line["lost"], line["latency_ns"] / 1e6, line["bundle"],
-            state.source if state else "", line["share"], line["detail"],
-        )  # fmt: skip
+            line["sweep"],
+            line["time_ns"] / 1e9,
+            Status(line["status"]),
+            line["label"],
+            line["probability"],
+            line["margin"],
+            line["fused"],
+            line["lost"],
+            line["latency_ns"] / 1e6,
+            line["bundle"],
+            state.source if state else "",
+            line["share"],
+            line["detail"],
+        )
 
 
 def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
@@ -223,10 +263,11 @@ def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
 
 
 class LinkPort:
-    """A port that the box on this machine opens by a name: one end of a pseudo-terminal, the other at `path`.
+    """A port that the box on this machine opens by a name: one end of a pseudo-terminal, the other
+    at `path`.
 
-    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this one's group may open it, the box among
-    them. Raises ConfigError if something else is at `path`.
+    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this one's group
+    may open it, the box among them. Raises ConfigError if something else is at `path`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -240,7 +281,9 @@ class LinkPort:
             path.symlink_to(name)
         except OSError as e:
             self._stack.close()
-            raise ConfigError(f"--link {path}: {str(e.strerror).lower()}; name a path that is free") from e
+            raise ConfigError(
+                f"--link {path}: {str(e.strerror).lower()}; name a path that is free"
+            ) from e
         self._stack.callback(path.unlink, missing_ok=True)
 
     @property

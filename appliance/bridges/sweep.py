@@ -1,5 +1,5 @@
-"""A sweep by command, from START to its answer, for bridges that offer it as one thing. In: a Source and what it hears.
-Out: the Answer, or an error that says why there is none.
+"""A sweep by command, from START to its answer, for bridges that offer it as one thing. In: a
+Source and what it hears. Out: the Answer, or an error that says why there is none.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ READY_S = 3.0
 ABORTED_S = 2.0
 """Longest wait for the answer to a sweep that was aborted."""
 TURN_S = 0.05
-"""Longest time until it is noticed that nobody wants the answer any more, or that the box is gone."""
+"""Longest time until it is noticed that nobody wants the answer any more, or that the box is
+gone."""
 LONGEST_S = 3600.0
 
 
@@ -36,14 +37,18 @@ class Terms(Protocol):
 class CommandedSweep:
     """Carries out one sweep at a time.
 
-    canceled: whether nobody wants the answer any more. say: is called with each phase, `sliding`, `judging`, `early`, the
-    last with the answer.
+    canceled: whether nobody wants the answer any more. say: is called with each phase, `sliding`,
+    `judging`, `early`, the last with the answer.
     """
 
     def __init__(
-        self, source: Source, *, canceled: Callable[[], bool], say: Callable[[str, Answer | None], None],
+        self,
+        source: Source,
+        *,
+        canceled: Callable[[], bool],
+        say: Callable[[str, Answer | None], None],
         clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._source, self._canceled, self._say = source, canceled, say
         self._clock = clock or SystemClock()
         self._answers: SimpleQueue[Answer] = SimpleQueue()
@@ -58,11 +63,13 @@ class CommandedSweep:
     def run(self, terms: Terms) -> Answer:
         """The answer; it is `aborted` if the sweep was canceled.
 
-        Raises ConfigError for terms that cannot be, CommandRefused, NoAnswer or LinkLost; the box's sweep is then aborted
-        as far as the box can be reached.
+        Raises ConfigError for terms that cannot be, CommandRefused, NoAnswer or LinkLost; the box's
+        sweep is then aborted as far as the box can be reached.
         """
         check(terms)
-        self._source.wait_ready(READY_S)  # so every earlier sweep is answered, and the next answer is to this one
+        self._source.wait_ready(
+            READY_S
+        )  # so every earlier sweep is answered, and the next answer is to this one
         if self._canceled():
             raise CommandRefused("the sweep was canceled before START")
         if terms.new_object:
@@ -81,7 +88,8 @@ class CommandedSweep:
         return answer or self._aborted()
 
     def _answered(self, terms: Terms) -> Answer | None:
-        """The answer, None if the sweep was canceled; STOP is sent when it is due, or when the answer is there."""
+        """The answer, None if the sweep was canceled; STOP is sent when it is due, or when the
+        answer is there."""
         begin_ns = self._clock.now_ns()
         stop_s = terms.slide_s or math.inf
         stopped = False
@@ -91,7 +99,13 @@ class CommandedSweep:
                 self._source.send("STOP")
                 stopped = True
                 self._say("judging", None)
-            answer = self._next(min(TURN_S, max(0.0, terms.timeout_s - past_s), TURN_S if stopped else stop_s - past_s))
+            answer = self._next(
+                min(
+                    TURN_S,
+                    max(0.0, terms.timeout_s - past_s),
+                    TURN_S if stopped else stop_s - past_s,
+                )
+            )
             if answer:
                 if answer.early:
                     self._say("early", answer)
@@ -100,12 +114,17 @@ class CommandedSweep:
                 return answer
             self._see_that_it_is_there(begin_ns)
             if past_s >= terms.timeout_s:
-                raise NoAnswer(f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was aborted")
+                raise NoAnswer(
+                    f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was aborted"
+                )
         return None
 
     def _close(self, answer: Answer) -> None:
-        """Send STOP for a sweep that was answered before: it causes no answer, and without it the next START does the same."""
-        if answer.status is not Status.NO_STOP:  # else another's START has closed it, and the STOP is the other's
+        """Send STOP for a sweep that was answered before: it causes no answer, and without it the
+        next START does the same."""
+        if (
+            answer.status is not Status.NO_STOP
+        ):  # else another's START has closed it, and the STOP is the other's
             with suppress(ApplianceError):
                 self._source.send("STOP")
 
@@ -115,7 +134,9 @@ class CommandedSweep:
         if trouble:
             raise LinkLost(f"the box was lost during the sweep: {trouble}")
         if self._clock.now_ns() - max(begin_ns, self._heard_ns) > STALE_S * 1e9:
-            raise NoAnswer(f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?")
+            raise NoAnswer(
+                f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?"
+            )
 
     def _aborted(self) -> Answer:
         with suppress(CommandRefused):  # it was answered in this moment
@@ -139,7 +160,9 @@ class CommandedSweep:
 def check(terms: Terms) -> None:
     """Raises ConfigError for times that cannot be."""
     if not 0 <= terms.slide_s <= LONGEST_S:
-        raise ConfigError(f"slide_s = {terms.slide_s:g} is no time from START to STOP; use 0 to {LONGEST_S:g}")
+        raise ConfigError(
+            f"slide_s = {terms.slide_s:g} is no time from START to STOP; use 0 to {LONGEST_S:g}"
+        )
     if not terms.slide_s < terms.timeout_s <= LONGEST_S:
         raise ConfigError(
             f"timeout_s = {terms.timeout_s:g} is no longest time from START to the answer; use more than slide_s ="

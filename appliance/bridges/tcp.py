@@ -1,5 +1,6 @@
-"""The serial line over TCP: what a controller with a socket needs, URScript for one. In: a port. Out: its sentences, to
-each peer; commands of the peers go to the box, one at a time, and the answer to a command to the peer that sent it.
+"""The serial line over TCP: what a controller with a socket needs, URScript for one. In: a port.
+Out: its sentences, to each peer; commands of the peers go to the box, one at a time, and the answer
+to a command to the peer that sent it.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from appliance.core.errors import LinkLost
 from appliance.core.sentences import Sentence, sentence
 
 PACE_S = 0.02
-"""Time between two commands to the box, of all peers together: its loop answers each, and a flood must not reach it. Also
-between two of one peer, refused ones too, so that a peer that floods leaves the others their turn."""
+"""Time between two commands to the box, of all peers together: its loop answers each, and a flood
+must not reach it. Also between two of one peer, refused ones too, so that a peer that floods leaves
+the others their turn."""
 ANSWER_S = 2.0
 """Longest wait for the box to answer a command."""
 QUESTIONS = ("ID", "STATE", "LABEL")
@@ -27,7 +29,13 @@ class TcpBridge:
     """Passes sentences on. writes: whether peers may send commands that change something."""
 
     def __init__(
-        self, name: str, opener: Callable[[], Any], *, writes: bool, most: int, loop: asyncio.AbstractEventLoop
+        self,
+        name: str,
+        opener: Callable[[], Any],
+        *,
+        writes: bool,
+        most: int,
+        loop: asyncio.AbstractEventLoop,
     ) -> None:
         self.server = TcpServer(self.serve, most)
         self._writes, self._loop, self._asking = writes, loop, asyncio.Lock()
@@ -52,7 +60,9 @@ class TcpBridge:
 
     def _pass_on(self, heard: Sentence) -> None:
         line = sentence(heard.kind, *heard.fields)
-        if heard.kind == "ANS":  # one that comes too late, or that nobody has asked for, is for nobody
+        if (
+            heard.kind == "ANS"
+        ):  # one that comes too late, or that nobody has asked for, is for nobody
             if heard.fields[:1] == [self._asked] and not self._answer.done():
                 self._answer.set_result(line)
             return
@@ -79,7 +89,9 @@ class TcpBridge:
                 self._next_s = self._loop.time() + PACE_S
                 self._asked, self._answer = command.kind, self._loop.create_future()
                 try:
-                    await asyncio.to_thread(self._line.write, sentence(command.kind, *command.fields))
+                    await asyncio.to_thread(
+                        self._line.write, sentence(command.kind, *command.fields)
+                    )
                     return await asyncio.wait_for(self._answer, ANSWER_S)
                 except LinkLost as e:
                     why = str(e)

@@ -1,6 +1,8 @@
-"""Arrays in the files of a bundle: .npz in and out, sweeps packed as their changes, the form of class means.
+"""Arrays in the files of a bundle: .npz in and out, sweeps packed as their changes, the form of
+class means.
 
-In: bytes, arrays. Out: arrays, bytes; a BundleError where they are not as they must be. Nothing is unpickled.
+In: bytes, arrays. Out: arrays, bytes; a BundleError where they are not as they must be. Nothing is
+unpickled.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from appliance.core.types import UNREADABLE, SweepFormat
 
 
 def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
-    """Arrays of the .npz `data` by name, `names` among them; pickled objects are refused. Raises BundleError naming `file`."""
+    """Arrays of the .npz `data` by name, `names` among them; pickled objects are refused. Raises
+    BundleError naming `file`."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
@@ -31,8 +34,12 @@ def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
             arrays = dict(z.items())
         for name, values in arrays.items():
-            if not isinstance(values, np.ndarray):  # numpy gives what does not begin as an array does as it is
-                raise BundleError(f"{file} cannot be read: {name!r} is no array; export the bundle again")
+            if not isinstance(
+                values, np.ndarray
+            ):  # numpy gives what does not begin as an array does as it is
+                raise BundleError(
+                    f"{file} cannot be read: {name!r} is no array; export the bundle again"
+                )
         return {name: arrays[name] for name in names} | arrays
     except (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
         raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
@@ -46,33 +53,50 @@ def packed(**arrays: NDArray[Any]) -> bytes:
 
 
 def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
-    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as whole numbers of the same bits: of all
-    changes first the lowest byte, then the next one, [bytes, G, T, R, C] or [bytes, G, T, R, C, A].
+    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as whole numbers
+    of the same bits: of all changes first the lowest byte, then the next one, [bytes, G, T, R, C]
+    or [bytes, G, T, R, C, A].
 
     These pack better than the numbers, and not a bit of them is lost.
     """
     bits = np.ascontiguousarray(samples).view(f"<u{samples.itemsize}")
     steps = np.diff(bits, axis=1, prepend=np.zeros_like(bits[:, :1]))
-    planes: NDArray[np.uint8] = np.moveaxis(steps.view(np.uint8).reshape(*bits.shape, samples.itemsize), -1, 0)
+    planes: NDArray[np.uint8] = np.moveaxis(
+        steps.view(np.uint8).reshape(*bits.shape, samples.itemsize), -1, 0
+    )
     return planes
 
 
 def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
-    """Sweeps from the bytes of their changes [bytes, G, T, R, C] or [bytes, G, T, R, C, A]: the inverse of `changes`. Raises
-    BundleError naming `file`."""
+    """Sweeps from the bytes of their changes [bytes, G, T, R, C] or [bytes, G, T, R, C, A]: the
+    inverse of `changes`. Raises BundleError naming `file`."""
     size = f.numpy_type.itemsize
-    if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (size, f.window, *f.shape):
-        raise BundleError(f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}")
+    if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (
+        size,
+        f.window,
+        *f.shape,
+    ):
+        raise BundleError(
+            f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}"
+        )
     steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{size}")[..., 0]
     return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
 
 
 def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
-    """Raises BundleError if an array of means.npz has another type or shape than `n` labels have, or a number out of
-    range."""
+    """Raises BundleError if an array of means.npz has another type or shape than `n` labels have,
+    or a number out of range."""
     rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
-    rows = {"means": (n, rank), "bias": (n,), "sweeps": (n,), "spread": (n,), "shapes": (n, 0, 0), "moved_turn": (rank, rank),
-            "moved_means": (n, rank), "moved_shapes": (n, 0, 0)}  # fmt: skip
+    rows = {
+        "means": (n, rank),
+        "bias": (n,),
+        "sweeps": (n,),
+        "spread": (n,),
+        "shapes": (n, 0, 0),
+        "moved_turn": (rank, rank),
+        "moved_means": (n, rank),
+        "moved_shapes": (n, 0, 0),
+    }
     kinds = {"sweeps": "int64", "shapes": "float16", "moved_shapes": "float16"}
     for name, wanted in rows.items():
         if name not in arrays:

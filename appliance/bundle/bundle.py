@@ -1,16 +1,20 @@
-"""The model bundle. In: a folder. Out: a checked Bundle. No file is used before its hash and form were checked.
+"""The model bundle. In: a folder. Out: a checked Bundle. No file is used before its hash and form
+were checked.
 
-A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, if the manifest has `known`, `means.npz`. The graph takes
-the sensor's raw counts as `sweep` [1, T, R, C], or [1, T, R, C, A] where a taxel has several axes (or float32 features
-[1, n] as `features`, if the manifest's input is one of features.KINDS); all scaling is inside it. Its outputs by name:
+A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, if the manifest has `known`,
+`means.npz`. The graph takes the sensor's raw counts as `sweep` [1, T, R, C], or [1, T, R, C, A]
+where a taxel has several axes (or float32 features [1, n] as `features`, if the manifest's input is
+one of features.KINDS); all scaling is inside it. Its outputs by name:
 
 - `logits` float32 [1, K0] for the K0 labels of training;
 - `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of the window;
 - `embedding` float32 [1, r], optional: a linear projection in which the sweeps of each material have covariance 1.
 
-Golden sweeps are test sweeps with the logits that were computed at export, or by the box at enrolment.
+Golden sweeps are test sweeps with the logits that were computed at export, or by the box at
+enrolment.
 
-A box that enrols a label leaves these files as they are, byte for byte, and puts `enrolment.npz` beside them (enrolled.py).
+A box that enrols a label leaves these files as they are, byte for byte, and puts `enrolment.npz`
+beside them (enrolled.py).
 """
 
 from __future__ import annotations
@@ -52,18 +56,44 @@ except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
 __all__ = [
-    "DEFAULT", "ENROLMENT", "ENROLMENT_SIGNATURE", "GOLDEN", "GOLDEN_TOLERANCE", "INPUTS", "LABEL", "MANIFEST", "MEANS",
-    "MODEL", "SIGNATURE", "AddedLabels", "Bundle", "Classes", "Early", "Known", "Manifest", "Moved", "MovedClasses",
-    "Thresholds", "digest", "file_entry", "files", "from_files", "identity", "load", "name",
-]  # fmt: skip
+    "DEFAULT",
+    "ENROLMENT",
+    "ENROLMENT_SIGNATURE",
+    "GOLDEN",
+    "GOLDEN_TOLERANCE",
+    "INPUTS",
+    "LABEL",
+    "MANIFEST",
+    "MEANS",
+    "MODEL",
+    "SIGNATURE",
+    "AddedLabels",
+    "Bundle",
+    "Classes",
+    "Early",
+    "Known",
+    "Manifest",
+    "Moved",
+    "MovedClasses",
+    "Thresholds",
+    "digest",
+    "file_entry",
+    "files",
+    "from_files",
+    "identity",
+    "load",
+    "name",
+]
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
 MOST_SMALL = 1 << 20
-"""Largest size in bytes of a manifest or a signature, which are read before anything is known about them."""
+"""Largest size in bytes of a manifest or a signature, which are read before anything is known about
+them."""
 SIGNATURE, ENROLMENT_SIGNATURE = MANIFEST + ".sig", ENROLMENT + ".sig"
 OPTIONAL = {SIGNATURE: MOST_SMALL, ENROLMENT: MOST_BYTES, ENROLMENT_SIGNATURE: MOST_SMALL}
 """Files that a manifest does not name, with the largest size of each in bytes."""
 GOLDEN_TOLERANCE = 0.02
-"""Largest allowed difference of a golden sweep's probability between export and this machine; labels must be equal."""
+"""Largest allowed difference of a golden sweep's probability between export and this machine;
+labels must be equal."""
 
 
 def file_entry(data: bytes) -> dict[str, Any]:
@@ -77,31 +107,36 @@ def digest(data: bytes) -> str:
 
 
 def identity(named_by: bytes) -> str:
-    """A bundle's id: the first eight hexadecimal digits of the sha256 of its manifest, or of its enrolment.npz."""
+    """A bundle's id: the first eight hexadecimal digits of the sha256 of its manifest, or of its
+    enrolment.npz."""
     return digest(named_by)[:8]
 
 
 def name(files: Mapping[str, bytes]) -> str:
-    """A bundle's name in the store: the sha256 of what names all its other files, in hexadecimal."""
+    """A bundle's name in the store: the sha256 of what names all its other files, in
+    hexadecimal."""
     return digest(files.get(ENROLMENT, files[MANIFEST]))
 
 
 def load(folder: Path) -> Bundle:
-    """Read and check the bundle in `folder`. Raises BundleError if a file is missing, altered or of another form."""
+    """Read and check the bundle in `folder`. Raises BundleError if a file is missing, altered or of
+    another form."""
     return from_files(files(folder), str(folder))
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The files of the bundle in `folder` by name: the manifest, the files that it names, and those of OPTIONAL that are
-    there.
+    """The files of the bundle in `folder` by name: the manifest, the files that it names, and those
+    of OPTIONAL that are there.
 
-    Other files are ignored. Links are not followed, and no file is read beyond the size in the manifest.
-    Raises BundleError if a file cannot be read or is larger.
+    Other files are ignored. Links are not followed, and no file is read beyond the size in the
+    manifest. Raises BundleError if a file cannot be read or is larger.
     """
     try:
         found = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
-        raise BundleError(f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one") from e
+        raise BundleError(
+            f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one"
+        ) from e
     for name, size in _named(found[MANIFEST]).items():
         try:
             found[name] = _read(folder / name, size)
@@ -109,18 +144,25 @@ def files(folder: Path) -> dict[str, bytes]:
             if name in OPTIONAL and e.errno == errno.ENOENT:
                 continue
             what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
-            raise BundleError(f"{folder}: {name} {what}: {e.strerror}; copy the bundle again") from e
+            raise BundleError(
+                f"{folder}: {name} {what}: {e.strerror}; copy the bundle again"
+            ) from e
     return found
 
 
 def _named(manifest: bytes) -> dict[str, int]:
     """The other files to read, with the largest size of each."""
-    return OPTIONAL | {name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()}
+    return OPTIONAL | {
+        name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()
+    }
 
 
 def _read(path: Path, most: int) -> bytes:
-    """Bytes of a regular file, at most one more than `most`: no link, no device, no pipe that would block."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as f:
+    """Bytes of a regular file, at most one more than `most`: no link, no device, no pipe that would
+    block."""
+    with os.fdopen(
+        os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb"
+    ) as f:
         if not stat.S_ISREG(os.fstat(f.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no plain file", str(path))
         data = f.read(most + 1)
@@ -130,18 +172,29 @@ def _read(path: Path, most: int) -> bytes:
 
 
 def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
-    """The checked bundle of `files` by name. where: their origin, for messages. Raises BundleError as `load`."""
+    """The checked bundle of `files` by name. where: their origin, for messages. Raises BundleError
+    as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
     samples, logits = _golden(golden, manifest)
-    classes = _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
+    classes = (
+        _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
+    )
     f, kind = manifest.format, manifest.input
     numbers = None if kind == "raw" else len(features.compute(kind, samples[0], f.rate_hz))
-    untrained, rank = (int(np.count_nonzero(classes.sweeps)), classes.means.shape[1]) if classes else (0, None)
+    untrained, rank = (
+        (int(np.count_nonzero(classes.sweeps)), classes.means.shape[1]) if classes else (0, None)
+    )
     memory = check.check(model, manifest, numbers, untrained, rank)
     text = files[MANIFEST]
-    made = Bundle(manifest, identity(text), model, samples, logits, classes, base=digest(text), memory=memory)
-    return enrolled.applied(made, files[ENROLMENT], identity(files[ENROLMENT])) if ENROLMENT in files else made
+    made = Bundle(
+        manifest, identity(text), model, samples, logits, classes, base=digest(text), memory=memory
+    )
+    return (
+        enrolled.applied(made, files[ENROLMENT], identity(files[ENROLMENT]))
+        if ENROLMENT in files
+        else made
+    )
 
 
 def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: str) -> bytes:
@@ -150,25 +203,35 @@ def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: s
         raise BundleError(f"{where}: the manifest does not name {name}; export the bundle again")
     want, have = manifest.files[name], file_entry(files[name])
     if want != have:
-        raise BundleError(f"{where}: {name} was altered: {have} instead of {want}; copy the bundle again")
+        raise BundleError(
+            f"{where}: {name} was altered: {have} instead of {want}; copy the bundle again"
+        )
     return files[name]
 
 
 def golden_file(samples: NDArray[Any], logits: NDArray[Any]) -> bytes:
-    """golden.npz of sweeps [G, T, R, C] or [G, T, R, C, A], as `arrays.changes`, and their logits [G, K]."""
+    """golden.npz of sweeps [G, T, R, C] or [G, T, R, C, A], as `arrays.changes`, and their logits
+    [G, K]."""
     return arrays.packed(changes=arrays.changes(samples), logits=logits)
 
 
 def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]. Older files hold `samples` as they are."""
+    """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]. Older files hold
+    `samples` as they are."""
     f = manifest.format
     held = arrays.read(data, GOLDEN, "logits")
     if not held.keys() & {"samples", "changes"}:
         raise BundleError(f"{GOLDEN} holds no sweeps; export the bundle again")
     samples = held["samples"] if "samples" in held else arrays.summed(held["changes"], f, GOLDEN)
     logits = held["logits"]
-    if samples.shape[1:] != (f.window, *f.shape) or samples.dtype != f.numpy_type or not len(samples):
-        raise BundleError(f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}")
+    if (
+        samples.shape[1:] != (f.window, *f.shape)
+        or samples.dtype != f.numpy_type
+        or not len(samples)
+    ):
+        raise BundleError(
+            f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}"
+        )
     if logits.shape != (len(samples), len(manifest.labels)):
         raise BundleError(
             f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, {len(manifest.labels)} labels"
@@ -186,12 +249,18 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
     arrays.check_classes(held, n)
     sweeps = held["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
-        raise BundleError(f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled ones after")
+        raise BundleError(
+            f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled ones after"
+        )
     if manifest.early and sweeps.any():
         raise BundleError(
             "manifest has `early`, whose heads do not know the enrolled labels; enrol again from the original"
         )
     return Classes(
-        held["means"], held["bias"], sweeps, held["spread"], held["shapes"],
+        held["means"],
+        held["bias"],
+        sweeps,
+        held["spread"],
+        held["shapes"],
         MovedClasses(*(held[name] for name in moved)) if moved else None,
-    )  # fmt: skip
+    )

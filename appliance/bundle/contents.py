@@ -1,4 +1,5 @@
-"""What a bundle holds once it was read and checked: manifest, model, golden sweeps, class means, enrolled labels."""
+"""What a bundle holds once it was read and checked: manifest, model, golden sweeps, class means,
+enrolled labels."""
 
 from __future__ import annotations
 
@@ -14,10 +15,11 @@ from appliance.core.types import SweepFormat
 
 @dataclass(frozen=True, slots=True)
 class MovedClasses:
-    """The classes as they are where the contact has moved, in the embedding turned so that moved sweeps have covariance 1.
+    """The classes as they are where the contact has moved, in the embedding turned so that moved
+    sweeps have covariance 1.
 
-    turn: float32 [r, r], embedding @ turn is the turned one. means: float32 [K, r]; shapes: float16 [K, b, b], see
-    Classes.
+    turn: float32 [r, r], embedding @ turn is the turned one. means: float32 [K, r]; shapes: float16
+    [K, b, b], see Classes.
     """
 
     turn: NDArray[np.float32]
@@ -29,12 +31,14 @@ class MovedClasses:
 class Classes:
     """Content of means.npz: the class means in the embedding, in the order of the labels.
 
-    means: float32 [K, r]. bias: float32 [K], added to the product of mean and embedding. sweeps: int64 [K], number of
-    sweeps that a label was enrolled from; 0 for a trained label. spread: float32 [K], variance of the label's sweeps
-    per direction of the embedding; 1 for a trained label, and for all labels if the file has no such array.
-    shapes: float16 [K, b, b], how the label's sweeps scatter in the last b directions of the embedding: what a difference
-    from the mean is multiplied by before it is squared; 1 for an enrolled label, b = 0 if the file has no such array.
-    moved: the same for sweeps whose contact has moved, None if the manifest has no `moved`.
+    means: float32 [K, r]. bias: float32 [K], added to the product of mean and embedding. sweeps:
+    int64 [K], number of sweeps that a label was enrolled from; 0 for a trained label. spread:
+    float32 [K], variance of the label's sweeps per direction of the embedding; 1 for a trained
+    label, and for all labels if the file has no such array. shapes: float16 [K, b, b], how the
+    label's sweeps scatter in the last b directions of the embedding: what a difference from the
+    mean is multiplied by before it is squared; 1 for an enrolled label, b = 0 if the file has no
+    such array. moved: the same for sweeps whose contact has moved, None if the manifest has no
+    `moved`.
     """
 
     means: NDArray[np.float32]
@@ -48,18 +52,22 @@ class Classes:
         """The arrays of means.npz by name."""
         own = {name: getattr(self, name) for name in self.__slots__ if name != "moved"}
         return own | (
-            {f"moved_{name}": getattr(self.moved, name) for name in self.moved.__slots__} if self.moved else {}
+            {f"moved_{name}": getattr(self.moved, name) for name in self.moved.__slots__}
+            if self.moved
+            else {}
         )
 
 
 @dataclass(frozen=True, slots=True)
 class AddedLabels:
-    """Content of enrolment.npz: the labels that a box has enrolled into a bundle, in the order in which it did.
+    """Content of enrolment.npz: the labels that a box has enrolled into a bundle, in the order in
+    which it did.
 
-    base: sha256 of the manifest of that bundle, hexadecimal. labels: [n]. means: float32 [n, r], of each label's sweeps in
-    the embedding; sweeps: int64 [n], how many these were; spread: float32 [n], as in Classes. golden: raw counts [n, T, R, C]
-    or [n, T, R, C, A], one sweep of each label. logits: float32 [G + n, K + n] of the base's G golden sweeps and these, for
-    its K labels and these.
+    base: sha256 of the manifest of that bundle, hexadecimal. labels: [n]. means: float32 [n, r], of
+    each label's sweeps in the embedding; sweeps: int64 [n], how many these were; spread: float32
+    [n], as in Classes. golden: raw counts [n, T, R, C] or [n, T, R, C, A], one sweep of each label.
+    logits: float32 [G + n, K + n] of the base's G golden sweeps and these, for its K labels and
+    these.
     """
 
     base: str
@@ -75,11 +83,12 @@ class AddedLabels:
 class Bundle:
     """A bundle whose files agree with its manifest.
 
-    id: the first eight hexadecimal digits of `bundle.named_by`. model: the bytes of model.onnx. golden: raw counts
-    [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K]. classes: the class means, None if the manifest has no
-    `known`. added: labels that a box has enrolled; manifest, golden sweeps and classes have them, too. None where there are
-    none. base: sha256 of manifest.json as it is in the folder, "" where it was not read from one. memory: bytes that the model needs
-    at most, by the account of onnx_check.
+    id: the first eight hexadecimal digits of `bundle.named_by`. model: the bytes of model.onnx.
+    golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K]. classes: the
+    class means, None if the manifest has no `known`. added: labels that a box has enrolled;
+    manifest, golden sweeps and classes have them, too. None where there are none. base: sha256 of
+    manifest.json as it is in the folder, "" where it was not read from one. memory: bytes that the
+    model needs at most, by the account of onnx_check.
     """
 
     manifest: Manifest
@@ -97,7 +106,11 @@ class Bundle:
         """The labels that were enrolled, with the number of sweeps each was enrolled from."""
         if self.classes is None:
             return {}
-        return {label: int(n) for label, n in zip(self.manifest.labels, self.classes.sweeps, strict=True) if n}
+        return {
+            label: int(n)
+            for label, n in zip(self.manifest.labels, self.classes.sweeps, strict=True)
+            if n
+        }
 
     @property
     def format(self) -> SweepFormat:

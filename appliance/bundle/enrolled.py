@@ -1,9 +1,10 @@
-"""Labels that a box has enrolled into a bundle by itself. In: the bundle, the bytes of enrolment.npz. Out: the bundle with
-these labels, or a BundleError.
+"""Labels that a box has enrolled into a bundle by itself. In: the bundle, the bytes of
+enrolment.npz. Out: the bundle with these labels, or a BundleError.
 
-Nothing of the bundle is changed: its files stay as they are, and its own signature covers them. The file holds, of each
-label, the mean of its sweeps in the embedding, their number and spread, and a golden sweep; all that a class has besides
-(bias, shape, mean where the contact has moved) is computed from these. So a label is all that an enrolment can add.
+Nothing of the bundle is changed: its files stay as they are, and its own signature covers them. The
+file holds, of each label, the mean of its sweeps in the embedding, their number and spread, and a
+golden sweep; all that a class has besides (bias, shape, mean where the contact has moved) is
+computed from these. So a label is all that an enrolment can add.
 """
 
 from __future__ import annotations
@@ -30,18 +31,28 @@ AGAIN = "enrol again (palpate enrol)"
 def file(added: AddedLabels) -> bytes:
     """The bytes of enrolment.npz; the same for the same labels."""
     return arrays.packed(
-        base=np.array(added.base), labels=np.array(added.labels), means=added.means, sweeps=added.sweeps, spread=added.spread,
-        changes=arrays.changes(added.golden), logits=added.logits,
-    )  # fmt: skip
+        base=np.array(added.base),
+        labels=np.array(added.labels),
+        means=added.means,
+        sweeps=added.sweeps,
+        spread=added.spread,
+        changes=arrays.changes(added.golden),
+        logits=added.logits,
+    )
 
 
 def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
-    """`bundle` with the labels of `data`, under this id. Raises BundleError where `data` is not the enrolment of this
-    bundle, or of another form."""
+    """`bundle` with the labels of `data`, under this id. Raises BundleError where `data` is not the
+    enrolment of this bundle, or of another form."""
     added = _read(bundle, data)
     for k, label in enumerate(added.labels):
         bundle = with_label(
-            bundle, label, added.means[k], int(added.sweeps[k]), float(added.spread[k]), added.golden[k]
+            bundle,
+            label,
+            added.means[k],
+            int(added.sweeps[k]),
+            float(added.spread[k]),
+            added.golden[k],
         )
     assert bundle.classes
     arrays.check_classes(bundle.classes.arrays(), len(bundle.manifest.labels))
@@ -49,30 +60,45 @@ def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
 
 
 def with_label(
-    bundle: Bundle, label: str, mean: NDArray[np.float32], sweeps: int, spread: float, golden: NDArray[Any]
+    bundle: Bundle,
+    label: str,
+    mean: NDArray[np.float32],
+    sweeps: int,
+    spread: float,
+    golden: NDArray[Any],
 ) -> Bundle:
-    """`bundle` with one more label, by the mean [r] of so many sweeps in the embedding, and one golden sweep [T, R, C] or
-    [T, R, C, A]; logits of golden sweeps and id are still those of before.
+    """`bundle` with one more label, by the mean [r] of so many sweeps in the embedding, and one
+    golden sweep [T, R, C] or [T, R, C, A]; logits of golden sweeps and id are still those of
+    before.
 
-    The early heads do not know the label, and the figures of `bundle` no longer hold: both are removed. Raises BundleError
-    for a label that is taken or cannot be sent.
+    The early heads do not know the label, and the figures of `bundle` no longer hold: both are
+    removed. Raises BundleError for a label that is taken or cannot be sent.
     """
     assert bundle.classes
     m = bundle.manifest
     manifest = replace(
-        m, labels=(*m.labels, label), version=f"{m.version}+{label}", early=None, figures={},
+        m,
+        labels=(*m.labels, label),
+        version=f"{m.version}+{label}",
+        early=None,
+        figures={},
         made=m.made | {"enrolled": bundle.enrolled | {label: sweeps}},
-    )  # fmt: skip
+    )
     classes = extended(bundle.classes, mean, sweeps, spread)
-    return replace(bundle, manifest=manifest, classes=classes, golden=np.concatenate([bundle.golden, golden[None]]))
+    return replace(
+        bundle,
+        manifest=manifest,
+        classes=classes,
+        golden=np.concatenate([bundle.golden, golden[None]]),
+    )
 
 
 def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -> Classes:
     """`classes` with one more label, whose `sweeps` have this mean [r] in the embedding.
 
-    Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on average larger than that of the true mean,
-    by r / n. Its shape is that of all materials together. A moved skin is assumed to change its mean as it changes those of
-    the trained labels on average.
+    Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on average larger than
+    that of the true mean, by r / n. Its shape is that of all materials together. A moved skin is
+    assumed to change its mean as it changes those of the trained labels on average.
     """
     row, moved = mean.astype(np.float32).astype(np.float64), classes.moved
     if moved:
@@ -83,10 +109,13 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
     with np.errstate(over="ignore"):  # what is not finite then is refused
         bias = -(row @ row) / 2 + len(row) / (2 * sweeps)
         return Classes(
-            np.vstack([classes.means, row]).astype(np.float32), np.append(classes.bias, bias).astype(np.float32),
-            np.append(classes.sweeps, sweeps), np.append(classes.spread, spread).astype(np.float32),
-            _one_more(classes.shapes), moved,
-        )  # fmt: skip
+            np.vstack([classes.means, row]).astype(np.float32),
+            np.append(classes.bias, bias).astype(np.float32),
+            np.append(classes.sweeps, sweeps),
+            np.append(classes.spread, spread).astype(np.float32),
+            _one_more(classes.shapes),
+            moved,
+        )
 
 
 def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
@@ -98,30 +127,47 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
     """The content of `data`, checked by what `bundle` is. Raises BundleError."""
     held = arrays.read(data, ENROLMENT, *ARRAYS)
     base, labels = held["base"], held["labels"]
-    if base.dtype.kind != "U" or base.shape != () or labels.dtype.kind != "U" or labels.ndim != 1 or not len(labels):
+    if (
+        base.dtype.kind != "U"
+        or base.shape != ()
+        or labels.dtype.kind != "U"
+        or labels.ndim != 1
+        or not len(labels)
+    ):
         raise BundleError(f"{ENROLMENT} names no bundle and its labels; {AGAIN}")
     if base.item() != bundle.base:
         raise BundleError(
             f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files beside it are those of {bundle.id}; {AGAIN}"
         )
     if bundle.classes is None or not bundle.manifest.known:
-        raise BundleError(f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the file")
+        raise BundleError(
+            f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the file"
+        )
     _check(held, bundle, len(labels))
     golden = arrays.summed(held["changes"], bundle.format, ENROLMENT)
     return AddedLabels(
-        base.item(), tuple(labels.tolist()), held["means"], held["sweeps"], held["spread"], golden, held["logits"]
+        base.item(),
+        tuple(labels.tolist()),
+        held["means"],
+        held["sweeps"],
+        held["spread"],
+        golden,
+        held["logits"],
     )
 
 
 def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
-    """Raises BundleError where an array has another type, shape or range than `n` labels for `bundle` have."""
+    """Raises BundleError where an array has another type, shape or range than `n` labels for
+    `bundle` have."""
     assert bundle.classes
     f, golden = bundle.format, len(bundle.golden) + n
     wanted = {
-        "means": ("float32", (n, bundle.classes.means.shape[1])), "sweeps": ("int64", (n,)), "spread": ("float32", (n,)),
+        "means": ("float32", (n, bundle.classes.means.shape[1])),
+        "sweeps": ("int64", (n,)),
+        "spread": ("float32", (n,)),
         "changes": ("uint8", (f.numpy_type.itemsize, n, f.window, *f.shape)),
         "logits": ("float32", (golden, len(bundle.manifest.labels) + n)),
-    }  # fmt: skip
+    }
     for name, (kind, shape) in wanted.items():
         values = held[name]
         if values.dtype != kind or values.shape != shape:
@@ -130,5 +176,10 @@ def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
             )
         if not np.isfinite(values).all():
             raise BundleError(f"{ENROLMENT} holds {name} that are not finite; {AGAIN}")
-    if not ((held["sweeps"] >= 1) & (held["sweeps"] <= MOST_SWEEPS)).all() or not (held["spread"] >= 1).all():
-        raise BundleError(f"{ENROLMENT} holds a number of sweeps or a spread below 1, or too many; {AGAIN}")
+    if (
+        not ((held["sweeps"] >= 1) & (held["sweeps"] <= MOST_SWEEPS)).all()
+        or not (held["spread"] >= 1).all()
+    ):
+        raise BundleError(
+            f"{ENROLMENT} holds a number of sweeps or a spread below 1, or too many; {AGAIN}"
+        )

@@ -1,4 +1,5 @@
-"""The manifest of a bundle. In: the bytes of manifest.json. Out: a checked Manifest, and the bytes of one.
+"""The manifest of a bundle. In: the bytes of manifest.json. Out: a checked Manifest, and the bytes
+of one.
 
 The dataclasses are its schema. What was read can be computed with, printed and written again.
 """
@@ -23,16 +24,18 @@ from appliance.signal.contact import ContactPositions
 from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
-"""Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`, `place`) and 3 (without
-`moved`) are read."""
+"""Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`,
+`place`) and 3 (without `moved`) are read."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
-"""Form of a label. It is sent in sentences, so it has no comma, star or dollar sign and at most 24 characters."""
+"""Form of a label. It is sent in sentences, so it has no comma, star or dollar sign and at most 24
+characters."""
 UNSURE = 0.5
 """Least probability for status ok where a bundle names none."""
 MOST_BYTES = 64 << 20
-"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; what a model may need in memory is checked by onnx_check."""
+"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; what a model may
+need in memory is checked by onnx_check."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
@@ -51,8 +54,8 @@ class Thresholds(WindowLimits):
 class Early:
     """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
 
-    least: [D], the probability that a label must reach at each step; above 1 a step never answers. agree: number of
-    steps in a row, including the newest, that must name the same label.
+    least: [D], the probability that a label must reach at each step; above 1 a step never answers.
+    agree: number of steps in a row, including the newest, that must name the same label.
     """
 
     least: tuple[float, ...]
@@ -60,7 +63,9 @@ class Early:
 
     def __post_init__(self) -> None:
         if not self.least or not all(_positive(p) for p in self.least):
-            raise BundleError(f"early.least {list(self.least)} must be numbers above 0, one for each step")
+            raise BundleError(
+                f"early.least {list(self.least)} must be numbers above 0, one for each step"
+            )
         if type(self.agree) is not int or self.agree < 1:
             raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
 
@@ -69,8 +74,8 @@ class Early:
 class Known:
     """Rule for unknown materials. Raises BundleError for a number out of range.
 
-    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it the material is
-    unknown. temperature: divisor of the logits from class means.
+    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
+    the material is unknown. temperature: divisor of the logits from class means.
     """
 
     limit: float
@@ -82,10 +87,12 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """Rule for sweeps whose contact has moved, by `place`. Raises BundleError for a number out of range.
+    """Rule for sweeps whose contact has moved, by `place`. Raises BundleError for a number out of
+    range.
 
-    limit: as that of Known, for distances between moved sweeps. temperature: divisor of logits that are calibrated for
-    sweeps in place. unsure: least probability for status ok; above 1 no such sweep is ok by itself.
+    limit: as that of Known, for distances between moved sweeps. temperature: divisor of logits that
+    are calibrated for sweeps in place. unsure: least probability for status ok; above 1 no such
+    sweep is ok by itself.
     """
 
     limit: float
@@ -110,13 +117,13 @@ def _positive(value: object) -> bool:
 class Manifest:
     """The manifest of a bundle. Raises BundleError for values out of range.
 
-    input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation protocol. made:
-    commit, seed and machine of the export. early, known, place, moved: rules for early answers and unknown materials,
-    contact positions of training, and the rule for contacts elsewhere; None if the bundle does not support them.
-    unloaded: raw counts of the skin without contact, the values of a frame in their order; () where they are not known,
-    which `json` omits.
-    runtime: least version of the box that can run it. counter: increases with each signed bundle, so that an older one
-    cannot be installed unnoticed; 0 was never signed.
+    input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation
+    protocol. made: commit, seed and machine of the export. early, known, place, moved: rules for
+    early answers and unknown materials, contact positions of training, and the rule for contacts
+    elsewhere; None if the bundle does not support them. unloaded: raw counts of the skin without
+    contact, the values of a frame in their order; () where they are not known, which `json` omits.
+    runtime: least version of the box that can run it. counter: increases with each signed bundle,
+    so that an older one cannot be installed unnoticed; 0 was never signed.
     """
 
     name: str
@@ -143,15 +150,23 @@ class Manifest:
                 f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: update one of them"
             )
         if self.input not in INPUTS:
-            raise BundleError(f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}")
+            raise BundleError(
+                f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}"
+            )
         _check_age(self)
         _check_files(self.files)
         if (self.known is not None) != (MEANS in self.files):
-            raise BundleError(f"manifest must have both `known` and {MEANS}, or neither; export the bundle again")
+            raise BundleError(
+                f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
+            )
         if self.moved and not (self.known and self.place):
-            raise BundleError("manifest has `moved` without `known` and `place`; export the bundle again")
+            raise BundleError(
+                "manifest has `moved` without `known` and `place`; export the bundle again"
+            )
         if self.place and self.thresholds.contact is None:
-            raise BundleError("manifest has `place` without `thresholds.contact`; export the bundle again")
+            raise BundleError(
+                "manifest has `place` without `thresholds.contact`; export the bundle again"
+            )
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
                 f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have {self.format.channels}; "
@@ -177,12 +192,14 @@ class Manifest:
 
     @property
     def tare(self) -> NDArray[np.float64]:
-        """Raw counts of the unloaded skin, of the shape of a frame, from which the box starts; 0 where they are not known."""
+        """Raw counts of the unloaded skin, of the shape of a frame, from which the box starts; 0
+        where they are not known."""
         return np.array(self.unloaded or (0.0,) * self.format.channels).reshape(self.format.shape)
 
     @classmethod
     def parse(cls, text: bytes) -> Manifest:
-        """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong type."""
+        """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong
+        type."""
         try:
             made = typed(cls, json.loads(text))
             made.json()  # raises if it is nested too deeply to be written again after enrolment
@@ -192,7 +209,8 @@ class Manifest:
 
 
 def version(text: object) -> tuple[int, ...]:
-    """A version as a tuple of numbers, for comparison. Raises BundleError if it is not of the form 1.2.3."""
+    """A version as a tuple of numbers, for comparison. Raises BundleError if it is not of the form
+    1.2.3."""
     if not isinstance(text, str) or not _VERSION.fullmatch(text):
         raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
     return tuple(map(int, text.split(".")))
@@ -201,9 +219,13 @@ def version(text: object) -> tuple[int, ...]:
 def _check_age(m: Manifest) -> None:
     """Raises BundleError if a manifest has keys that its schema version does not have."""
     if m.schema == 1 and (m.early or m.known):
-        raise BundleError("manifest schema 1 has no `early` and no `known`; export the bundle again")
+        raise BundleError(
+            "manifest schema 1 has no `early` and no `known`; export the bundle again"
+        )
     if m.schema < 3 and (m.place or m.counter or m.runtime != "0.0.0"):
-        raise BundleError(f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again")
+        raise BundleError(
+            f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again"
+        )
     if m.schema < 4 and m.moved:
         raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
 
@@ -212,9 +234,15 @@ def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
     """Raises BundleError for a file that no bundle has, or an entry without sha256 and size."""
     for name, entry in files.items():
         if name not in (MODEL, GOLDEN, MEANS):
-            raise BundleError(f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone")
+            raise BundleError(
+                f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone"
+            )
         hashed, size = entry.get("sha256"), entry.get("bytes")
-        if entry.keys() != {"sha256", "bytes"} or not isinstance(hashed, str) or not _SHA256.fullmatch(hashed):
+        if (
+            entry.keys() != {"sha256", "bytes"}
+            or not isinstance(hashed, str)
+            or not _SHA256.fullmatch(hashed)
+        ):
             raise BundleError(
                 f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the bundle again"
             )
@@ -230,4 +258,6 @@ def _check_labels(labels: tuple[str, ...]) -> None:
         raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
     for label in labels:
         if not isinstance(label, str) or not LABEL.fullmatch(label):
-            raise BundleError(f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'")
+            raise BundleError(
+                f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+            )

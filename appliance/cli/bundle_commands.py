@@ -1,4 +1,5 @@
-"""The commands of `palpate` for the bundles in the store: list, install, verify, commit, roll back, promote.
+"""The commands of `palpate` for the bundles in the store: list, install, verify, commit, roll back,
+promote.
 
 In: arguments. Out: lines on standard output, exit codes.
 """
@@ -34,8 +35,8 @@ NEXT = "from the next start on: systemctl restart palpate"
 class ListedBundle:
     """One bundle of the store; sha "" for the packaged one, which nobody signed.
 
-    role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept, or damaged.
-    detail: the progress of its trial, why it was left, or what is wrong with it.
+    role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept,
+    or damaged. detail: the progress of its trial, why it was left, or what is wrong with it.
     """
 
     sha: str
@@ -51,18 +52,29 @@ class ListedBundle:
 def entries(store: Store) -> list[ListedBundle]:
     """The bundles of the store, those that matter most first."""
     current, state = store.current, store.state
-    names = sorted(p.name for p in store.bundles.folder.iterdir()) if store.bundles.folder.is_dir() else []
-    listed = [_entry(store, sha, current, state) for sha in (*filter(SHA.fullmatch, names), PACKAGED)]
+    names = (
+        sorted(p.name for p in store.bundles.folder.iterdir())
+        if store.bundles.folder.is_dir()
+        else []
+    )
+    listed = [
+        _entry(store, sha, current, state) for sha in (*filter(SHA.fullmatch, names), PACKAGED)
+    ]
     order = ("current", "on trial", "previous", "candidate", "left", "kept", "damaged")
     return sorted(listed, key=lambda e: order.index(e.role))
 
 
 def lines(listed: Iterable[ListedBundle]) -> list[str]:
     """A table for a person."""
-    rows = [(e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in listed]
+    rows = [
+        (e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in listed
+    ]
     rows = [("role", "id", "bundle", "counter", "signed by", ""), *rows]
     wide = [max(len(row[i]) for row in rows) for i in range(5)]
-    return ["  ".join([*(t.ljust(w) for t, w in zip(row, wide, strict=False)), row[-1]]).rstrip() for row in rows]
+    return [
+        "  ".join([*(t.ljust(w) for t, w in zip(row, wide, strict=False)), row[-1]]).rstrip()
+        for row in rows
+    ]
 
 
 def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBundle:
@@ -74,7 +86,16 @@ def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBun
             signed = store.bundles.get(sha)
             loaded, signer = signed.bundle, signed.signer
     except BundleError as e:
-        return ListedBundle(sha, sha[:8], "?", "?", 0, "?", "damaged", " ".join(filter(None, (role, detail, str(e)))))
+        return ListedBundle(
+            sha,
+            sha[:8],
+            "?",
+            "?",
+            0,
+            "?",
+            "damaged",
+            " ".join(filter(None, (role, detail, str(e)))),
+        )
     m = loaded.manifest
     return ListedBundle(sha, loaded.id, m.name, m.version, m.counter, signer, role, detail)
 
@@ -115,24 +136,31 @@ def run_install(args: argparse.Namespace) -> int:
     store = assembly.store(settings)
     skin = None if args.other_skin else streaming(settings, store)
     sha = store.install(args.folder, args.shadow, lambda new: suits(new, skin))
-    committed = "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
+    committed = (
+        "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
+    )
     print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
     return 0
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:
-    """The format of the skin that streams into the service now: that of the bundle that runs. None where that is not
-    known."""
+    """The format of the skin that streams into the service now: that of the bundle that runs. None
+    where that is not known."""
     try:
         report = status.read(Path(settings.store.status), SystemClock().now_ns())
         running = store.running().bundle
     except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
         return None
-    return running.format if report["running"] and report["streams"] and report["bundle"] == running.id else None
+    return (
+        running.format
+        if report["running"] and report["streams"] and report["bundle"] == running.id
+        else None
+    )
 
 
 def suits(new: Bundle, skin: SweepFormat | None) -> None:
-    """Raises BundleError where `new` is for another skin than the one that streams; None: nothing is known of it."""
+    """Raises BundleError where `new` is for another skin than the one that streams; None: nothing
+    is known of it."""
     if skin and not fits(skin, new.format):
         raise BundleError(
             f"bundle {new.id} is for a skin of {new.format}, and the one that streams has {skin}: it would answer no "
@@ -170,6 +198,10 @@ def run_promote(args: argparse.Namespace) -> int:
 
 
 RUNS = {
-    "bundles": run_bundles, "install": run_install, "verify": run_verify, "commit": run_commit, "rollback": run_rollback,
+    "bundles": run_bundles,
+    "install": run_install,
+    "verify": run_verify,
+    "commit": run_commit,
+    "rollback": run_rollback,
     "promote": run_promote,
-}  # fmt: skip
+}

@@ -1,4 +1,5 @@
-"""The commands of `palpate` but those for bundles in the store: run, record, check, enrol, align, replay, config, status.
+"""The commands of `palpate` but those for bundles in the store: run, record, check, enrol, align,
+replay, config, status.
 
 In: arguments, and for the first five a way to the devices, which `main` chooses. Out: exit codes.
 """
@@ -48,11 +49,13 @@ if TYPE_CHECKING:
 Facts = Mapping[str, Callable[[], object]]
 """Further facts of the status and the feed, by their names; a text is shown to a person."""
 OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
-"""Opens the devices. Its argument gives the format that a simulated skin has to send; None for whatever its script has."""
+"""Opens the devices. Its argument gives the format that a simulated skin has to send; None for
+whatever its script has."""
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings that a command's options ask for. --every and --sweep are settings of the trigger by the clock."""
+    """The settings that a command's options ask for. --every and --sweep are settings of the
+    trigger by the clock."""
     sets = list(args.set)
     for key, option in (("skin", "skin"), ("port", "skin_port")):
         if value := getattr(args, option, None):
@@ -61,7 +64,9 @@ def load_settings(args: argparse.Namespace) -> Config:
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:
         if mode not in (None, "timed"):
-            raise ConfigError(f"--every and --sweep are for --trigger timed, not for {mode}; leave them out")
+            raise ConfigError(
+                f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
+            )
         mode = "timed"
     for key, value in (("mode", mode), ("every_s", every), ("sweep_s", sweep)):
         sets += [f"trigger.{key}={value}"] if value is not None else []
@@ -82,7 +87,8 @@ def stop_flag() -> Callable[[], bool]:
 
 
 def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
-    """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was answered."""
+    """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was
+    answered."""
     settings, stopped = load_settings(args), stop_flag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
@@ -100,18 +106,27 @@ def run(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
         }
         observers: list[Observer | None] = [
-            Notifier(SystemClock()), trial, shadow, *_reports(settings, current, devices.source, facts, stack),
-        ]  # fmt: skip
+            Notifier(SystemClock()),
+            trial,
+            shadow,
+            *_reports(settings, current, devices.source, facts, stack),
+        ]
         box = assembly.box(
-            settings, current, devices, port, stack, capture=_capture(args, settings, current.format, stack),
+            settings,
+            current,
+            devices,
+            port,
+            stack,
+            capture=_capture(args, settings, current.format, stack),
             observers=[o for o in observers if o],
-        )  # fmt: skip
+        )
         box.run(_done(args, box, devices, stopped))
     return 0
 
 
 def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
-    """`palpate record`: each sweep is kept with its label. No bundle is needed: the skin says what it sends."""
+    """`palpate record`: each sweep is kept with its label. No bundle is needed: the skin says what
+    it sends."""
     from appliance.recording.recording import Labels, RecordingSession
 
     labels = Labels(args.material, args.position, args.session)
@@ -123,27 +138,50 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         if args.window is not None:
             fmt = replace(fmt, window=round(args.window * fmt.rate_hz))
         _check_length(fmt, settings)
-        # a person at a terminal reads the log; sentences are for a robot, or for a program that reads the output
-        port = assembly.port(settings, devices) if settings.serial.port or not sys.stdout.isatty() else None
+        # a person at a terminal reads the log; sentences are for a robot, or for a program that
+        # reads the output
+        port = (
+            assembly.port(settings, devices)
+            if settings.serial.port or not sys.stdout.isatty()
+            else None
+        )
         folder = args.out or Path(settings.store.folder) / "sweeps"
-        recording = RecordingSession(folder, fmt, labels, devices.clock, _sentences(port), args.target)
+        recording = RecordingSession(
+            folder, fmt, labels, devices.clock, _sentences(port), args.target
+        )
         stack.callback(recording.close)
-        page = _record_page(args, settings, fmt, devices, recording, lambda command: box.obey(command))
-        log.info(f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:.3g} s")
+        page = _record_page(
+            args, settings, fmt, devices, recording, lambda command: box.obey(command)
+        )
+        log.info(
+            f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:.3g} s"
+        )
         if slow := skin_profile.warning(fmt):
             log.warning(f"record: {slow}")
         facts: Facts = {
-            "model": lambda: "none: sweeps are recorded", "recorded": lambda: recording.about()["missing"],
+            "model": lambda: "none: sweeps are recorded",
+            "recorded": lambda: recording.about()["missing"],
             "recording": recording.about,
-        }  # fmt: skip
+        }
         feed = _feed(settings, fmt, devices.source, {"bundle": "", "labels": []}, facts)
         box = assembly.recorder(
-            settings, fmt, devices, port, stack, capture=_capture(args, settings, fmt, stack),
+            settings,
+            fmt,
+            devices,
+            port,
+            stack,
+            capture=_capture(args, settings, fmt, stack),
             observers=[
-                Notifier(SystemClock()), recording, *_printer(fmt, recording), *_status(settings, facts), *feed, *page,
+                Notifier(SystemClock()),
+                recording,
+                *_printer(fmt, recording),
+                *_status(settings, facts),
+                *feed,
+                *page,
             ],
-            commands=recording.commands, ordered=bool(page),
-        )  # fmt: skip
+            commands=recording.commands,
+            ordered=bool(page),
+        )
         for shown in page:
             stack.enter_context(shown)
         box.run(_done(args, box, devices, stopped))
@@ -160,9 +198,13 @@ def _printer(fmt: SweepFormat, recording: RecordingSession) -> list[Observer]:
 
 
 def _record_page(
-    args: argparse.Namespace, settings: Config, fmt: SweepFormat, devices: Devices, recording: RecordingSession,
+    args: argparse.Namespace,
+    settings: Config,
+    fmt: SweepFormat,
+    devices: Devices,
+    recording: RecordingSession,
     obey: Callable[[Command], list[object]],
-) -> list[RecordPage]:  # fmt: skip
+) -> list[RecordPage]:
     """The page on which a person sees the recording and sets its labels, where one is asked for."""
     if args.web is None:
         return []
@@ -170,7 +212,15 @@ def _record_page(
     from appliance.watch.record import RecordPage
 
     access = Access.configured(settings.watch, args.web)
-    page = RecordPage(access, fmt, devices.source, devices.wire(settings).trigger, recording.about, obey, SystemClock())
+    page = RecordPage(
+        access,
+        fmt,
+        devices.source,
+        devices.wire(settings).trigger,
+        recording.about,
+        obey,
+        SystemClock(),
+    )
     log.info(f"page: {page.server.address}")
     return [page]
 
@@ -180,7 +230,9 @@ def _announced(settings: Config, devices: Devices) -> SweepFormat:
     try:
         return skins.announced(settings, devices)
     except SensorError as e:
-        raise type(e)(f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for") from e
+        raise type(e)(
+            f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for"
+        ) from e
 
 
 def _check_length(fmt: SweepFormat, settings: Config) -> None:
@@ -196,28 +248,38 @@ def _sentences(port: Port | None) -> Callable[[bytes], None]:
     return port.say if port else lambda line: None
 
 
-def _capture(args: argparse.Namespace, settings: Config, fmt: SweepFormat, stack: ExitStack) -> CaptureWriter | None:
+def _capture(
+    args: argparse.Namespace, settings: Config, fmt: SweepFormat, stack: ExitStack
+) -> CaptureWriter | None:
     capture = CaptureWriter(args.capture, fmt, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)
     return capture
 
 
-def _done(args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]) -> Callable[[], bool]:
+def _done(
+    args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
+) -> Callable[[], bool]:
     """True when the loop is to end: by a signal, after --sweeps answers, at the end of a script."""
     return lambda: (
-        (args.sweeps is not None and box.answered >= args.sweeps) or stopped() or devices.finished(box.answered)
+        (args.sweeps is not None and box.answered >= args.sweeps)
+        or stopped()
+        or devices.finished(box.answered)
     )
 
 
-def _reports(settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack) -> list[Observer]:
-    """What reports to a person and keeps sweeps, as the settings say: the log, the black box, status and feed with
-    `facts`. source: where the frames come from."""
+def _reports(
+    settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack
+) -> list[Observer]:
+    """What reports to a person and keeps sweeps, as the settings say: the log, the black box,
+    status and feed with `facts`. source: where the frames come from."""
     observers: list[Observer] = [VerdictLog()] if in_journal() else []
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
 
-        black_box = BlackBox(Path(settings.store.folder) / "black-box", current.format, settings.store.black_box)
+        black_box = BlackBox(
+            Path(settings.store.folder) / "black-box", current.format, settings.store.black_box
+        )
         stack.callback(black_box.close)
         observers.append(black_box)
     m = current.manifest
@@ -227,7 +289,11 @@ def _reports(settings: Config, current: Bundle, source: str, facts: Facts, stack
 
     expected = Expected.by(current, settings.sensor.fingertip)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
-    return [*observers, *_status(settings, facts), *_feed(settings, current.format, source, known, facts)]
+    return [
+        *observers,
+        *_status(settings, facts),
+        *_feed(settings, current.format, source, known, facts),
+    ]
 
 
 def _status(settings: Config, facts: Facts) -> list[Observer]:
@@ -238,9 +304,11 @@ def _status(settings: Config, facts: Facts) -> list[Observer]:
     return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
 
 
-def _feed(settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts) -> list[Observer]:
-    """What programs that watch the box read, where the settings name a socket; its default is for a service, whose
-    folder is there. model: what the feed's first line says of it."""
+def _feed(
+    settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
+) -> list[Observer]:
+    """What programs that watch the box read, where the settings name a socket; its default is for a
+    service, whose folder is there. model: what the feed's first line says of it."""
     path = Path(settings.feed.socket)
     default = settings.sources["feed.socket"] == "code"
     if not settings.feed.socket or (default and not os.access(path.parent, os.W_OK)):
@@ -248,11 +316,18 @@ def _feed(settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, A
     from appliance.service.feed import FeedServer
 
     known = {"source": source, "skin": settings.sensor.skin, **model}
-    return [FeedServer(path, fmt, known, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
+    return [
+        FeedServer(
+            path, fmt, known, SystemClock(), lambda: {name: fact() for name, fact in facts.items()}
+        )
+    ]
 
 
-def _shadow(args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices) -> Shadow | None:
-    """A candidate that classifies beside the current bundle, where one is asked for and there is one."""
+def _shadow(
+    args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices
+) -> Shadow | None:
+    """A candidate that classifies beside the current bundle, where one is asked for and there is
+    one."""
     try:
         candidate = None
         if args.shadow:
@@ -264,16 +339,23 @@ def _shadow(args: argparse.Namespace, settings: Config, current: Bundle, devices
         from appliance.deployment.shadow import Shadow
 
         return Shadow(
-            candidate, current, Path(settings.store.folder) / "shadow", devices.clock,
+            candidate,
+            current,
+            Path(settings.store.folder) / "shadow",
+            devices.clock,
             lambda judged: assembly.classifier(settings, judged, devices.clock),
-        )  # fmt: skip
-    except (ApplianceError, OSError) as e:  # the box serves the robot, the candidate is for a person
+        )
+    except (
+        ApplianceError,
+        OSError,
+    ) as e:  # the box serves the robot, the candidate is for a person
         log.warning(f"no shadow: {e}")
         return None
 
 
 def _open_any(open_devices: OpenDevices, settings: Config) -> Devices:
-    """The devices; a simulated skin sends what the bundle wants, where there is one and the skin can."""
+    """The devices; a simulated skin sends what the bundle wants, where there is one and the skin
+    can."""
     try:
         return open_devices(lambda: load_bundle(settings, answers=False).format)
     except (BundleError, FormatError):
@@ -285,14 +367,19 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     settings = load_settings(args)
     devices = _open_any(open_devices, settings)
     failed = 0
-    for result in check(devices.wire(settings), lambda: load_bundle(settings, answers=not args.sim), devices):
-        print(f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True)
+    for result in check(
+        devices.wire(settings), lambda: load_bundle(settings, answers=not args.sim), devices
+    ):
+        print(
+            f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True
+        )
         failed += not result.ok
     return 1 if failed else 0
 
 
 def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
-    """`palpate enrol`: the box takes sweeps as always; of the good ones it learns one label more."""
+    """`palpate enrol`: the box takes sweeps as always; of the good ones it learns one label
+    more."""
     from appliance.inference import enrolment
 
     settings = load_settings(args)
@@ -301,9 +388,13 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     enrolment.admit(start.bundle, args.label)
     if args.out:
         enrolment.check_target(args.out, args.replace)
-    new = enrolment.enrol(start.bundle, args.label, _good_sweeps(args, settings, start.bundle, open_devices))
+    new = enrolment.enrol(
+        start.bundle, args.label, _good_sweeps(args, settings, start.bundle, open_devices)
+    )
     if new.disagreement and not args.scattered:
-        raise BundleError(f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written")
+        raise BundleError(
+            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written"
+        )
     for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
     files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
@@ -313,15 +404,28 @@ def run_enrol(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         assembly.store(settings).enrol(files)
     m = new.bundle.manifest
     use = f"palpate install {args.out}" if key else "classifier.bundle; it is not signed"
-    how = f"use it with {use}" if args.out else "it runs on trial from the next start on: systemctl restart palpate"
-    log.info(f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; {how}")
+    how = (
+        f"use it with {use}"
+        if args.out
+        else "it runs on trial from the next start on: systemctl restart palpate"
+    )
+    log.info(
+        f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; {how}"
+    )
     return 0
 
 
 def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
-    """The key that signs what is enrolled, checked before the robot sweeps. None where it is not signed: what a simulated
-    skin taught, and on a bench that allows unsigned bundles. Raises ConfigError."""
-    unsigned = "--sim" if args.sim else "classifier.allow_unsigned" if settings.classifier.allow_unsigned else ""
+    """The key that signs what is enrolled, checked before the robot sweeps. None where it is not
+    signed: what a simulated skin taught, and on a bench that allows unsigned bundles. Raises
+    ConfigError."""
+    unsigned = (
+        "--sim"
+        if args.sim
+        else "classifier.allow_unsigned"
+        if settings.classifier.allow_unsigned
+        else ""
+    )
     if unsigned:
         if not args.out:
             raise ConfigError(
@@ -340,7 +444,8 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
 def _good_sweeps(
     args: argparse.Namespace, settings: Config, current: Bundle, open_devices: OpenDevices
 ) -> NDArray[Any]:
-    """The windows of as many good sweeps as are asked for. Raises ApplianceError where there are too few."""
+    """The windows of as many good sweeps as are asked for. Raises ApplianceError where there are
+    too few."""
     from appliance.inference.enrolment import SweepCollector
 
     settings = replace(settings, classifier=replace(settings.classifier, early=False))
@@ -349,7 +454,9 @@ def _good_sweeps(
     taken = SweepCollector(args.good)
     with ExitStack() as stack:
         port = assembly.port(settings, devices)
-        box = assembly.box(settings, current, devices, port, stack, observers=[taken], labels=(args.label,))
+        box = assembly.box(
+            settings, current, devices, port, stack, observers=[taken], labels=(args.label,)
+        )
         box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))
     return taken.windows()
 
@@ -378,7 +485,9 @@ def run_align(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     stopped = stop_flag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = local_page("watch.html", args.web, stack)
-        screen = stack.enter_context(Screen(sys.stdout, devices.clock, *(page.address for page in pages)))
+        screen = stack.enter_context(
+            Screen(sys.stdout, devices.clock, *(page.address for page in pages))
+        )
         displays: list[Display] = [screen, *pages]
         live.run(devices.wire(settings), expected, devices, displays, stopped)
     return 0
@@ -405,7 +514,8 @@ def _expected(settings: Config, devices: Devices) -> Expected:
 
 
 def run_replay(args: argparse.Namespace) -> int:
-    """`palpate replay`: the sentences of a capture, a kept sweep or a folder of them; 1 where a verdict differs."""
+    """`palpate replay`: the sentences of a capture, a kept sweep or a folder of them; 1 where a
+    verdict differs."""
     from appliance.runtime.replay import replay
 
     settings = load_settings(args)
@@ -420,7 +530,8 @@ def run_config(args: argparse.Namespace) -> int:
 
 
 def run_status(args: argparse.Namespace) -> int:
-    """`palpate status`: the state of the service; 69 where it waits for the skin, 1 where it does not run."""
+    """`palpate status`: the state of the service; 69 where it waits for the skin, 1 where it does
+    not run."""
     from appliance.service import status
 
     now_ns = SystemClock().now_ns()
@@ -429,5 +540,11 @@ def run_status(args: argparse.Namespace) -> int:
     return status.exit_code(report)
 
 
-WITH_DEVICES = {"run": run, "record": run_record, "check": run_check, "enrol": run_enrol, "align": run_align}
+WITH_DEVICES = {
+    "run": run,
+    "record": run_record,
+    "check": run_check,
+    "enrol": run_enrol,
+    "align": run_align,
+}
 RUNS = {"replay": run_replay, "config": run_config, "status": run_status}

@@ -1,8 +1,10 @@
-"""`python -m appliance.cli.lower_outputs`: sets the output lines low after a program that could not. In: its settings.
+"""`python -m appliance.cli.lower_outputs`: sets the output lines low after a program that could
+not. In: its settings.
 
-systemd runs it whenever `palpate run` has ended (ExecStopPost=). A program that was killed leaves its lines to the
-driver of the chip, and some drivers keep the levels: READY stays high without a box behind it. It loads neither numpy
-nor onnxruntime, so that the lines are low before the robot acts on them.
+systemd runs it whenever `palpate run` has ended (ExecStopPost=). A program that was killed leaves
+its lines to the driver of the chip, and some drivers keep the levels: READY stays high without a
+box behind it. It loads neither numpy nor onnxruntime, so that the lines are low before the robot
+acts on them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The command `palpate`: runs a command with the devices that it needs. In: arguments. Out: an exit code.
+"""The command `palpate`: runs a command with the devices that it needs. In: arguments. Out: an exit
+code.
 
 Simulated devices are chosen by name, here and nowhere else, and every sentence they cause says so.
 """
@@ -58,28 +59,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as e:
-        print(f"palpate: {e.filename or 'a file'}: {e.strerror}; check its path and who may use it", file=sys.stderr)
+        print(
+            f"palpate: {e.filename or 'a file'}: {e.strerror}; check its path and who may use it",
+            file=sys.stderr,
+        )
         return 1
 
 
-def _with_devices(run: Callable[[argparse.Namespace, OpenDevices], int], args: argparse.Namespace) -> int:
+def _with_devices(
+    run: Callable[[argparse.Namespace, OpenDevices], int], args: argparse.Namespace
+) -> int:
     return run(args, partial(_open_devices, args))
 
 
 def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat] | None) -> Devices:
-    """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated skin has to send."""
+    """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated
+    skin has to send."""
     if args.sim:
-        return _simulated(args.sim, fmt() if fmt else None, args, load_settings(args), remember=False)
+        return _simulated(
+            args.sim, fmt() if fmt else None, args, load_settings(args), remember=False
+        )
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     return Devices(SystemClock())
 
 
 def _simulated(
-    name: str, fmt: SweepFormat | None, args: argparse.Namespace, settings: Config, *, remember: bool = True,
+    name: str,
+    fmt: SweepFormat | None,
+    args: argparse.Namespace,
+    settings: Config,
+    *,
+    remember: bool = True,
     spread: bool = False,
-) -> RobotDevices:  # fmt: skip
-    """A simulated robot with the skin that the settings name: a readout board on USB, or one on a terminal."""
+) -> RobotDevices:
+    """A simulated robot with the skin that the settings name: a readout board on USB, or one on a
+    terminal."""
     from appliance.sim import devices, rig, script
 
     clock = rig.VirtualClock() if args.virtual else SystemClock()
@@ -93,15 +108,20 @@ def _simulated(
     seen = sweeps.view(settings.sensor.skin, profile.format)
     acts, source, fmt = script.named(name, fmt, args.seed, spread=spread, seen=seen)
     acts = islice(acts, args.sweeps)
-    return terminal.build(settings.sensor.skin, profile, fmt, acts, clock, source, remember=remember)
+    return terminal.build(
+        settings.sensor.skin, profile, fmt, acts, clock, source, remember=remember
+    )
 
 
 def _played_bundle(settings: Config) -> Bundle:
-    """The bundle for simulated sweeps: that of the settings, or the packaged one where only others may read what was deployed."""
+    """The bundle for simulated sweeps: that of the settings, or the packaged one where only others
+    may read what was deployed."""
     try:
         return load_bundle(settings, answers=False)
     except PermissionError as e:
-        log.warning(f"{e.filename}: {e.strerror}, so the packaged bundle plays; the deployed one with sudo -u palpate")
+        log.warning(
+            f"{e.filename}: {e.strerror}, so the packaged bundle plays; the deployed one with sudo -u palpate"
+        )
         return bundles.load(bundles.DEFAULT)
 
 
@@ -117,7 +137,14 @@ def run_demo(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        show = demo.Demo(devices.robot.played, far_end, devices.clock, sys.stdout, bundle.manifest.labels, raw=args.raw)
+        show = demo.Demo(
+            devices.robot.played,
+            far_end,
+            devices.clock,
+            sys.stdout,
+            bundle.manifest.labels,
+            raw=args.raw,
+        )
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
         show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
     return 0
@@ -130,17 +157,23 @@ def run_bench(args: argparse.Namespace) -> int:
     settings = load_settings(args)
     bundle = _played_bundle(settings)
 
-    def build(devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()) -> tuple[Box, int]:
+    def build(
+        devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()
+    ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        return assembly.box(_on_lines(settings), bundle, devices, port, stack, observers=observers), far_end
+        return assembly.box(
+            _on_lines(settings), bundle, devices, port, stack, observers=observers
+        ), far_end
 
     if args.part:
         print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))
         return 0
     from appliance.tools import bench
 
-    figures = bench.run(bundle, build, args.references, args.seed, lambda line: print(line, flush=True))
+    figures = bench.run(
+        bundle, build, args.references, args.seed, lambda line: print(line, flush=True)
+    )
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
     return 0
@@ -159,7 +192,15 @@ def _on_lines(settings: Config) -> Config:
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": run_demo, "bench": run_bench, **{f"bridge {name}": partial(_run_bridge, name) for name in bridges.TEXTS},
-    **commands.RUNS, **bundle_commands.RUNS, **skin_commands.RUNS, **watch_commands.RUNS,
-    **{name: partial(_with_devices, run) for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()},
-}  # fmt: skip
+    "demo": run_demo,
+    "bench": run_bench,
+    **{f"bridge {name}": partial(_run_bridge, name) for name in bridges.TEXTS},
+    **commands.RUNS,
+    **bundle_commands.RUNS,
+    **skin_commands.RUNS,
+    **watch_commands.RUNS,
+    **{
+        name: partial(_with_devices, run)
+        for name, run in {**commands.WITH_DEVICES, **skin_commands.WITH_DEVICES}.items()
+    },
+}

@@ -1,4 +1,5 @@
-"""The arguments of the command `palpate`. In: what each command runs. Out: a parser with help and exit codes."""
+"""The arguments of the command `palpate`. In: what each command runs. Out: a parser with help and
+exit codes."""
 
 from __future__ import annotations
 
@@ -24,8 +25,12 @@ def settings() -> argparse.ArgumentParser:
     """The options of every command that has settings."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--board", help="board file to use: firmware_config/board-NAME.toml")
-    common.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value")
-    common.add_argument("--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are")
+    common.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value"
+    )
+    common.add_argument(
+        "--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are"
+    )
     return common
 
 
@@ -39,11 +44,16 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
         help="simulated tubes, one of them, a finger at rest on one, or a sweep set, instead of the devices",
     )
     devices.add_argument(
-        "--skin", metavar="NAME",
+        "--skin",
+        metavar="NAME",
         help="profile of the skin, or the file of one (sensor.skin); with --sim the name of an emulated one",
-    )  # fmt: skip
-    devices.add_argument("--port", dest="skin_port", metavar="PATH", help="serial port of the skin (sensor.port)")
-    devices.add_argument("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
+    )
+    devices.add_argument(
+        "--port", dest="skin_port", metavar="PATH", help="serial port of the skin (sensor.port)"
+    )
+    devices.add_argument(
+        "--virtual", action="store_true", help="with --sim: do not wait for the time to pass"
+    )
     devices.add_argument("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
     answers = argparse.ArgumentParser(add_help=False)
     answers.add_argument("--sweeps", type=_count, metavar="N", help="stop after N answers")
@@ -54,18 +64,26 @@ def _trigger() -> argparse.ArgumentParser:
     """The options that say what starts and stops sweeps where there are no lines."""
     trigger = argparse.ArgumentParser(add_help=False)
     trigger.add_argument(
-        "--trigger", choices=get_args(get_type_hints(TriggerConfig)["mode"]), metavar="MODE",
+        "--trigger",
+        choices=get_args(get_type_hints(TriggerConfig)["mode"]),
+        metavar="MODE",
         help="trigger.mode: two-lines or one-line; serial: commands START and STOP; key: the space bar; timed",
-    )  # fmt: skip
-    trigger.add_argument("--every", type=float, metavar="S", help="timed: seconds from one start to the next (5)")
-    trigger.add_argument("--sweep", type=float, metavar="S", help="timed: seconds from start to stop (3)")
+    )
+    trigger.add_argument(
+        "--every", type=float, metavar="S", help="timed: seconds from one start to the next (5)"
+    )
+    trigger.add_argument(
+        "--sweep", type=float, metavar="S", help="timed: seconds from start to stop (3)"
+    )
     return trigger
 
 
 def _count(text: str) -> int:
     """A number of sweeps, for argparse."""
     if not text.isdecimal() or not 1 <= (number := int(text)) <= 1_000_000_000:
-        raise argparse.ArgumentTypeError(f"{text} is no number of sweeps; use a whole number from 1 on")
+        raise argparse.ArgumentTypeError(
+            f"{text} is no number of sweeps; use a whole number from 1 on"
+        )
     return number
 
 
@@ -76,12 +94,15 @@ def _seconds(text: str, least: float = 1.0) -> float:
     except ValueError:
         seconds = 0.0
     if not least <= seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"{text} is no number of seconds that will do; use {least:g} to 3600")
+        raise argparse.ArgumentTypeError(
+            f"{text} is no number of seconds that will do; use {least:g} to 3600"
+        )
     return seconds
 
 
 def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.ArgumentParser:
-    """The parser of all commands. runs: command name -> function, which becomes `args.run` of that command."""
+    """The parser of all commands. runs: command name -> function, which becomes `args.run` of that
+    command."""
     parser = argparse.ArgumentParser(
         "palpate", description="Names the material a robot has just touched.", epilog=EXIT_CODES
     )
@@ -91,7 +112,9 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
 
     def add(name: str, text: str, *parents: argparse.ArgumentParser, group: Any = commands) -> Any:
         last, options = name.rpartition(" ")[2], [common, *parents]
-        command = group.add_parser(last, help=text, description=text, parents=options, epilog=EXIT_CODES)
+        command = group.add_parser(
+            last, help=text, description=text, parents=options, epilog=EXIT_CODES
+        )
         command.set_defaults(run=runs[name])
         return command
 
@@ -99,7 +122,9 @@ def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.
     _local_commands(add, devices, answers)
     _bundle_commands(add)
     about = "the skin by itself, without a bundle"
-    skin = commands.add_parser("skin", help=about, description=about).add_subparsers(required=True, metavar="COMMAND")
+    skin = commands.add_parser("skin", help=about, description=about).add_subparsers(
+        required=True, metavar="COMMAND"
+    )
     _skin_commands(partial(add, group=skin), devices)
     about = "what other machines in the cell speak, beside the service"
     bridge = commands.add_parser("bridge", help=about, description=about).add_subparsers(
@@ -122,12 +147,23 @@ def _service_commands(
     trigger = _trigger()
     run = add("run", "classify sweeps until SIGTERM", devices, answers, trigger)
     run.add_argument(
-        "--shadow", nargs="?", const="", metavar="DIR",
+        "--shadow",
+        nargs="?",
+        const="",
+        metavar="DIR",
         help="also classify with the bundle in DIR, by default the candidate of the store; its answers are only compared",
-    )  # fmt: skip
-    record = add("record", "keep each sweep with its label, for training; needs no bundle", devices, answers, trigger)
+    )
+    record = add(
+        "record",
+        "keep each sweep with its label, for training; needs no bundle",
+        devices,
+        answers,
+        trigger,
+    )
     for command in (run, record):
-        command.add_argument("--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay")
+        command.add_argument(
+            "--capture", type=Path, metavar="FILE", help="write all input to FILE, for replay"
+        )
     _record_options(record)
     enrol = add(
         "enrol",
@@ -135,38 +171,70 @@ def _service_commands(
         devices,
         trigger,
     )
-    enrol.add_argument("label", metavar="LABEL", help="its name; all sweeps from now on are of this material")
-    enrol.add_argument("--out", type=Path, metavar="DIR", help="write the new bundle to DIR instead of installing it")
+    enrol.add_argument(
+        "label", metavar="LABEL", help="its name; all sweeps from now on are of this material"
+    )
+    enrol.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write the new bundle to DIR instead of installing it",
+    )
     enrol.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
     enrol.add_argument(
-        "--sweeps", type=int, choices=range(1, MOST_SWEEPS + 1), default=5, dest="good", metavar="N",
+        "--sweeps",
+        type=int,
+        choices=range(1, MOST_SWEEPS + 1),
+        default=5,
+        dest="good",
+        metavar="N",
         help=f"how many good sweeps it takes, 1 to {MOST_SWEEPS} (default 5)",
-    )  # fmt: skip
-    enrol.add_argument("--scattered", action="store_true", help="even if the sweeps are unlike one another")
+    )
+    enrol.add_argument(
+        "--scattered", action="store_true", help="even if the sweeps are unlike one another"
+    )
     enrol.set_defaults(sweeps=None)
 
 
 def _record_options(record: argparse.ArgumentParser) -> None:
     """What `record` alone takes."""
     record.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the sweeps (default: sweeps/ in the store's folder)"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of the sweeps (default: sweeps/ in the store's folder)",
     )
     for name in ("material", "position", "session"):
         record.add_argument(
-            f"--{name}", default="", metavar="TEXT", help="until a command on the serial line or the page changes it"
+            f"--{name}",
+            default="",
+            metavar="TEXT",
+            help="until a command on the serial line or the page changes it",
         )
     record.add_argument(
-        "--format", metavar="RxC:TYPE:HZ", help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)"
+        "--format",
+        metavar="RxC:TYPE:HZ",
+        help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)",
     )
     window = partial(_seconds, least=0.01)
-    record.add_argument("--window", type=window, metavar="S", help="seconds of each sweep that are kept (default 2)")
     record.add_argument(
-        "--target", type=_count, default=10, metavar="N", help="sweeps wanted per material and position (default 10)"
+        "--window", type=window, metavar="S", help="seconds of each sweep that are kept (default 2)"
     )
     record.add_argument(
-        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        "--target",
+        type=_count,
+        default=10,
+        metavar="N",
+        help="sweeps wanted per material and position (default 10)",
+    )
+    record.add_argument(
+        "--web",
+        nargs="?",
+        const=WEB_PORT,
+        type=int,
+        metavar="PORT",
         help=f"also as a page, on which the labels are set (default port {WEB_PORT}); watch.address opens it to the network",
-    )  # fmt: skip
+    )
 
 
 def _local_commands(
@@ -178,27 +246,50 @@ def _local_commands(
     )
     align = add("align", "show where the contact lies on the skin, and where it should", devices)
     align.add_argument(
-        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        "--web",
+        nargs="?",
+        const=WEB_PORT,
+        type=int,
+        metavar="PORT",
         help=f"also as a page on localhost (default port {WEB_PORT})",
-    )  # fmt: skip
+    )
     align.set_defaults(sweeps=None)
     add("check", "self-test: bundle, golden sweeps, devices", devices, answers)
-    add("status", "state of the service, and its last verdicts").add_argument("--json", action="store_true")
+    add("status", "state of the service, and its last verdicts").add_argument(
+        "--json", action="store_true"
+    )
     watch = add("watch", "the running box live: skin, verdicts, latency and loss, over its feed")
     shown = watch.add_mutually_exclusive_group()
-    shown.add_argument("--json", action="store_true", help="the feed's lines as they are (PROTOCOL.md, part 4)")
     shown.add_argument(
-        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        "--json", action="store_true", help="the feed's lines as they are (PROTOCOL.md, part 4)"
+    )
+    shown.add_argument(
+        "--web",
+        nargs="?",
+        const=WEB_PORT,
+        type=int,
+        metavar="PORT",
         help=f"as a page (default port {WEB_PORT}); watch.address and its token open it to the network",
-    )  # fmt: skip
-    add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument("file", type=Path)
+    )
+    add("replay", "judge a capture, a kept sweep or a folder of them again").add_argument(
+        "file", type=Path
+    )
     add("config", "print each value with its source")
     bench = add("bench", "measure latency, memory, start and processor share on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
-    bench.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)")
-    bench.add_argument("--references", type=Path, default=Path("build/references"), help="fp32.onnx, paper_int8.onnx")
     bench.add_argument(
-        "--part", choices=("memory", "stream"), help="one part alone, as JSON, with the sweeps of --acts"
+        "--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)"
+    )
+    bench.add_argument(
+        "--references",
+        type=Path,
+        default=Path("build/references"),
+        help="fp32.onnx, paper_int8.onnx",
+    )
+    bench.add_argument(
+        "--part",
+        choices=("memory", "stream"),
+        help="one part alone, as JSON, with the sweeps of --acts",
     )
     bench.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
 
@@ -208,41 +299,80 @@ def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) ->
     add("skin list", "all skin profiles, with what each skin lacks and whether it was measured")
     detect = add("skin detect", "what is plugged in, and which profile fits; it only listens")
     detect.add_argument("--port", default="", metavar="PATH", help="this port alone")
-    detect.add_argument("--write", action="store_true", help="with --port: also ask, and send commands for starting")
-    check = add("skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices)
+    detect.add_argument(
+        "--write", action="store_true", help="with --port: also ask, and send commands for starting"
+    )
+    check = add(
+        "skin check", "whether the skin's firmware keeps to PROTOCOL.md, part by part", devices
+    )
     check.add_argument(
-        "--seconds", type=_seconds, default=10.0, metavar="S",
+        "--seconds",
+        type=_seconds,
+        default=10.0,
+        metavar="S",
         help="how long frames are listened to, 1 to 3600 (default 10); the longer, the surer of the clock",
-    )  # fmt: skip
+    )
     show = add("skin show", "the skin live: heat map, rate, noise, dead and stuck taxels", devices)
     show.add_argument(
-        "--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT",
+        "--web",
+        nargs="?",
+        const=WEB_PORT,
+        type=int,
+        metavar="PORT",
         help=f"also as a page on localhost (default port {WEB_PORT})",
-    )  # fmt: skip
+    )
     for command in (check, show):
         command.set_defaults(sweeps=None)
-    new = add("skin new", "listen to a skin that has no profile, propose one and write it; nothing is sent to it")
+    new = add(
+        "skin new",
+        "listen to a skin that has no profile, propose one and write it; nothing is sent to it",
+    )
     new.add_argument("name", metavar="NAME", help="of the profile")
-    new.add_argument("--port", required=True, metavar="PATH", help="where it is; `palpate skin detect` lists the ports")
     new.add_argument(
-        "--grid", metavar="RxC[xA]", help="rows, columns and axes; without it, proposals are printed alone"
+        "--port",
+        required=True,
+        metavar="PATH",
+        help="where it is; `palpate skin detect` lists the ports",
     )
     new.add_argument(
-        "--proposal", type=_count, metavar="N", help="which of the proposals (default: the first that has this grid)"
+        "--grid",
+        metavar="RxC[xA]",
+        help="rows, columns and axes; without it, proposals are printed alone",
     )
-    new.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long it listens (default 3)")
-    new.add_argument("--out", type=Path, metavar="DIR", help="folder of the profile (default: /etc/palpate/skins)")
+    new.add_argument(
+        "--proposal",
+        type=_count,
+        metavar="N",
+        help="which of the proposals (default: the first that has this grid)",
+    )
+    new.add_argument(
+        "--seconds", type=_seconds, default=3.0, metavar="S", help="how long it listens (default 3)"
+    )
+    new.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of the profile (default: /etc/palpate/skins)",
+    )
     new.add_argument("--replace", action="store_true", help="replace a profile of this name")
 
 
 def _bundle_commands(add: Callable[..., Any]) -> None:
     """The commands for the bundles in the store."""
-    listed = add("bundles", "the bundles on this box: which one runs, and which one `rollback` returns to")
+    listed = add(
+        "bundles", "the bundles on this box: which one runs, and which one `rollback` returns to"
+    )
     listed.add_argument("--json", action="store_true")
-    install = add("install", "check the signed bundle in DIR, and run it on trial from the next start on")
-    install.add_argument("--shadow", action="store_true", help="as the candidate of `run --shadow` instead")
+    install = add(
+        "install", "check the signed bundle in DIR, and run it on trial from the next start on"
+    )
     install.add_argument(
-        "--other-skin", action="store_true", help="even if it is for another skin than the one that streams"
+        "--shadow", action="store_true", help="as the candidate of `run --shadow` instead"
+    )
+    install.add_argument(
+        "--other-skin",
+        action="store_true",
+        help="even if it is for another skin than the one that streams",
     )
     for command in (install, add("verify", "check the signed bundle in DIR, and change nothing")):
         command.add_argument("folder", type=Path, metavar="DIR")

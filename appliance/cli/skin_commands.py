@@ -1,6 +1,7 @@
 """The commands `palpate skin ...`: the skin by itself, without a bundle.
 
-In: arguments, and a way to the devices, which `main` chooses. Out: lines on standard output, exit codes.
+In: arguments, and a way to the devices, which `main` chooses. Out: lines on standard output, exit
+codes.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     failed, port = 0, settings.sensor.link == "serial"
     with closing(skins.open_board(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
-        log.info(f"frames are listened to for {args.seconds:g} s; stopping, requests and overflow take {more} more")
+        log.info(
+            f"frames are listened to for {args.seconds:g} s; stopping, requests and overflow take {more} more"
+        )
         for found in skin_check.check(link, devices.clock, args.seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
@@ -48,7 +51,11 @@ def run_list(args: argparse.Namespace) -> int:
     broken = 0
     for name, profile in _profiles(load_settings(args)):
         broken += isinstance(profile, ConfigError)
-        print(f"{name:<14} {profile}" if isinstance(profile, ConfigError) else skin_detect.listed(name, profile))
+        print(
+            f"{name:<14} {profile}"
+            if isinstance(profile, ConfigError)
+            else skin_detect.listed(name, profile)
+        )
     return 1 if broken else 0
 
 
@@ -58,7 +65,9 @@ def run_detect(args: argparse.Namespace) -> int:
     from appliance.tools import skin_detect
 
     if args.write and not args.port:
-        raise ConfigError("--write writes commands to a port, so it has to be named: add --port /dev/...")
+        raise ConfigError(
+            "--write writes commands to a port, so it has to be named: add --port /dev/..."
+        )
     settings, clock = load_settings(args), SystemClock()
     profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
     there = serial_port.ports()
@@ -73,9 +82,13 @@ def run_detect(args: argparse.Namespace) -> int:
     if usb:
         log.info(f"listening at {', '.join(port.path for port in usb)}; some seconds at each")
     for one in skin_detect.detect(
-        usb, profiles, lambda path, baud: SerialLink(path, baud, clock), clock,
-        write=args.write, seconds=skin_detect.LISTEN_S,
-    ):  # fmt: skip
+        usb,
+        profiles,
+        lambda path, baud: SerialLink(path, baud, clock),
+        clock,
+        write=args.write,
+        seconds=skin_detect.LISTEN_S,
+    ):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
         found += bool(one.profile)
     if not found and not usb:
@@ -107,7 +120,9 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     stopped = stop_flag()
     with ExitStack() as stack:
         pages = local_page("skin.html", args.web, stack)
-        screen = stack.enter_context(SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages)))
+        screen = stack.enter_context(
+            SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
+        )
         sensor = stack.enter_context(closing(skins.sensor(settings, fmt, devices)))
         name = settings.sensor.skin
         skin_show.run(sensor, fmt, name, devices.source, devices.clock, [screen, *pages], stopped)
@@ -115,7 +130,8 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
 
 def run_new(args: argparse.Namespace) -> int:
-    """`palpate skin new`: listens to a port, and writes a profile where the grid is named; else says how it can be."""
+    """`palpate skin new`: listens to a port, and writes a profile where the grid is named; else
+    says how it can be."""
     from appliance.io.serial_link import SerialLink
     from appliance.tools import skin_new
 
@@ -125,19 +141,27 @@ def run_new(args: argparse.Namespace) -> int:
         _make(path.parent)  # before a user has listened in vain
     port, clock = args.port, SystemClock()
     bauds = (settings.sensor.baud,) if settings.sensor.baud else skin_new.BAUDS
-    log.info(f"listening at {port}: {args.seconds:g} s at each speed, until one shows a pattern; touch the skin")
+    log.info(
+        f"listening at {port}: {args.seconds:g} s at each speed, until one shows a pattern; touch the skin"
+    )
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, args.seconds, clock)
     for number, proposal in enumerate(heard.proposals, 1):
         print(f"{number}: {skin_new.words(proposal)}")
     if not args.grid:
-        print(f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first is not right")
+        print(
+            f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first is not right"
+        )
         return 0
     chosen, grid = skin_new.choose(heard, args.grid, args.proposal or 0)
     there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
     storage.put_all({path: text.encode()}, mode=0o644)
-    use = f"--skin {shlex.quote(str(path))}" if args.out else f'--skin {path.stem} (sensor.skin = "{path.stem}")'
+    use = (
+        f"--skin {shlex.quote(str(path))}"
+        if args.out
+        else f'--skin {path.stem} (sensor.skin = "{path.stem}")'
+    )
     print(f"{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with {use}")
     return 0
 
@@ -147,16 +171,22 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
-        raise ConfigError(f"{folder} cannot be made: {str(e.strerror).lower()}; name a folder with --out") from e
+        raise ConfigError(
+            f"{folder} cannot be made: {str(e.strerror).lower()}; name a folder with --out"
+        ) from e
     if not os.access(folder, os.W_OK):
-        raise ConfigError(f"{folder} may not be written by this user; name another folder with --out")
+        raise ConfigError(
+            f"{folder} may not be written by this user; name another folder with --out"
+        )
 
 
 def _new_name(args: argparse.Namespace, settings: Config) -> str:
     """The name of the new profile. Raises ConfigError where it cannot be used."""
     name: str = args.name
     if not skin_profile.NAME.fullmatch(name):
-        raise ConfigError(f"{name!r} cannot name a profile; use up to 32 small letters, digits and hyphens")
+        raise ConfigError(
+            f"{name!r} cannot name a profile; use up to 32 small letters, digits and hyphens"
+        )
     folders = [args.out] if args.out else skins.folders(settings)
     if name in skin_profile.names(folders) and not args.replace:
         raise ConfigError(f"there is a profile {name} already; take another name, or --replace")

@@ -1,4 +1,5 @@
-"""The command `palpate watch`: the running box for a person, over its feed. In: arguments. Out: exit codes."""
+"""The command `palpate watch`: the running box for a person, over its feed. In: arguments. Out:
+exit codes."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ def run_watch(args: argparse.Namespace) -> int:
     settings, clock = load_settings(args), SystemClock()
     path, stopped = settings.feed.socket, stop_flag()
     if not path:
-        raise ConfigError('feed.socket = "" turns the feed off, so there is nothing to watch; set it to a path')
+        raise ConfigError(
+            'feed.socket = "" turns the feed off, so there is nothing to watch; set it to a path'
+        )
     if args.web is not None:
         from appliance.watch.access import Access
         from appliance.watch.web import PageWatcher

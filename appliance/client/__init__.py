@@ -1,1 +1,2 @@
-"""What other programs import to talk with the box: over its feed, over its serial line. numpy is not needed."""
+"""What other programs import to talk with the box: over its feed, over its serial line. numpy is
+not needed."""

@@ -1,5 +1,5 @@
-"""What the box says, as objects. In: the fields of RES, STA and ANS sentences (PROTOCOL.md, part 2). Out: Answer,
-BoxState, BoxIdentity."""
+"""What the box says, as objects. In: the fields of RES, STA and ANS sentences (PROTOCOL.md, part
+2). Out: Answer, BoxState, BoxIdentity."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ ADVICE = {
 class Answer:
     """The answer to one sweep, with the fields of RES. Probability and margin are 0 to 1.
 
-    time_s: of the box's monotonic clock. lost: frames of the window that were lost. loss_known: whether lost frames can
-    be seen. missed: how many answers before this one did not arrive, as the numbers of the sweeps show.
+    time_s: of the box's monotonic clock. lost: frames of the window that were lost. loss_known:
+    whether lost frames can be seen. missed: how many answers before this one did not arrive, as the
+    numbers of the sweeps show.
     """
 
     sweep: int
@@ -44,20 +45,48 @@ class Answer:
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> Answer:
-        """The answer in the fields of a RES sentence. Raises FormatError where they do not have its form."""
+        """The answer in the fields of a RES sentence. Raises FormatError where they do not have its
+        form."""
         try:
-            sweep, time_s, status, label, probability, margin, fused, lost, latency, bundle, source, share = fields[:12]
+            (
+                sweep,
+                time_s,
+                status,
+                label,
+                probability,
+                margin,
+                fused,
+                lost,
+                latency,
+                bundle,
+                source,
+                share,
+            ) = fields[:12]
             return cls(
-                int(sweep), float(time_s), Status(status), label, float(probability), float(margin), int(fused),
-                int(lost), float(latency), bundle, source, float(share),
-                ",".join(fields[12:13]), fields[13:14] != ["1"],
-            )  # fmt: skip
+                int(sweep),
+                float(time_s),
+                Status(status),
+                label,
+                float(probability),
+                float(margin),
+                int(fused),
+                int(lost),
+                float(latency),
+                bundle,
+                source,
+                float(share),
+                ",".join(fields[12:13]),
+                fields[13:14] != ["1"],
+            )
         except ValueError as e:
-            raise FormatError(f"RES,{','.join(fields)}: {e}; is the client older than the box?") from e
+            raise FormatError(
+                f"RES,{','.join(fields)}: {e}; is the client older than the box?"
+            ) from e
 
     @classmethod
     def read(cls, line: str) -> Answer | None:
-        """The answer in a line, None if it is another sentence or damaged. Raises FormatError as `of` does."""
+        """The answer in a line, None if it is another sentence or damaged. Raises FormatError as
+        `of` does."""
         heard = sentences.read(line.encode("ascii", "replace"))
         return cls.of(heard.fields) if heard.kind == "RES" and heard.summed else None
 
@@ -73,12 +102,14 @@ class Answer:
 
     @property
     def faulty(self) -> bool:
-        """Nothing was learned of the object: the sweep, the skin or the wiring was not as it must be."""
+        """Nothing was learned of the object: the sweep, the skin or the wiring was not as it must
+        be."""
         return not self.status.classified and self.status not in (Status.UNKNOWN, Status.RECORDED)
 
     @property
     def early(self) -> bool:
-        """It came while the finger was sliding: the finger may stop, and no other answer follows."""
+        """It came while the finger was sliding: the finger may stop, and no other answer
+        follows."""
         return self.share < 1
 
     @property
@@ -106,17 +137,29 @@ class BoxState:
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> BoxState:
-        """The state in the fields of STA or of the answer to STATE. Raises FormatError where they have another form."""
+        """The state in the fields of STA or of the answer to STATE. Raises FormatError where they
+        have another form."""
         try:
             time_s, skin, sweeping, *counts = fields[:9]
             answered, frames, lost, garbage, enumerations, dropped = map(int, counts)
             bundle, source = fields[9:11]
             return cls(
-                float(time_s), skin, sweeping == "1", answered, frames, lost, garbage, enumerations, dropped, bundle,
+                float(time_s),
+                skin,
+                sweeping == "1",
+                answered,
+                frames,
+                lost,
+                garbage,
+                enumerations,
+                dropped,
+                bundle,
                 source,
-            )  # fmt: skip
+            )
         except ValueError as e:
-            raise FormatError(f"STA,{','.join(fields)}: {e}; is the client older than the box?") from e
+            raise FormatError(
+                f"STA,{','.join(fields)}: {e}; is the client older than the box?"
+            ) from e
 
     @property
     def ready(self) -> bool:
@@ -126,7 +169,8 @@ class BoxState:
 
 @dataclass(frozen=True, slots=True)
 class BoxIdentity:
-    """What answers: name, version and id of the bundle, the form of its sweeps, and the skin's board."""
+    """What answers: name, version and id of the bundle, the form of its sweeps, and the skin's
+    board."""
 
     name: str
     version: str

@@ -1,4 +1,5 @@
-"""A client of the box for the robot's computer. In: its serial line. Out: answers to sweeps, commands carried out.
+"""A client of the box for the robot's computer. In: its serial line. Out: answers to sweeps,
+commands carried out.
 
 with Palpate("/dev/ttyUSB0") as box:
     box.wait_ready(timeout_s=10)
@@ -29,7 +30,8 @@ BAUD = 115200
 KEPT = 256
 """Most answers that wait for `result`; then the oldest is dropped and counted as missed."""
 POLL_S, QUESTION_S = 0.2, 1.0
-"""Time between two questions of `wait_ready`, and for the answer to one: a box that starts does not hear what was sent before."""
+"""Time between two questions of `wait_ready`, and for the answer to one: a box that starts does not
+hear what was sent before."""
 
 Heard = Answer | BoxState
 
@@ -37,19 +39,26 @@ Heard = Answer | BoxState
 class Palpate:
     """The box at the other end of a line. Threads may share one.
 
-    port: a serial device, a pseudo-terminal, or `socket://host:port`. timeout_s: longest wait for the answer to a
-    command. listener: is called with each answer and each state, in the thread that reads. opener: opens the port, for
-    tests and for what is no port.
+    port: a serial device, a pseudo-terminal, or `socket://host:port`. timeout_s: longest wait for
+    the answer to a command. listener: is called with each answer and each state, in the thread that
+    reads. opener: opens the port, for tests and for what is no port.
 
-    trouble: why the line is not open, "" if it is. missed: answers that were lost. damaged: sentences that were damaged,
-    the last of which `damage` tells. restarts: how often the box's program has begun anew. Whatever asks or waits has a
-    deadline; a line that is lost meanwhile ends the wait with LinkLost and is opened again.
+    trouble: why the line is not open, "" if it is. missed: answers that were lost. damaged:
+    sentences that were damaged, the last of which `damage` tells. restarts: how often the box's
+    program has begun anew. Whatever asks or waits has a deadline; a line that is lost meanwhile
+    ends the wait with LinkLost and is opened again.
     """
 
     def __init__(
-        self, port: str, *, baud: int = BAUD, timeout_s: float = 3.0, listener: Callable[[Heard], None] | None = None,
-        opener: Callable[[], Any] | None = None, clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        port: str,
+        *,
+        baud: int = BAUD,
+        timeout_s: float = 3.0,
+        listener: Callable[[Heard], None] | None = None,
+        opener: Callable[[], Any] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
         self.missed = self.damaged = self.restarts = 0
         self.damage = ""
         self.newest: BoxState | None = None
@@ -59,18 +68,25 @@ class Palpate:
         self._asking = threading.Lock()
         self._replies: deque[list[str]] = deque(maxlen=KEPT)
         self._answers: deque[Answer] = deque()
-        # numbers of the newest answer and of those before it that did not come; answers that STA has counted
+        # numbers of the newest answer and of those before it that did not come; answers that STA
+        # has counted
         self._sweep: int | None = None
         self._absent: set[int] = set()
         self._answered: int | None = None
         self._line = Line(
-            opener or partial(open_port, port, baud), self._on_sentence, self._on_change, name=port, clock=self._clock
+            opener or partial(open_port, port, baud),
+            self._on_sentence,
+            self._on_change,
+            name=port,
+            clock=self._clock,
         )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -83,24 +99,36 @@ class Palpate:
         return self._line.trouble
 
     def silent_s(self) -> float:
-        """Time since the last sentence; infinite before the first. The box sends one a second (serial.state_s)."""
+        """Time since the last sentence; infinite before the first. The box sends one a second
+        (serial.state_s)."""
         return (self._clock.now_ns() - self._heard_ns) / 1e9 if self._heard_ns else float("inf")
 
     def wait_ready(self, timeout_s: float) -> BoxState:
         """Wait until a sweep can begin, and forget answers that nobody has asked for.
 
-        Raises NoAnswer with the reason if that takes longer; a line that is not there yet is waited for as well.
+        Raises NoAnswer with the reason if that takes longer; a line that is not there yet is waited
+        for as well.
         """
         end_ns = self._end_ns(timeout_s)
         while True:
             try:
                 # a last question gets the time for its answer
-                state = self.state(min(self._timeout_s, QUESTION_S, max(POLL_S, self._left_s(end_ns))))
+                state = self.state(
+                    min(self._timeout_s, QUESTION_S, max(POLL_S, self._left_s(end_ns)))
+                )
                 if state.ready:
                     self.forget()
                     return state
-                why = f"a sweep is open (skin {state.skin})" if state.sweeping else f"the skin is {state.skin}"
-            except (LinkLost, NoAnswer, CommandRefused) as e:  # a bridge refuses while its own line is gone
+                why = (
+                    f"a sweep is open (skin {state.skin})"
+                    if state.sweeping
+                    else f"the skin is {state.skin}"
+                )
+            except (
+                LinkLost,
+                NoAnswer,
+                CommandRefused,
+            ) as e:  # a bridge refuses while its own line is gone
                 why = str(e)
             with self._news:
                 self._news.wait(min(POLL_S, max(0.0, self._left_s(end_ns))))
@@ -108,7 +136,8 @@ class Palpate:
                 raise NoAnswer(f"not ready within {timeout_s:g} s: {why}")
 
     def start(self) -> None:
-        """Begin a sweep by command (trigger.mode = "serial"), and forget answers that nobody has asked for."""
+        """Begin a sweep by command (trigger.mode = "serial"), and forget answers that nobody has
+        asked for."""
         self.forget()
         self.ask("START")
 
@@ -137,14 +166,17 @@ class Palpate:
         return BoxIdentity.of(self.ask("ID"))
 
     def labels(self) -> tuple[str, ...]:
-        """The labels of the bundle; a label's code on the class bits is its place, counted from 1."""
+        """The labels of the bundle; a label's code on the class bits is its place, counted from
+        1."""
         found: list[str] = []
         count = 1
         while len(found) < count:
             wanted = str(len(found) + 1)
             fields = self.ask("LABEL", wanted)
             if len(fields) != 3 or fields[0] != wanted or not fields[2].isdecimal():
-                raise FormatError(f"label {wanted} was answered {','.join(fields)}; update box or client")
+                raise FormatError(
+                    f"label {wanted} was answered {','.join(fields)}; update box or client"
+                )
             found, count = [*found, fields[1]], int(fields[2])
         return tuple(found)
 
@@ -156,26 +188,33 @@ class Palpate:
     def result(self, timeout_s: float) -> Answer:
         """The oldest answer that was not given yet; waits for it.
 
-        Raises NoAnswer if none comes in time, LinkLost at once if the line is lost: the answer was sent into nowhere.
+        Raises NoAnswer if none comes in time, LinkLost at once if the line is lost: the answer was
+        sent into nowhere.
         """
         with self._news:
             losses = self._line.losses
             self._news.wait_for(
-                lambda: self._answers or self._line.trouble or self._line.losses != losses, max(0.0, timeout_s)
+                lambda: self._answers or self._line.trouble or self._line.losses != losses,
+                max(0.0, timeout_s),
             )
             if self._answers:
                 return self._answers.popleft()
             if self._line.trouble or self._line.losses != losses:
-                raise LinkLost(self._line.trouble or "the line was lost meanwhile, and is open again")
+                raise LinkLost(
+                    self._line.trouble or "the line was lost meanwhile, and is open again"
+                )
         raise NoAnswer(f"no answer to a sweep within {timeout_s:g} s; {self._why_silent()}")
 
     def ask(self, name: str, *texts: str, timeout_s: float | None = None) -> list[str]:
-        """Send a command; the fields of its answer. What follows a comma in `name` is taken as the first of `texts`.
+        """Send a command; the fields of its answer. What follows a comma in `name` is taken as the
+        first of `texts`.
 
-        Raises CommandRefused with the box's reason, NoAnswer if it does not answer in time, LinkLost if the line is not
-        open or is lost.
+        Raises CommandRefused with the box's reason, NoAnswer if it does not answer in time,
+        LinkLost if the line is not open or is lost.
         """
-        name, *given = name.split(",")  # as a person writes it: the box answers under the name alone
+        name, *given = name.split(
+            ","
+        )  # as a person writes it: the box answers under the name alone
         wait_s = self._timeout_s if timeout_s is None else timeout_s
         end_ns = self._end_ns(wait_s)
         if not self._asking.acquire(timeout=max(0.0, wait_s)):
@@ -188,12 +227,17 @@ class Palpate:
             with self._news:
                 while True:
                     self._news.wait_for(
-                        lambda: self._replies or self._line.losses != losses, max(0.0, self._left_s(end_ns))
+                        lambda: self._replies or self._line.losses != losses,
+                        max(0.0, self._left_s(end_ns)),
                     )
                     if self._line.losses != losses:
-                        raise LinkLost(f"{name}: {self._line.trouble or 'the line was lost meanwhile'}")
+                        raise LinkLost(
+                            f"{name}: {self._line.trouble or 'the line was lost meanwhile'}"
+                        )
                     if not self._replies:
-                        raise NoAnswer(f"no answer to {name} within {wait_s:g} s; {self._why_silent()}")
+                        raise NoAnswer(
+                            f"no answer to {name} within {wait_s:g} s; {self._why_silent()}"
+                        )
                     answered, outcome, *fields = [*self._replies.popleft(), "", ""]
                     if answered in (name, "") and outcome == "error":
                         raise CommandRefused(f"{name}: {','.join(fields[:-2])}")
@@ -209,7 +253,11 @@ class Palpate:
         return (end_ns - self._clock.now_ns()) / 1e9
 
     def _why_silent(self) -> str:
-        heard = f"the last sentence came {self.silent_s():.1f} s ago" if self._heard_ns else "nothing was ever heard"
+        heard = (
+            f"the last sentence came {self.silent_s():.1f} s ago"
+            if self._heard_ns
+            else "nothing was ever heard"
+        )
         hurt = f", {self.damaged} were damaged ({self.damage})" if self.damaged else ""
         return f"{heard}{hurt}; is the box on, and does the line carry both ways?"
 
@@ -240,8 +288,11 @@ class Palpate:
             self._listener(news)
 
     def _counted(self, answer: Answer) -> Answer:
-        """The answer with the number of those that are missing before it: every sweep gets exactly one."""
-        if answer.sweep in self._absent:  # one that waited for late frames while the next was answered at once
+        """The answer with the number of those that are missing before it: every sweep gets exactly
+        one."""
+        if (
+            answer.sweep in self._absent
+        ):  # one that waited for late frames while the next was answered at once
             self._absent.remove(answer.sweep)
             self.missed -= 1
             return answer

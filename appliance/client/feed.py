@@ -1,4 +1,5 @@
-"""Reads the feed of the running box (PROTOCOL.md, part 4), and comes back to it when the box restarts.
+"""Reads the feed of the running box (PROTOCOL.md, part 4), and comes back to it when the box
+restarts.
 
 In: the path of its socket. Out: each line as a dict. numpy is not needed.
 """
@@ -26,10 +27,13 @@ ENDED = "the box has closed the feed; it is read again when the box is back"
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[dict[str, Any]], bytes]:
-    """The lines in `data`, which continues `rest`, and the new unfinished rest. Raises FormatError for what is no line."""
+    """The lines in `data`, which continues `rest`, and the new unfinished rest. Raises FormatError
+    for what is no line."""
     *lines, rest = (rest + data).split(b"\n")
     if len(rest) > MOST_LINE:
-        raise FormatError(f"a line of over {MOST_LINE} bytes; is this socket the feed of a palpate?")
+        raise FormatError(
+            f"a line of over {MOST_LINE} bytes; is this socket the feed of a palpate?"
+        )
     return [_line(line) for line in lines], rest
 
 
@@ -40,7 +44,9 @@ def _line(text: bytes) -> dict[str, Any]:
         if not isinstance(line["type"], str):
             raise TypeError
     except (ValueError, TypeError, KeyError, RecursionError) as e:
-        raise FormatError(f"{text[:40]!a} is no line of a feed; is this socket the feed of a palpate?") from e
+        raise FormatError(
+            f"{text[:40]!a} is no line of a feed; is this socket the feed of a palpate?"
+        ) from e
     if line["type"] == "hello" and line.get("schema") != FEED_SCHEMA:
         raise FormatError(
             f"the box speaks schema {line.get('schema')!r} of the feed, this reader {FEED_SCHEMA}; update one of them"
@@ -49,16 +55,21 @@ def _line(text: bytes) -> dict[str, Any]:
 
 
 class Feed:
-    """The feed at `path`. `read` connects where that is needed, so a box that is not there yet is no error.
+    """The feed at `path`. `read` connects where that is needed, so a box that is not there yet is
+    no error.
 
-    frames_hz, sweeps: what is asked for at each connection, see `ask`. trouble: why nothing is read now, "" where the
-    feed is. Usable in one thread; `fileno` is for waiting elsewhere.
+    frames_hz, sweeps: what is asked for at each connection, see `ask`. trouble: why nothing is read
+    now, "" where the feed is. Usable in one thread; `fileno` is for waiting elsewhere.
     """
 
     def __init__(
-        self, path: str | Path = DEFAULT, *, frames_hz: float = 0, sweeps: bool = False,
+        self,
+        path: str | Path = DEFAULT,
+        *,
+        frames_hz: float = 0,
+        sweeps: bool = False,
         clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.path = Path(path)
         self.trouble = "not connected yet"
         self._asked: dict[str, Any] = {"frames": frames_hz, "sweeps": sweeps}
@@ -75,11 +86,14 @@ class Feed:
         self.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Every line, also over restarts of the box. Raises FeedError where none comes for ten seconds."""
+        """Every line, also over restarts of the box. Raises FeedError where none comes for ten
+        seconds."""
         while True:
             line = self.read(10.0)
             if line is None:
-                raise FeedError(f"{self.path}: {self.trouble or 'nothing came for 10 s; see palpate status'}")
+                raise FeedError(
+                    f"{self.path}: {self.trouble or 'nothing came for 10 s; see palpate status'}"
+                )
             yield line
 
     @property
@@ -92,7 +106,8 @@ class Feed:
         return self._connection.fileno() if self._connection else -1
 
     def ask(self, *, frames_hz: float | None = None, sweeps: bool | None = None) -> None:
-        """Ask for frames at this rate (0 to 20 a second), and for the windows of cut sweeps; None: as before."""
+        """Ask for frames at this rate (0 to 20 a second), and for the windows of cut sweeps; None:
+        as before."""
         if frames_hz is not None:
             self._asked["frames"] = frames_hz
         if sweeps is not None:
@@ -100,7 +115,8 @@ class Feed:
         self._request()
 
     def read(self, timeout_s: float = 1.0) -> dict[str, Any] | None:
-        """The next line; None where none has come in that time, `trouble` then says why if there is a reason."""
+        """The next line; None where none has come in that time, `trouble` then says why if there is
+        a reason."""
         end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while not self._lines:
             left_ns = end_ns - self._clock.now_ns()
@@ -122,7 +138,8 @@ class Feed:
         self._rest = b""
 
     def lose(self, why: str) -> None:
-        """Close, and connect again after a while. why: `trouble` until then; what the box said last is the better reason."""
+        """Close, and connect again after a while. why: `trouble` until then; what the box said last
+        is the better reason."""
         self.close()
         self.trouble = self.trouble or why
         self._retry_ns = self._clock.now_ns() + RETRY_NS

@@ -1,4 +1,5 @@
-"""The robot's end of the serial line: a thread that reads, and opens the port again after it was lost.
+"""The robot's end of the serial line: a thread that reads, and opens the port again after it was
+lost.
 
 In: a serial device, a pseudo-terminal or `socket://host:port`. Out: sentences, as they arrive.
 """
@@ -24,26 +25,35 @@ READ_S = 0.2
 WRITE_S = 1.0
 """Longest wait until the port takes a command."""
 SILENT_NS = 10_000_000_000
-"""A socket without a byte for this long is opened again: the other computer may be gone without a word."""
+"""A socket without a byte for this long is opened again: the other computer may be gone without a
+word."""
 
 
 def open_port(url: str, baud: int) -> Any:
     """The port at `url`. Raises OSError or ValueError."""
     exclusive = None if "://" in url else True
-    return serial.serial_for_url(url, baudrate=baud, timeout=READ_S, write_timeout=WRITE_S, exclusive=exclusive)
+    return serial.serial_for_url(
+        url, baudrate=baud, timeout=READ_S, write_timeout=WRITE_S, exclusive=exclusive
+    )
 
 
 class Line:
-    """Calls `heard` with each sentence and `changed` when the port was opened or lost, both in its own thread.
+    """Calls `heard` with each sentence and `changed` when the port was opened or lost, both in its
+    own thread.
 
-    opener: opens the port; raises OSError or ValueError. name: what errors call it. trouble: why it is not open, "" if
-    it is. losses: how often it was lost.
+    opener: opens the port; raises OSError or ValueError. name: what errors call it. trouble: why it
+    is not open, "" if it is. losses: how often it was lost.
     """
 
     def __init__(
-        self, opener: Callable[[], Any], heard: Callable[[Sentence], None], changed: Callable[[], None], *,
-        name: str = "the line", clock: Clock | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        opener: Callable[[], Any],
+        heard: Callable[[Sentence], None],
+        changed: Callable[[], None],
+        *,
+        name: str = "the line",
+        clock: Clock | None = None,
+    ) -> None:
         self.trouble, self.losses = "", 0
         self._opener, self._heard, self._changed, self._name = opener, heard, changed, name
         self._clock = clock or SystemClock()
@@ -73,7 +83,9 @@ class Line:
         try:
             port = self._opener()
         except (OSError, ValueError) as e:
-            self.trouble = f"{self._name} cannot be opened: {e}; check the name, the cable and who may use it"
+            self.trouble = (
+                f"{self._name} cannot be opened: {e}; check the name, the cable and who may use it"
+            )
             return None
         self.trouble = ""
         return port
@@ -110,6 +122,9 @@ class Line:
                         self._heard(sentence)
                 elif is_socket and self._clock.now_ns() - last_ns > SILENT_NS:
                     return "nothing came for 10 s"
-        except (OSError, TypeError) as e:  # TypeError: pyserial 3.5 reads from a descriptor that is gone
+        except (
+            OSError,
+            TypeError,
+        ) as e:  # TypeError: pyserial 3.5 reads from a descriptor that is gone
             return str(e)
         return "closed"

@@ -1,1 +1,2 @@
-"""What every package shares: types, errors, clock, settings, files. It imports nothing else of the appliance."""
+"""What every package shares: types, errors, clock, settings, files. It imports nothing else of the
+appliance."""

@@ -1,7 +1,8 @@
-"""The host's monotonic clock as an object that is passed in, and the conversion of device time to host time.
+"""The host's monotonic clock as an object that is passed in, and the conversion of device time to
+host time.
 
-In: device time stamps (us) with the host time (ns) at which each packet arrived. Out: the host time at which each frame
-was taken.
+In: device time stamps (us) with the host time (ns) at which each packet arrived. Out: the host time
+at which each frame was taken.
 """
 
 from __future__ import annotations
@@ -52,18 +53,24 @@ def wait_readable(fd: int, timeout_s: float) -> bool:
 class DeviceClock:
     """Converts device time to host time, from packets that arrive late but never early.
 
-    Arrival minus device time is the clock offset plus a delay that is never negative, so the offset is the lower
-    envelope of these points. During the first `settle_s` it is their minimum. After that it is the line below all
-    points of the last `span_s` that is closest to them on average: the edge of their lower convex hull at the mean
-    time, with its slope bounded by `max_ppm` (two crystals differ by less). The error that remains is the shortest
-    delay itself, about 0.1 ms, which cannot be distinguished from the offset.
-    A line that lies higher than the worst clock on USB can have drifted since the last one is rejected and the last one
-    stays in use: frames that all come late, from a full FIFO, were not taken late.
-    Make a new object after each enumeration, since the device's clock then starts again at 0.
+    Arrival minus device time is the clock offset plus a delay that is never negative, so the offset
+    is the lower envelope of these points. During the first `settle_s` it is their minimum. After
+    that it is the line below all points of the last `span_s` that is closest to them on average:
+    the edge of their lower convex hull at the mean time, with its slope bounded by `max_ppm` (two
+    crystals differ by less). The error that remains is the shortest delay itself, about 0.1 ms,
+    which cannot be distinguished from the offset. A line that lies higher than the worst clock on
+    USB can have drifted since the last one is rejected and the last one stays in use: frames that
+    all come late, from a full FIFO, were not taken late. Make a new object after each enumeration,
+    since the device's clock then starts again at 0.
     """
 
     def __init__(
-        self, *, settle_s: float = 2.0, span_s: float = 20.0, step_s: float = 0.25, max_ppm: float = 200.0
+        self,
+        *,
+        settle_s: float = 2.0,
+        span_s: float = 20.0,
+        step_s: float = 0.25,
+        max_ppm: float = 200.0,
     ) -> None:
         self._settle_ns = settle_s * 1e9
         self._step_ns = int(step_s * 1e9)
@@ -76,7 +83,8 @@ class DeviceClock:
         self._fitted_ns = 0  # device time at which the line was fitted
 
     def unwrap(self, device_us: int) -> int:
-        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the one nearest to the last."""
+        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the one
+        nearest to the last."""
         if self._device_us is None:
             self._device_us = device_us
         else:
@@ -84,7 +92,8 @@ class DeviceClock:
         return self._device_us
 
     def update(self, device_ns: int, arrival_ns: int) -> None:
-        """Record that the frame taken at `device_ns` (unwrapped) arrived at host time `arrival_ns`."""
+        """Record that the frame taken at `device_ns` (unwrapped) arrived at host time
+        `arrival_ns`."""
         offset = arrival_ns - device_ns
         if not self._points:
             self._first_ns = device_ns
@@ -108,11 +117,12 @@ class DeviceClock:
         return round(device_ns + _at(self._line, device_ns))
 
     def quality(self) -> dict[str, float] | None:
-        """How well device time is known, for the sidecar of a recorded sweep; None before the first packet.
+        """How well device time is known, for the sidecar of a recorded sweep; None before the first
+        packet.
 
-        seconds: length of the past that the line was fitted to. drift_ppm: how much faster host time runs than device
-        time. late_ms: the fastest packet of each quarter of a second is compared with the fastest of all; this is the
-        largest delay among them.
+        seconds: length of the past that the line was fitted to. drift_ppm: how much faster host
+        time runs than device time. late_ms: the fastest packet of each quarter of a second is
+        compared with the fastest of all; this is the largest delay among them.
         """
         if not self._points:
             return None
@@ -134,7 +144,8 @@ class DeviceClock:
         left, right = next((a, b) for a, b in pairwise(hull) if b[0] >= middle)
         slope = (right[1] - left[1]) / (right[0] - left[0])
         slope = max(-self._max_slope, min(self._max_slope, slope))
-        # with a bounded slope the line may intersect the hull: lower it until it touches the hull from below
+        # with a bounded slope the line may intersect the hull: lower it until it touches the hull
+        # from below
         x, y = min(hull, key=lambda p: p[1] - slope * p[0])
         return x, y, slope
 

@@ -1,8 +1,9 @@
-"""The settings of the box. In: TOML files and `--set` options. Out: one frozen `Config` that knows each value's source.
+"""The settings of the box. In: TOML files and `--set` options. Out: one frozen `Config` that knows
+each value's source.
 
 Layers, each overriding those before it: the defaults below, `sensor.toml`, `board-NAME.toml`,
-`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: a field's type and limits say what a file may
-hold.
+`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: a field's type and limits say
+what a file may hold.
 """
 
 from __future__ import annotations
@@ -28,16 +29,18 @@ FEED_SCHEMA = 1
 class SensorConfig:
     """Which skin it is, where, and how it is read.
 
-    skin: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's, "" for that. rate_hz:
-    frames per second in place of the profile's, 0 for that. tare: send the profile's command for it whenever the skin
-    is found, which must be unloaded then. fingertip: the side of the grid that is nearest to the end of the finger, for
-    pictures; "" where nobody has said it.
-    vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link: "vendor" (bulk transfers),
-    "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with the kernel's
-    driver). port: path of this serial port; "" finds the one with the ids. baud: its bits per second, 0 takes the
-    profile's. Profiles of other protocols have ids of their own and use `port`, `serial` and `baud`.
-    read_bytes: size of one read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
-    frame after which the skin counts as lost. retry_ms: time between two searches for a missing skin.
+    skin: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's, ""
+    for that. rate_hz: frames per second in place of the profile's, 0 for that. tare: send the
+    profile's command for it whenever the skin is found, which must be unloaded then. fingertip: the
+    side of the grid that is nearest to the end of the finger, for pictures; "" where nobody has
+    said it. vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link:
+    "vendor" (bulk transfers), "acm" (a serial port over USB, without the kernel's driver), or
+    "serial" (any serial port, with the kernel's driver). port: path of this serial port; "" finds
+    the one with the ids. baud: its bits per second, 0 takes the profile's. Profiles of other
+    protocols have ids of their own and use `port`, `serial` and `baud`. read_bytes: size of one
+    read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
+    frame after which the skin counts as lost. retry_ms: time between two searches for a missing
+    skin.
     """
 
     skin: str = "palpate"
@@ -59,14 +62,15 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True)
 class TriggerConfig:
-    """What starts and stops a sweep: the robot's lines, by the kernel's names (`gpioinfo`; "" means not wired), or not a
-    line.
+    """What starts and stops a sweep: the robot's lines, by the kernel's names (`gpioinfo`; "" means
+    not wired), or not a line.
 
-    mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls, `stop` is not used.
-    "serial": commands on the serial line. "key": the space bar. "timed": a sweep of `sweep_s` every `every_s`.
-    new_object: its rising edge announces another object. active_low: inverts all three lines.
-    bias: the inputs' resistor. glitch_us: time for which a level must hold to count. storm_edges: largest number of
-    edges in one burst; more are taken for a broken wire.
+    mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls,
+    `stop` is not used. "serial": commands on the serial line. "key": the space bar. "timed": a
+    sweep of `sweep_s` every `every_s`. new_object: its rising edge announces another object.
+    active_low: inverts all three lines. bias: the inputs' resistor. glitch_us: time for which a
+    level must hold to count. storm_edges: largest number of edges in one burst; more are taken for
+    a broken wire.
     """
 
     mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"
@@ -90,8 +94,8 @@ class TriggerConfig:
 class OutputConfig:
     """The box's lines to the robot; "" means not wired.
 
-    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code, lowest bit first.
-    settle_us: time from setting them to the rise of `result_valid`.
+    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code,
+    lowest bit first. settle_us: time from setting them to the rise of `result_valid`.
     """
 
     ready: str = gpio_line()
@@ -105,10 +109,12 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
-    """Limits of a sweep. max_duration_s: without a stop edge for this long the sweep is answered `long`.
+    """Limits of a sweep. max_duration_s: without a stop edge for this long the sweep is answered
+    `long`.
 
-    late_ms: longest wait after the stop edge for frames of the window. lead_ms: time from the start edge to the first
-    frame of the window for early answers (500 is the middle of the paper's three seconds).
+    late_ms: longest wait after the stop edge for frames of the window. lead_ms: time from the start
+    edge to the first frame of the window for early answers (500 is the middle of the paper's three
+    seconds).
     """
 
     max_duration_s: float = number(12.0, 0.1, 3600.0)
@@ -120,8 +126,8 @@ class SweepConfig:
 class SerialConfig:
     """The serial line to the robot. port: a device path, "" for none. baud: bits per second, 8N1.
 
-    queue: largest number of sentences that wait for a slow reader; then the oldest is dropped. state_s: time between
-    two STA sentences.
+    queue: largest number of sentences that wait for a slow reader; then the oldest is dropped.
+    state_s: time between two STA sentences.
     """
 
     port: str = ""
@@ -132,13 +138,14 @@ class SerialConfig:
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
-    """The network. bundle: path of a bundle; "" for the one that was deployed last, or else the packaged one.
-    allow_unsigned: let a robot be answered by a `bundle` that nobody signed.
+    """The network. bundle: path of a bundle; "" for the one that was deployed last, or else the
+    packaged one. allow_unsigned: let a robot be answered by a `bundle` that nobody signed.
 
-    fuse: rule by which the sweeps of one object are fused into one answer; "none" answers each by itself. early: answer
-    while the finger still slides, as soon as the bundle's rule allows. min_probability: least probability for status
-    ok; 0 takes the bundle's threshold. max_sweeps: after this many fused sweeps of one object below `min_probability`
-    the answer is `undecided`; 0 means no limit.
+    fuse: rule by which the sweeps of one object are fused into one answer; "none" answers each by
+    itself. early: answer while the finger still slides, as soon as the bundle's rule allows.
+    min_probability: least probability for status ok; 0 takes the bundle's threshold. max_sweeps:
+    after this many fused sweeps of one object below `min_probability` the answer is `undecided`; 0
+    means no limit.
     """
 
     bundle: str = ""
@@ -153,10 +160,11 @@ class ClassifierConfig:
 class StoreConfig:
     """What the box stores. folder: bundles, recordings and black box (layout: deployment/store.py).
 
-    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of ssh-keygen. enrolment_key:
-    folder of the key with which this box signs the labels that it enrolled (deployment/enrolment_key.py). status: the file
-    that `palpate status` reads, "" for none. trial_sweeps, trial_s: a new bundle is committed once it has named this
-    many sweeps, or the skin has streamed for this long. black_box: number of latest sweeps to keep, 0 for none.
+    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of
+    ssh-keygen. enrolment_key: folder of the key with which this box signs the labels that it
+    enrolled (deployment/enrolment_key.py). status: the file that `palpate status` reads, "" for
+    none. trial_sweeps, trial_s: a new bundle is committed once it has named this many sweeps, or
+    the skin has streamed for this long. black_box: number of latest sweeps to keep, 0 for none.
     """
 
     folder: str = "/var/lib/palpate"
@@ -170,16 +178,19 @@ class StoreConfig:
 
 @dataclass(frozen=True, slots=True)
 class FeedConfig:
-    """What the box offers to programs that watch it (PROTOCOL.md, part 4). socket: path of the feed, "" for none."""
+    """What the box offers to programs that watch it (PROTOCOL.md, part 4). socket: path of the
+    feed, "" for none."""
 
     socket: str = "/run/palpate/feed.sock"
 
 
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
-    """The page of `palpate watch --web`. address: where it listens; beyond this machine only with token and certificate.
+    """The page of `palpate watch --web`. address: where it listens; beyond this machine only with
+    token and certificate.
 
-    names: further host names by which browsers may ask for it, separated by spaces. folder: token, certificate.pem and key.pem.
+    names: further host names by which browsers may ask for it, separated by spaces. folder: token,
+    certificate.pem and key.pem.
     """
 
     address: str = "127.0.0.1"
@@ -189,7 +200,8 @@ class WatchConfig:
 
 @dataclass(frozen=True, slots=True)
 class BridgeConfig:
-    """`palpate bridge` on the box, where no option says otherwise. address: where it listens, at the port of its kind.
+    """`palpate bridge` on the box, where no option says otherwise. address: where it listens, at
+    the port of its kind.
 
     allow_writes: whether peers may start, stop, tare and abort. A bridge has no password.
     """
@@ -200,9 +212,11 @@ class BridgeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All settings. board: the board file's name, "" for none. folder: where the files are, skins/ among them.
+    """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
+    among them.
 
-    sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the file's name or "--board".
+    sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the file's name
+    or "--board".
     """
 
     board: str
@@ -220,25 +234,35 @@ class Config:
     folder: Path = field(default=SITE.parent, compare=False)
 
 
-_SECTIONS: Mapping[str, Any] = MappingProxyType({n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)})
+_SECTIONS: Mapping[str, Any] = MappingProxyType(
+    {n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)}
+)
 _KEYS: Mapping[str, Key] = MappingProxyType(
-    {f"{section}.{last}": key for section, group in _SECTIONS.items() for last, key in keys(group).items()}
+    {
+        f"{section}.{last}": key
+        for section, group in _SECTIONS.items()
+        for last, key in keys(group).items()
+    }
 )
 
 
-def load(board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE) -> Config:
+def load(
+    board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE
+) -> Config:
     """All layers as one Config.
 
-    board: NAME of a `board-NAME.toml`; None or "" takes `board = "NAME"` in `site`, and without that no line is wired.
-    sets: "section.key=value", the value in TOML or a bare string. folder: where `sensor.toml` and the boards' files
-    are; None means `firmware_config/` beside the package, in an installation `/etc/palpate`. site: must exist unless it
-    is SITE.
-    Raises ConfigError naming the file, the key, the value and what is allowed.
+    board: NAME of a `board-NAME.toml`; None or "" takes `board = "NAME"` in `site`, and without
+    that no line is wired. sets: "section.key=value", the value in TOML or a bare string. folder:
+    where `sensor.toml` and the boards' files are; None means `firmware_config/` beside the package,
+    in an installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError naming
+    the file, the key, the value and what is allowed.
     """
     folder = folder or _folder()
     of_site = _read(site, needed=site != SITE)
     in_site = of_site.pop("board", "")
-    board, named_in = (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
+    board, named_in = (
+        (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
+    )
     layers = [(folder / "sensor.toml", _read(folder / "sensor.toml", needed=False))]
     if board != "":
         path = _board_file(folder, board, named_in)
@@ -250,23 +274,34 @@ def load(board: str | None, sets: Sequence[str] = (), *, folder: Path | None = N
         for name, value in _checked(table, str(where)):
             values[name], sources[name] = value, where.name
     _check_lines(values, sources)
-    groups = {s: group(**{f.name: values[f"{s}.{f.name}"] for f in fields(group)}) for s, group in _SECTIONS.items()}
+    groups = {
+        s: group(**{f.name: values[f"{s}.{f.name}"] for f in fields(group)})
+        for s, group in _SECTIONS.items()
+    }
     return Config(board=board, sources=MappingProxyType(sources), folder=folder, **groups)
 
 
 def describe(config: Config) -> str:
-    """One line per value, `section.key = value   # source`; the text is TOML that can be loaded as a site file."""
+    """One line per value, `section.key = value   # source`; the text is TOML that can be loaded as
+    a site file."""
     values = {"board": json.dumps(config.board)}
     for name, key in _KEYS.items():
         section, _, last = name.partition(".")
         value = getattr(getattr(config, section), last)
-        values[name] = f"0x{value:04x}" if "hex" in key.limits else json.dumps(value, ensure_ascii=False)
-    return "\n".join(f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items())
+        values[name] = (
+            f"0x{value:04x}" if "hex" in key.limits else json.dumps(value, ensure_ascii=False)
+        )
+    return "\n".join(
+        f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
+    )
 
 
 def boards(folder: Path | None = None) -> dict[str, Path]:
     """The delivered boards' files by name; folder: as for `load`."""
-    return {path.stem.removeprefix("board-"): path for path in sorted((folder or _folder()).glob("board-*.toml"))}
+    return {
+        path.stem.removeprefix("board-"): path
+        for path in sorted((folder or _folder()).glob("board-*.toml"))
+    }
 
 
 def _folder() -> Path:
@@ -282,16 +317,22 @@ def _read(path: Path, *, needed: bool) -> dict[str, Any]:
             return {}
         raise ConfigError(f"{path}: no such file; check the path") from e
     except OSError as e:
-        raise ConfigError(f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it") from e
+        raise ConfigError(
+            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
+        ) from e
     except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
-        raise ConfigError(f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes") from e
+        raise ConfigError(
+            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
+        ) from e
 
 
 def _board_file(folder: Path, board: Any, where: str) -> Path:
     known = boards(folder)
     if not (isinstance(board, str) and board in known):
         there = ", ".join(known) or "none"
-        raise ConfigError(f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: {there}")
+        raise ConfigError(
+            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: {there}"
+        )
     return known[board]
 
 
@@ -313,7 +354,9 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
     for section, content in table.items():
         if section not in _SECTIONS:
             if section == "board":
-                raise ConfigError(f"{where}: board is chosen in {SITE}, or with --board; move it there")
+                raise ConfigError(
+                    f"{where}: board is chosen in {SITE}, or with --board; move it there"
+                )
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
@@ -321,13 +364,16 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
             )
         named = {f"{section}.{last}": value for last, value in content.items()}
         yield from read_table(
-            _KEYS, named,
-            unknown=lambda name: _unknown(name, [*_KEYS], where), refused=lambda why: ConfigError(f"{where}: {why}"),
-        ).items()  # fmt: skip
+            _KEYS,
+            named,
+            unknown=lambda name: _unknown(name, [*_KEYS], where),
+            refused=lambda why: ConfigError(f"{where}: {why}"),
+        ).items()
 
 
 def _unknown(name: str, known: list[str], where: str) -> ConfigError:
-    """The error for an unknown name; a key of that name in another section is suggested before a similar spelling."""
+    """The error for an unknown name; a key of that name in another section is suggested before a
+    similar spelling."""
     last = name.rpartition(".")[2]
     near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"

@@ -1,4 +1,5 @@
-"""Clock, GPIO module and USB backend that the drivers use. Here: the real ones; `sim.devices` has simulated ones."""
+"""Clock, GPIO module and USB backend that the drivers use. Here: the real ones; `sim.devices` has
+simulated ones."""
 
 from __future__ import annotations
 
@@ -15,10 +16,10 @@ from appliance.core.types import SweepFormat
 class Devices:
     """What the drivers use: the real devices, or those of a subclass (`sim.devices.SimDevices`).
 
-    gpio: the module gpiod or its simulated double; None for gpiod, imported where a line is wired. backend: a pyusb
-    backend, None for libusb. source: the name of the source in sentences ("usb", "sim"). wait: waits until a serial port
-    can be read, at most so many seconds of `clock`. format: of the sweeps that simulated devices play, None where the skin
-    is to be asked.
+    gpio: the module gpiod or its simulated double; None for gpiod, imported where a line is wired.
+    backend: a pyusb backend, None for libusb. source: the name of the source in sentences ("usb",
+    "sim"). wait: waits until a serial port can be read, at most so many seconds of `clock`. format:
+    of the sweeps that simulated devices play, None where the skin is to be asked.
     """
 
     clock: Clock
@@ -29,7 +30,8 @@ class Devices:
     format: SweepFormat | None = None
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the lines and ids of these devices; the real ones are wired as configured."""
+        """The settings with the lines and ids of these devices; the real ones are wired as
+        configured."""
         return settings
 
     def finished(self, answered: int) -> bool:

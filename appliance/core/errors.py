@@ -1,13 +1,20 @@
-"""The error tree of the box: each class is one kind of error, with the exit code of the command line.
+"""The error tree of the box: each class is one kind of error, with the exit code of the command
+line.
 
-Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of sysexits.h.
+Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of
+sysexits.h.
 """
 
-EX_DATAERR, EX_UNAVAILABLE, EX_CONFIG = 65, 69, 78  # `os` has them on Unix alone, and the client runs elsewhere, too
+EX_DATAERR, EX_UNAVAILABLE, EX_CONFIG = (
+    65,
+    69,
+    78,
+)  # `os` has them on Unix alone, and the client runs elsewhere, too
 
 
 class ApplianceError(Exception):
-    """Base of all expected errors; the command line prints one as a single line and exits with `exit_code`."""
+    """Base of all expected errors; the command line prints one as a single line and exits with
+    `exit_code`."""
 
     exit_code = 1
 
@@ -25,7 +32,8 @@ class BundleError(ApplianceError):
 
 
 class SensorError(ApplianceError):
-    """The skin cannot be read. `state`: the sensor state of the STA sentence (PROTOCOL.md, sensor states)."""
+    """The skin cannot be read. `state`: the sensor state of the STA sentence (PROTOCOL.md, sensor
+    states)."""
 
     exit_code = EX_UNAVAILABLE
     state = "error"

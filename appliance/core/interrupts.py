@@ -1,4 +1,5 @@
-"""Ctrl-C while a program still imports what it needs. In: SIGINT. Out: one line on standard error, exit code 130.
+"""Ctrl-C while a program still imports what it needs. In: SIGINT. Out: one line on standard error,
+exit code 130.
 
 No exception is raised for it: extension modules that are being imported make other errors of one.
 """
@@ -17,7 +18,8 @@ INTERRUPTED = 130
 
 @contextmanager
 def during_imports(program: str) -> Iterator[None]:
-    """Within this block, Ctrl-C ends the process. One that is ignored, as after `nohup`, stays ignored."""
+    """Within this block, Ctrl-C ends the process. One that is ignored, as after `nohup`, stays
+    ignored."""
 
     def end(number: int, frame: FrameType | None) -> None:
         os.write(2, f"{program}: interrupted before anything was done\n".encode())

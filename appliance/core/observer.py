@@ -1,4 +1,5 @@
-"""What happens in the loop, for whatever watches it: captures, recordings, status, the service manager."""
+"""What happens in the loop, for whatever watches it: captures, recordings, status, the service
+manager."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ from appliance.core.types import Edge, Frames, Sweep, Verdict
 class Observer:
     """Base of all observers; each overrides what it wants to know.
 
-    No method may raise or wait: a full disk costs the record, never the classifying. What takes time belongs into
-    `sweep` or `turn`, where all answers of the turn are out.
+    No method may raise or wait: a full disk costs the record, never the classifying. What takes
+    time belongs into `sweep` or `turn`, where all answers of the turn are out.
     """
 
     def frames(self, frames: Frames) -> None:
@@ -29,10 +30,12 @@ class Observer:
         """The robot has got this verdict on its serial line."""
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """A sweep was answered, and all other answers of the turn are out. circumstances: see Box.circumstances."""
+        """A sweep was answered, and all other answers of the turn are out. circumstances: see
+        Box.circumstances."""
 
     def turn(self, health: Health) -> None:
-        """A turn has ended: frames were read or the skin is away, edges were polled, answers are out."""
+        """A turn has ended: frames were read or the skin is away, edges were polled, answers are
+        out."""
 
     def stopping(self) -> None:
         """The loop has ended; what is open is being answered."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 
 def commit() -> str:
-    """The commit of this code, followed by + if files were changed since; "unknown" outside a checkout."""
+    """The commit of this code, followed by + if files were changed since; "unknown" outside a
+    checkout."""
     here = str(Path(__file__).parent)
     command = ["git", "-C", here, "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
     try:

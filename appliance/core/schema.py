@@ -1,7 +1,9 @@
-"""Dataclasses as schemas of files. In: values from TOML or JSON. Out: these values, checked and as their fields' types.
+"""Dataclasses as schemas of files. In: values from TOML or JSON. Out: these values, checked and as
+their fields' types.
 
-A field is the only place for a value's type, default and limits. TOML tables are read with `keys` and `read_table`,
-JSON objects with `typed`; `closest` finds the name that a misspelt one probably stands for.
+A field is the only place for a value's type, default and limits. TOML tables are read with `keys`
+and `read_table`, JSON objects with `typed`; `closest` finds the name that a misspelt one probably
+stands for.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ _Kind = TypeVar("_Kind")
 
 
 def number(default: _Number, least: _Number, most: _Number, **more: object) -> _Number:
-    """A number field with its limits. more: `step` allows whole multiples only, `hex` prints it in hexadecimal."""
+    """A number field with its limits. more: `step` allows whole multiples only, `hex` prints it in
+    hexadecimal."""
     return field(default=default, metadata={"least": least, "most": most, **more})
 
 
@@ -29,8 +32,9 @@ def gpio_line() -> str:
 
 
 def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
-    """A field with its own reader. allowed: what the file may hold, for messages. read: returns the value to keep, or
-    None if the given one is not allowed. A dict as default is copied for each object."""
+    """A field with its own reader. allowed: what the file may hold, for messages. read: returns the
+    value to keep, or None if the given one is not allowed. A dict as default is copied for each
+    object."""
     metadata = {"allowed": allowed, "read": read}
     if isinstance(default, dict):
         return field(default_factory=default.copy, metadata=metadata)
@@ -39,7 +43,8 @@ def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A field of a dataclass as a key of a TOML table. hint: the field's type. limits: its metadata."""
+    """A field of a dataclass as a key of a TOML table. hint: the field's type. limits: its
+    metadata."""
 
     hint: Any
     default: Any
@@ -56,7 +61,10 @@ class Key:
             return tuple(value) if names else None
         if self.hint in (str, bool):
             return value if _fits(value, self.hint) else None
-        if type(value) not in (int, self.hint) or not self.limits["least"] <= value <= self.limits["most"]:
+        if (
+            type(value) not in (int, self.hint)
+            or not self.limits["least"] <= value <= self.limits["most"]
+        ):
             return None
         return None if "step" in self.limits and value % self.limits["step"] else self.hint(value)
 
@@ -82,13 +90,16 @@ def keys(kind: Any) -> dict[str, Key]:
 
 
 def read_table(
-    known: Mapping[str, Key], table: Mapping[str, Any], *, unknown: Callable[[str], Exception],
+    known: Mapping[str, Key],
+    table: Mapping[str, Any],
+    *,
+    unknown: Callable[[str], Exception],
     refused: Callable[[str], Exception],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The values of a TOML table as their fields' types, by name.
 
-    Raises the error that `unknown` makes of a name that is not in `known`, and the one that `refused` makes of the text
-    "NAME = VALUE is not allowed; use ...".
+    Raises the error that `unknown` makes of a name that is not in `known`, and the one that
+    `refused` makes of the text "NAME = VALUE is not allowed; use ...".
     """
     values = {}
     for name, value in table.items():
@@ -110,7 +121,8 @@ def shown(value: object) -> str:
 
 
 def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
-    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar first; case is ignored.
+    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar
+    first; case is ignored.
 
     cutoff: least similarity, 0 to 1 (difflib's ratio).
     """
@@ -119,10 +131,12 @@ def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5)
 
 
 def typed(kind: type[_Kind], table: Any) -> _Kind:
-    """A `kind` (a dataclass) from a JSON object. Lists become tuples and objects dataclasses as its fields require.
+    """A `kind` (a dataclass) from a JSON object. Lists become tuples and objects dataclasses as its
+    fields require.
 
-    Only values that can be computed with and printed are accepted: integers for int, finite numbers, printable strings.
-    Raises TypeError naming the field, and whatever the dataclass raises for its values.
+    Only values that can be computed with and printed are accepted: integers for int, finite
+    numbers, printable strings. Raises TypeError naming the field, and whatever the dataclass raises
+    for its values.
     """
     hints = get_type_hints(kind)
     if not isinstance(table, dict) or not table.keys() <= hints.keys():
@@ -132,7 +146,9 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     for name, value in values.items():
         if isinstance(value, str) and not value.isprintable():
             raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
-    made = kind(**values)  # first, because what a class says about its values is more specific than their types
+    made = kind(
+        **values
+    )  # first, because what a class says about its values is more specific than their types
     for name, value in values.items():
         if not _fits(value, hints[name]):
             wanted = getattr(hints[name], "__name__", hints[name])
@@ -141,7 +157,8 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
 
 
 def _nested(hint: Any, value: Any) -> Any:
-    """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the type requires."""
+    """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the
+    type requires."""
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(value)
     if get_origin(hint) is dict and isinstance(value, dict):

@@ -8,7 +8,8 @@ from types import MappingProxyType
 
 
 class Status(StrEnum):
-    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test compares the lists."""
+    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test
+    compares the lists."""
 
     OK = "ok"
     UNSURE = "unsure"
@@ -36,7 +37,8 @@ class Status(StrEnum):
 
     @property
     def faulty(self) -> bool:
-        """True if there is a window, but its counts show that the skin did not measure a contact as it should."""
+        """True if there is a window, but its counts show that the skin did not measure a contact as
+        it should."""
         return self in (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
 
 

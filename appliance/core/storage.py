@@ -1,7 +1,9 @@
-"""Atomic writes: a file or folder is complete or absent, also after a loss of power. In: names and bytes. Out: files.
+"""Atomic writes: a file or folder is complete or absent, also after a loss of power. In: names and
+bytes. Out: files.
 
-A file is written under another name, synced and renamed, and its folder synced: at every moment its name refers to the
-old content or to all of the new. Nothing here handles an OSError; the caller knows what is lost by it.
+A file is written under another name, synced and renamed, and its folder synced: at every moment its
+name refers to the old content or to all of the new. Nothing here handles an OSError; the caller
+knows what is lost by it.
 """
 
 from __future__ import annotations
@@ -18,8 +20,11 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Constants of the Linux system call renameat2."""
 
 
-def put(path: Path, data: bytes, *, parents: bool = False, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file completely or not at all. parents: make its folders. durable, mode: as for `put_all`.
+def put(
+    path: Path, data: bytes, *, parents: bool = False, durable: bool = True, mode: int | None = None
+) -> None:
+    """Write one file completely or not at all. parents: make its folders. durable, mode: as for
+    `put_all`.
 
     Raises OSError, and then leaves nothing behind.
     """
@@ -29,14 +34,16 @@ def put(path: Path, data: bytes, *, parents: bool = False, durable: bool = True,
 
 
 def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | None = None) -> None:
-    """Write files of one folder. They get their names in this order, so that a later file may refer to those before it.
+    """Write files of one folder. They get their names in this order, so that a later file may refer
+    to those before it.
 
-    durable: False omits the syncs: every reader still finds a complete file, but a loss of power may leave a broken
-    one. mode: permission bits, regardless of the umask; None leaves them to the umask.
-    Raises OSError, and then leaves behind no file that did not exist before.
+    durable: False omits the syncs: every reader still finds a complete file, but a loss of power
+    may leave a broken one. mode: permission bits, regardless of the umask; None leaves them to the
+    umask. Raises OSError, and then leaves behind no file that did not exist before.
     """
-    # as text: pathlib interns each new name, Python never reuses a place in its table of interned strings, and where a file
-    # is written each second the table would fill and be made anew, half a MiB larger, in the midst of the work
+    # as text: pathlib interns each new name, Python never reuses a place in its table of interned
+    # strings, and where a file is written each second the table would fill and be made anew, half a
+    # MiB larger, in the midst of the work
     asides = {target: f"{target}{PART}" for target in files}
     taken: list[str] = []
     try:
@@ -57,7 +64,8 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
 
 
 def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file under its own name, synced if `durable`: for a folder that gets its name only when complete."""
+    """Write one file under its own name, synced if `durable`: for a folder that gets its name only
+    when complete."""
     with open(path, "wb") as f:
         if mode is not None:
             os.fchmod(f.fileno(), mode)
@@ -69,8 +77,9 @@ def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | No
 
 @contextmanager
 def folder(target: Path) -> Iterator[Path]:
-    """A new folder beside `target`. When the block ends without an exception its files are synced and it takes the name
-    `target` in one step, replacing what was there; otherwise it is removed. Raises OSError.
+    """A new folder beside `target`. When the block ends without an exception its files are synced
+    and it takes the name `target` in one step, replacing what was there; otherwise it is removed.
+    Raises OSError.
     """
     import tempfile  # costs 1 MB of memory with its imports, needed only where a bundle is written
 

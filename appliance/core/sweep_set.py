@@ -1,4 +1,5 @@
-"""Sweep sets, which the simulator plays and `train` learns from. In: a user's .npz. Out: a checked SweepSet.
+"""Sweep sets, which the simulator plays and `train` learns from. In: a user's .npz. Out: a checked
+SweepSet.
 
 All shapes and types are checked here, so that no other module has to.
 """
@@ -25,10 +26,12 @@ Set = TypeVar("Set", bound="SweepSet")
 class SweepSet:
     """N sweeps with their labels and groups.
 
-    samples: raw counts [N, T, R, C] or [N, T, R, C, A] of one of DATA_TYPES. labels: int [N], indices into `materials`.
-    rate_hz: frames per second. groups: int [N] each; sweeps with the same number in `recording` are parts of one recording. source: the
-    name used in messages. unloaded: float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the skin without
-    contact as it was when each sweep was recorded, NaN for a sweep where it is not known; None where it never is. Raises FormatError naming `source` and what is wrong.
+    samples: raw counts [N, T, R, C] or [N, T, R, C, A] of one of DATA_TYPES. labels: int [N],
+    indices into `materials`. rate_hz: frames per second. groups: int [N] each; sweeps with the same
+    number in `recording` are parts of one recording. source: the name used in messages. unloaded:
+    float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the skin without contact
+    as it was when each sweep was recorded, NaN for a sweep where it is not known; None where it
+    never is. Raises FormatError naming `source` and what is wrong.
     """
 
     samples: Array
@@ -47,14 +50,21 @@ class SweepSet:
                 "and axes after them only where there are several"
             )
         if x.dtype.name not in DATA_TYPES:
-            raise self._error(f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}")
+            raise self._error(
+                f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}"
+            )
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
-        for name, values in {"labels": self.labels, **{f"group_{k}": v for k, v in self.groups.items()}}.items():
+        for name, values in {
+            "labels": self.labels,
+            **{f"group_{k}": v for k, v in self.groups.items()},
+        }.items():
             if values.shape != (len(x),) or values.dtype.kind not in "iu":
                 what = f"{values.dtype} {list(values.shape)}"
-                raise self._error(f"{name} holds {what}; give one whole number for each of {len(x)} sweeps")
+                raise self._error(
+                    f"{name} holds {what}; give one whole number for each of {len(x)} sweeps"
+                )
         level, wanted = self.unloaded, (len(x), 2, *x.shape[2:])
         if level is not None and (level.shape != wanted or level.dtype.kind != "f"):
             raise self._error(
@@ -68,7 +78,9 @@ class SweepSet:
                 f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, from 0 on"
             )
         if len(set(self.materials)) < n:
-            raise self._error(f"materials {list(self.materials)} name one twice; give each its own name")
+            raise self._error(
+                f"materials {list(self.materials)} name one twice; give each its own name"
+            )
         if not 0 < self.rate_hz < np.inf:
             raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
         try:
@@ -89,7 +101,8 @@ class SweepSet:
         return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name, *axes)
 
     def group(self, name: str) -> Array:
-        """Group `name`, int [N]; without a group `recording` each sweep is its own. Raises FormatError."""
+        """Group `name`, int [N]; without a group `recording` each sweep is its own. Raises
+        FormatError."""
         if name in self.groups:
             return self.groups[name]
         if name == "recording":
@@ -98,7 +111,8 @@ class SweepSet:
 
 
 def read(path: Path, what: str) -> dict[str, Array]:
-    """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it is not `what`."""
+    """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it
+    is not `what`."""
     try:
         with np.load(path, allow_pickle=False) as z:
             return {k: _typed(z, k) for k in z.files}
@@ -107,7 +121,8 @@ def read(path: Path, what: str) -> dict[str, Array]:
 
 
 def _typed(z: Any, name: str) -> Array:
-    """One array of an open .npz. Raises ValueError with the remedy where it holds Python objects."""
+    """One array of an open .npz. Raises ValueError with the remedy where it holds Python
+    objects."""
     try:
         return np.asarray(z[name])
     except ValueError as e:
@@ -119,12 +134,16 @@ def _typed(z: Any, name: str) -> Array:
 
 
 def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in the .npz `path`. Raises FormatError naming the file and what is missing or of the wrong form."""
-    return build(read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind)
+    """The set in the .npz `path`. Raises FormatError naming the file and what is missing or of the
+    wrong form."""
+    return build(
+        read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind
+    )
 
 
 def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
-    """A set of `arrays`, named as in a file. Raises FormatError naming `source` and what is wrong."""
+    """A set of `arrays`, named as in a file. Raises FormatError naming `source` and what is
+    wrong."""
     arrays = _numbered(arrays, source)
     missing = {"samples", "labels", "materials", "rate_hz"} - set(arrays)
     if missing:
@@ -132,20 +151,31 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
             f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
         )
     if arrays["materials"].ndim != 1 or arrays["materials"].dtype.kind != "U":
-        raise FormatError(f"{source}: materials hold {arrays['materials'].dtype}; give a list of names, dtype=str")
+        raise FormatError(
+            f"{source}: materials hold {arrays['materials'].dtype}; give a list of names, dtype=str"
+        )
     if arrays["rate_hz"].size != 1 or arrays["rate_hz"].dtype.kind not in "iuf":
-        raise FormatError(f"{source}: rate_hz holds {arrays['rate_hz']!r}; give one number, frames per second")
+        raise FormatError(
+            f"{source}: rate_hz holds {arrays['rate_hz']!r}; give one number, frames per second"
+        )
     # torch and onnxruntime accept only this machine's byte order
     native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in arrays.items()}
     groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
     materials = tuple(str(m) for m in arrays["materials"])
     return kind(
-        native["samples"], native["labels"], materials, arrays["rate_hz"].item(), groups, source, native.get("unloaded")
+        native["samples"],
+        native["labels"],
+        materials,
+        arrays["rate_hz"].item(),
+        groups,
+        source,
+        native.get("unloaded"),
     )
 
 
 def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
-    """The arrays with labels that are names as indices into `materials`, which may be missing then. Raises FormatError."""
+    """The arrays with labels that are names as indices into `materials`, which may be missing then.
+    Raises FormatError."""
     if "labels" not in arrays or (given := arrays["labels"]).dtype.kind != "U":
         return arrays
     materials = arrays.get("materials", np.unique(given))
@@ -154,11 +184,15 @@ def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
         raise FormatError(
             f"{source}: label {unknown[0]!r} is not among the materials {materials.tolist()}; add it there"
         )
-    return arrays | {"materials": materials, "labels": np.vectorize(number.get, otypes=[np.int64])(given)}
+    return arrays | {
+        "materials": materials,
+        "labels": np.vectorize(number.get, otypes=[np.int64])(given),
+    }
 
 
 def _conversion(x: Array) -> str:
-    """Advice for samples of another type: the first data type that holds the same values, float32 for fractions."""
+    """Advice for samples of another type: the first data type that holds the same values, float32
+    for fractions."""
     if x.dtype.kind not in "biuf":
         return ""
     fits = (d for d in DATA_TYPES if x.dtype.kind != "f" and (x.astype(d) == x).all())

@@ -1,4 +1,5 @@
-"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status; recorded sweeps as files.
+"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status; recorded sweeps
+as files.
 
 Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
 """
@@ -25,25 +26,29 @@ from appliance.core.schema import typed
 from appliance.core.status import Status as Status
 
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
-"""Data types of a taxel's raw count; the position in this tuple is its code in packets (PROTOCOL.md)."""
+"""Data types of a taxel's raw count; the position in this tuple is its code in packets
+(PROTOCOL.md)."""
 MOST_AXES = 8
 """Largest number of values that a taxel has."""
 
 EPOCH_BITS = 40
-"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two enumerations of the
-board are never adjacent."""
+"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
+enumerations of the board are never adjacent."""
 SCHEMA = 2
-"""Version of a recorded sweep's sidecar. Version 1 holds nothing but the sweep and is still read."""
+"""Version of a recorded sweep's sidecar. Version 1 holds nothing but the sweep and is still
+read."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
-"""What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an impossible size."""
+"""What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an
+impossible size."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepFormat:
-    """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used, counts of `dtype`.
+    """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used,
+    counts of `dtype`.
 
-    axes: values of each taxel; the last is the one along the skin's normal. It is part of a bundle: another skin needs
-    another bundle, not other code. Raises FormatError for a value out of range.
+    axes: values of each taxel; the last is the one along the skin's normal. It is part of a bundle:
+    another skin needs another bundle, not other code. Raises FormatError for a value out of range.
     """
 
     rows: int
@@ -55,15 +60,21 @@ class SweepFormat:
 
     def __post_init__(self) -> None:
         if self.dtype not in DATA_TYPES:
-            raise FormatError(f"data type {self.dtype!r} is unknown; use one of {', '.join(DATA_TYPES)}")
+            raise FormatError(
+                f"data type {self.dtype!r} is unknown; use one of {', '.join(DATA_TYPES)}"
+            )
         if not (1 <= self.rows <= 255 and 1 <= self.cols <= 255):
-            raise FormatError(f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way")
+            raise FormatError(
+                f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way"
+            )
         if not 1e-3 <= self.rate_hz <= 1e6:  # a board sends thousandths of 1 Hz
             raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
         if self.window < 1:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
         if not 1 <= self.axes <= MOST_AXES:
-            raise FormatError(f"{self.axes} axes of each taxel are out of range; use 1 to {MOST_AXES}")
+            raise FormatError(
+                f"{self.axes} axes of each taxel are out of range; use 1 to {MOST_AXES}"
+            )
 
     @property
     def numpy_type(self) -> np.dtype[Any]:
@@ -91,7 +102,8 @@ class SweepFormat:
         return self.shape, self.dtype
 
     def json(self) -> dict[str, Any]:
-        """All fields by name, for JSON. One axis is left out, so that files and ids remain those of earlier versions."""
+        """All fields by name, for JSON. One axis is left out, so that files and ids remain those of
+        earlier versions."""
         return {name: value for name, value in asdict(self).items() if (name, value) != ("axes", 1)}
 
     def __str__(self) -> str:
@@ -104,7 +116,8 @@ def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
 
 
 def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
-    """The axis along the skin's normal alone, the last one: [..., R, C] of [..., R, C] or [..., R, C, A].
+    """The axis along the skin's normal alone, the last one: [..., R, C] of [..., R, C] or [..., R,
+    C, A].
 
     before: dimensions before the rows, 0 for one frame, 1 for a window.
     """
@@ -118,8 +131,8 @@ def shown(shape: Sequence[int]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or [n, R, C, A] raw
-    counts."""
+    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or
+    [n, R, C, A] raw counts."""
 
     t_ns: NDArray[np.int64]
     seq: NDArray[np.int64]
@@ -137,11 +150,14 @@ class Frames:
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
         """Several runs of frames as one."""
-        return cls(*(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__))
+        return cls(
+            *(np.concatenate([getattr(run, name) for run in runs]) for name in cls.__slots__)
+        )
 
 
 class EdgeKind(StrEnum):
-    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot signalled is unknown."""
+    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot
+    signalled is unknown."""
 
     START = "start"
     STOP = "stop"
@@ -151,10 +167,12 @@ class EdgeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its burst.
+    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its
+    burst.
 
-    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before it are certain.
-    No edge follows it until every line has been quiet for `glitch_us`; the levels are then read again, without an edge.
+    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before
+    it are certain. No edge follows it until every line has been quiet for `glitch_us`; the levels
+    are then read again, without an edge.
     """
 
     kind: EdgeKind
@@ -163,15 +181,16 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise empty.
+    """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise
+    empty.
 
-    share: 1; less for a sweep that is still going on: the share of a window's frames that has come, counted from
-    `sweep.lead_ms` after the start edge; `frames` then are these frames.
-    start_ns, stop_ns: trigger edges, host monotonic (equal if one is missing; before the stop edge the last frame).
-    lost: frames of the window that never arrived; if `status` is ok they were interpolated.
-    complete_ns: when the last thing needed (stop edge or frame) had arrived.
-    object: number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused.
-    material, position, session: labels given while recording, "" for none.
+    share: 1; less for a sweep that is still going on: the share of a window's frames that has come,
+    counted from `sweep.lead_ms` after the start edge; `frames` then are these frames. start_ns,
+    stop_ns: trigger edges, host monotonic (equal if one is missing; before the stop edge the last
+    frame). lost: frames of the window that never arrived; if `status` is ok they were interpolated.
+    complete_ns: when the last thing needed (stop edge or frame) had arrived. object: number of NEW
+    OBJECT signals so far; 0 before the first, when sweeps are not fused. material, position,
+    session: labels given while recording, "" for none.
     """
 
     id: int
@@ -192,13 +211,14 @@ class Sweep:
 class Verdict:
     """The answer to one sweep.
 
-    scores: float64 [K] probabilities of the K labels for this sweep, or for all fused sweeps; empty if nothing was
-    classified. margin: probability of the label minus that of the next one. detail: what the status refers to
-    ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as in Sweep. latency_ns: from `Sweep.complete_ns` to the
-    verdict. bundle: id of the bundle. share: share of the window that was used, less than 1 in an early answer.
-    own: float64 [K] probabilities of this sweep alone; empty if nothing was classified.
-    moved: distance of the contact from its position in training ("moved 2.1 mm too far towards row 4"); "" if it is in
-    place, or if the bundle does not hold the positions.
+    scores: float64 [K] probabilities of the K labels for this sweep, or for all fused sweeps; empty
+    if nothing was classified. margin: probability of the label minus that of the next one. detail:
+    what the status refers to ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as in Sweep.
+    latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share: share of
+    the window that was used, less than 1 in an early answer. own: float64 [K] probabilities of this
+    sweep alone; empty if nothing was classified. moved: distance of the contact from its position
+    in training ("moved 2.1 mm too far towards row 4"); "" if it is in place, or if the bundle does
+    not hold the positions.
     """
 
     sweep: int
@@ -218,45 +238,73 @@ class Verdict:
     moved: str = ""
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
-        """All fields by name, for JSON, which keeps numbers bit for bit. arrays: include `scores` and `own`, as
-        lists."""
+        """All fields by name, for JSON, which keeps numbers bit for bit. arrays: include `scores`
+        and `own`, as lists."""
         values = {name: getattr(self, name) for name in Verdict.__slots__}
-        lists = {name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)}
-        return values | lists if arrays else {name: v for name, v in values.items() if name not in lists}
+        lists = {
+            name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
+        }
+        return (
+            values | lists
+            if arrays
+            else {name: v for name, v in values.items() if name not in lists}
+        )
 
 
 def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
     return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.numpy_type, fmt.shape)])
 
 
-def save(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it, completely or not at all.
+def save(
+    path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})
+) -> None:
+    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it,
+    completely or not at all.
 
-    The sidecar gets its name first, so that an .npy always has one. about: further content of the sidecar, under names
-    that Sweep does not use. Raises OSError if writing fails, and then leaves nothing behind.
+    The sidecar gets its name first, so that an .npy always has one. about: further content of the
+    sidecar, under names that Sweep does not use. Raises OSError if writing fails, and then leaves
+    nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(fmt))
-    table["t_ns"], table["seq"], table["taxels"] = sweep.frames.t_ns, sweep.frames.seq, sweep.frames.taxels
+    table["t_ns"], table["seq"], table["taxels"] = (
+        sweep.frames.t_ns,
+        sweep.frames.seq,
+        sweep.frames.taxels,
+    )
     own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
-    packed = io.BytesIO()  # np.save writes to a file without Python's I/O, and a full disk then gives no errno
+    packed = (
+        io.BytesIO()
+    )  # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     np.save(packed, table, allow_pickle=False)
-    content = {**about, **own, "format": fmt.json(), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
-    storage.put_all({path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()})
+    content = {
+        **about,
+        **own,
+        "format": fmt.json(),
+        "crc32": crc32(packed.getvalue()),
+        "schema": SCHEMA,
+    }
+    storage.put_all(
+        {path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()}
+    )
 
 
 def sidecar(path: Path) -> dict[str, Any]:
-    """The content of the sidecar of the .npy at `path`. Raises FormatError if it is missing or broken."""
+    """The content of the sidecar of the .npy at `path`. Raises FormatError if it is missing or
+    broken."""
     try:
         content = json.loads(path.with_suffix(".json").read_text("utf-8"))
         if not isinstance(content, dict):
             raise TypeError(f"{type(content).__name__} instead of an object")
         return content
     except (ValueError, OSError, TypeError, RecursionError) as e:
-        raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e
+        raise FormatError(
+            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
+        ) from e
 
 
 def load(path: Path) -> tuple[Sweep, SweepFormat]:
-    """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another form."""
+    """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another
+    form."""
     content = sidecar(path)
     try:
         data = path.read_bytes()
@@ -271,9 +319,17 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
                 f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
             )
         if table.dtype != _record_dtype(fmt) or table.ndim != 1:
-            raise FormatError(f"records of {table.dtype} do not fit the format {fmt} of its sidecar")
+            raise FormatError(
+                f"records of {table.dtype} do not fit the format {fmt} of its sidecar"
+            )
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
-        own = content if schema == 1 else {name: content[name] for name in Sweep.__slots__ if name in content}
+        own = (
+            content
+            if schema == 1
+            else {name: content[name] for name in Sweep.__slots__ if name in content}
+        )
         return typed(Sweep, own | {"status": status, "frames": frames}), fmt
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
-        raise FormatError(f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it") from e
+        raise FormatError(
+            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
+        ) from e

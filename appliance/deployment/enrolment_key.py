@@ -1,8 +1,10 @@
-"""The key with which a box signs the labels that it enrolled itself. In: the folder that `make install` has made, the bytes
-of enrolment.npz. Out: a signature, or a BundleError where the box did not make one.
+"""The key with which a box signs the labels that it enrolled itself. In: the folder that `make
+install` has made, the bytes of enrolment.npz. Out: a signature, or a BundleError where the box did
+not make one.
 
-`key` is the private key, which user palpate alone may read; `signer` is the public one, which belongs to root, as a line of
-a file of signers. Its signatures are for enrolments alone: another namespace than that of bundles.
+`key` is the private key, which user palpate alone may read; `signer` is the public one, which
+belongs to root, as a line of a file of signers. Its signatures are for enrolments alone: another
+namespace than that of bundles.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ class EnrolmentKey:
     folder: Path
 
     def check(self) -> None:
-        """Raises ConfigError where this user could not sign an enrolment that this box then believes."""
+        """Raises ConfigError where this user could not sign an enrolment that this box then
+        believes."""
         try:
             self.verify(PROBE, self.sign(PROBE))
         except BundleError as e:
@@ -37,7 +40,8 @@ class EnrolmentKey:
             ) from e
 
     def sign(self, data: bytes) -> bytes:
-        """The signature of an enrolment. Raises ConfigError where there is no key, or it is not private or damaged."""
+        """The signature of an enrolment. Raises ConfigError where there is no key, or it is not
+        private or damaged."""
         path = self.folder / KEY
         again = f"sudo -u palpate palpate enrol may read it; make install makes it where there is no {SIGNER} beside it"
         try:
@@ -59,7 +63,8 @@ class EnrolmentKey:
             ) from e
 
     def verify(self, data: bytes, signed: bytes) -> None:
-        """Raises BundleError where this box did not sign `data` as an enrolment, ConfigError where that cannot be checked."""
+        """Raises BundleError where this box did not sign `data` as an enrolment, ConfigError where
+        that cannot be checked."""
         signer = self.folder / SIGNER
         try:
             signature.verify(data, signed, signer, NAMESPACE)

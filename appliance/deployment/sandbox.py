@@ -1,7 +1,8 @@
-"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable. Out: nothing, or why it
-failed.
+"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable.
+Out: nothing, or why it failed.
 
-The child is a fork: it has what was read and checked here, byte for byte, and what it does to itself stays with it.
+The child is a fork: it has what was read and checked here, byte for byte, and what it does to
+itself stays with it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ MOST_MESSAGE = 2000
 
 
 def run_limited(work: Callable[[], object]) -> None:
-    """Do `work` in a child process. Raises BundleError where it raises, dies, or takes longer than DEADLINE_S."""
+    """Do `work` in a child process. Raises BundleError where it raises, dies, or takes longer than
+    DEADLINE_S."""
     import multiprocessing  # these two here: only commands need them, not the service
     import signal
 
@@ -43,8 +45,14 @@ def run_limited(work: Callable[[], object]) -> None:
         except EOFError:
             pass
     if child.exitcode:
-        name = signal.Signals(-child.exitcode).name if child.exitcode < 0 else f"exit code {child.exitcode}"
-        raise BundleError(f"model killed the process that tried it ({name}); export the bundle again")
+        name = (
+            signal.Signals(-child.exitcode).name
+            if child.exitcode < 0
+            else f"exit code {child.exitcode}"
+        )
+        raise BundleError(
+            f"model killed the process that tried it ({name}); export the bundle again"
+        )
 
 
 def _work(work: Callable[[], object], sender: Connection) -> None:
@@ -60,6 +68,8 @@ def _work(work: Callable[[], object], sender: Connection) -> None:
     except ApplianceError as e:
         sender.send_bytes(str(e).encode()[:MOST_MESSAGE])
     except MemoryError:
-        sender.send_bytes(f"model asks for more than {MOST_BYTES >> 20} MB; export a smaller one".encode())
+        sender.send_bytes(
+            f"model asks for more than {MOST_BYTES >> 20} MB; export a smaller one".encode()
+        )
     except Exception as e:  # of onnxruntime's classes, which share no base but this
         sender.send_bytes(f"model cannot be run: {type(e).__name__}: {e}".encode()[:MOST_MESSAGE])

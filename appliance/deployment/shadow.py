@@ -1,7 +1,9 @@
-"""Shadow mode: a candidate bundle classifies beside the one in service, before anybody commits to it.
+"""Shadow mode: a candidate bundle classifies beside the one in service, before anybody commits to
+it.
 
-In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on which it does not,
-in a folder. The candidate cannot affect the robot: it gets a sweep only after the answer has been sent.
+In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on
+which it does not, in a folder. The candidate cannot affect the robot: it gets a sweep only after
+the answer has been sent.
 """
 
 from __future__ import annotations
@@ -36,10 +38,11 @@ FAILURES = 3
 SLOW_NS = 100_000_000
 """A candidate that computes for longer has failed on the sweep: frames wait for it."""
 MOST_MEMORY = 180 << 20
-"""Bytes that the candidate's model and the current one may need together, by the account of onnx_check: the service may have
-256 MB (systemd/palpate.service), and needs 60 without a model."""
+"""Bytes that the candidate's model and the current one may need together, by the account of
+onnx_check: the service may have 256 MB (systemd/palpate.service), and needs 60 without a model."""
 STARTS = 3
-"""After so many starts in a row that did not last PERIOD_NS, the candidate is not loaded any more."""
+"""After so many starts in a row that did not last PERIOD_NS, the candidate is not loaded any
+more."""
 PERIOD_NS = 60_000_000_000
 """How often the counts are written where the two agree."""
 NEVER_NS = 1 << 63
@@ -49,10 +52,11 @@ NEVER_NS = 1 << 63
 class Agreement:
     """How two bundles have answered the same sweeps; the content of agreement.json.
 
-    pairs: answer of the current one -> answer of the candidate -> number of sweeps. later: early answers where the
-    candidate would have waited for more of the sweep; these are not compared. failed: sweeps on which the candidate
-    failed. kept: sweeps in the same folder. worst_ms, total_ms: its longest and its whole computing time. starts: in a
-    row without an orderly end, the present one included until it is older than PERIOD_NS.
+    pairs: answer of the current one -> answer of the candidate -> number of sweeps. later: early
+    answers where the candidate would have waited for more of the sweep; these are not compared.
+    failed: sweeps on which the candidate failed. kept: sweeps in the same folder. worst_ms,
+    total_ms: its longest and its whole computing time. starts: in a row without an orderly end, the
+    present one included until it is older than PERIOD_NS.
     """
 
     candidate: str
@@ -74,18 +78,28 @@ class Agreement:
         text = f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of {self.compared} sweeps"
         if self.compared:
             low, high = wilson(self.agreed, self.compared)
-            text += (
-                f" [{100 * low:.1f} to {100 * high:.1f} %], computing {self.total_ms / self.compared:.2g} ms for each"
-            )
+            text += f" [{100 * low:.1f} to {100 * high:.1f} %], computing {self.total_ms / self.compared:.2g} ms for each"
             text += f" and {self.worst_ms:.2g} ms at most"
         text += f"; {self.later} early answers are not compared" if self.later else ""
         return text + (f"; it failed on {self.failed}" if self.failed else "")
 
     def lines(self, folder: Path) -> list[str]:
-        """The text, then each pair of different answers, the most frequent first, and where the sweeps are."""
-        pairs = [(n, one, other) for one, row in self.pairs.items() for other, n in row.items() if one != other]
-        differ = [f"  {one} -> {other}: {n}" for n, one, other in sorted(pairs, key=lambda pair: -pair[0])]
-        return [self.text, *differ, *([f"  {self.kept} of these are kept in {folder}"] if self.kept else [])]
+        """The text, then each pair of different answers, the most frequent first, and where the
+        sweeps are."""
+        pairs = [
+            (n, one, other)
+            for one, row in self.pairs.items()
+            for other, n in row.items()
+            if one != other
+        ]
+        differ = [
+            f"  {one} -> {other}: {n}" for n, one, other in sorted(pairs, key=lambda pair: -pair[0])
+        ]
+        return [
+            self.text,
+            *differ,
+            *([f"  {self.kept} of these are kept in {folder}"] if self.kept else []),
+        ]
 
     def json(self) -> bytes:
         """The content of agreement.json."""
@@ -107,7 +121,8 @@ def _answer(v: Verdict) -> str:
 
 
 def read(folder: Path) -> Agreement | None:
-    """The agreement in a shadow's folder, None where there is none. Raises FormatError where it cannot be read."""
+    """The agreement in a shadow's folder, None where there is none. Raises FormatError where it
+    cannot be read."""
     try:
         found = typed(Agreement, json.loads((folder / FILE).read_bytes()))
         if found.schema != 1:
@@ -116,19 +131,27 @@ def read(folder: Path) -> Agreement | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, RecursionError) as e:
-        raise FormatError(f"{folder / FILE} cannot be read: {e}; take it away, and the counts begin anew") from e
+        raise FormatError(
+            f"{folder / FILE} cannot be read: {e}; take it away, and the counts begin anew"
+        ) from e
 
 
 class Shadow(Observer):
-    """Observer of a running box that lets the candidate judge each sweep by the same rules, and counts.
+    """Observer of a running box that lets the candidate judge each sweep by the same rules, and
+    counts.
 
-    current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of bundles are removed.
-    judge: makes a bundle's classifier by the settings. Raises ApplianceError where the candidate or the folder cannot
-    be used.
+    current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of
+    bundles are removed. judge: makes a bundle's classifier by the settings. Raises ApplianceError
+    where the candidate or the folder cannot be used.
     """
 
     def __init__(
-        self, candidate: Bundle, current: Bundle, folder: Path, clock: Clock, judge: Callable[[Bundle], Classifier]
+        self,
+        candidate: Bundle,
+        current: Bundle,
+        folder: Path,
+        clock: Clock,
+        judge: Callable[[Bundle], Classifier],
     ) -> None:
         if candidate.format != current.format:
             raise BundleError(
@@ -142,14 +165,18 @@ class Shadow(Observer):
                 "without a shadow"
             )
         self._clock, self._failures_in_row, self._tare = clock, 0, current.manifest.tare
-        self._log = TroubleLog(f"shadow: {folder} cannot be written", "make room there; classifying goes on")
+        self._log = TroubleLog(
+            f"shadow: {folder} cannot be written", "make room there; classifying goes on"
+        )
         self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
         try:
             self._sweeps = SweepFolder(folder, current.format)
             self.agreement = self._begin(candidate.id, current.id)
         except OSError as e:
-            raise ApplianceError(f"{folder}: {e.strerror}; see that it has room and may be written") from e
+            raise ApplianceError(
+                f"{folder}: {e.strerror}; see that it has room and may be written"
+            ) from e
         try:  # the model may kill the program here, so the start was counted before
             self._classifier = judge(candidate)
             self._classifier.self_test()
@@ -159,7 +186,8 @@ class Shadow(Observer):
             raise
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Let the candidate judge a sweep that has a window; one on which they differ is kept in a later turn."""
+        """Let the candidate judge a sweep that has a window; one on which they differ is kept in a
+        later turn."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
         tare = np.asarray(circumstances["tare"], np.float64)
@@ -169,12 +197,16 @@ class Shadow(Observer):
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:
             other = self._judge(sweep)
-        except Exception as e:  # onnxruntime raises its own classes, which share no base but Exception
+        except (
+            Exception
+        ) as e:  # onnxruntime raises its own classes, which share no base but Exception
             self._fail(str(e).strip()[:200])
             return
         took_ns = self._clock.now_ns() - begin_ns
         if took_ns > SLOW_NS:
-            self._fail(f"it computed {took_ns / 1e6:.0f} ms for a sweep, {SLOW_NS / 1e6:.0f} are allowed")
+            self._fail(
+                f"it computed {took_ns / 1e6:.0f} ms for a sweep, {SLOW_NS / 1e6:.0f} are allowed"
+            )
             return
         self._failures_in_row = 0
         if other is None:
@@ -182,7 +214,9 @@ class Shadow(Observer):
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
             self._due_ns = begin_ns
             if self.agreement.kept + len(self._waiting) < KEPT:
-                self._waiting.append((sweep, verdict, {**circumstances, "candidate": other.as_dict()}))
+                self._waiting.append(
+                    (sweep, verdict, {**circumstances, "candidate": other.as_dict()})
+                )
 
     def turn(self, health: Health) -> None:
         """At the end of a turn: write one thing that is due, while no sweep is open."""

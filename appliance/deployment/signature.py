@@ -1,7 +1,9 @@
-"""Signs and verifies bundles. In: a manifest, its signature, a file of trusted signers. Out: the signer's name.
+"""Signs and verifies bundles. In: a manifest, its signature, a file of trusted signers. Out: the
+signer's name.
 
-ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual), with keys and
-tools that people have already. A manifest names the hash of every other file, so its signature covers the whole bundle.
+ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its
+manual), with keys and tools that people have already. A manifest names the hash of every other
+file, so its signature covers the whole bundle.
 """
 
 from __future__ import annotations
@@ -25,24 +27,25 @@ NAMESPACE = "palpate-bundle"
 MOST_SIGNATURE, MOST_SIGNERS = 16 << 10, 256 << 10
 """Bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
 DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
-"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a passphrase or touches a
-key."""
+"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a
+passphrase or touches a key."""
 LINE = re.compile(
     r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
     r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
     re.ASCII,
 )
-"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates, and dates, for which
-a box must know the time."""
+"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates,
+and dates, for which a box must know the time."""
 DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
 def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAMESPACE) -> str:
-    """The name of the signer, one of `signers`, who signed `message` for this use, by default as a bundle's manifest.
+    """The name of the signer, one of `signers`, who signed `message` for this use, by default as a
+    bundle's manifest.
 
-    Raises BundleError where none of them did, and ConfigError where this cannot be checked: the file of signers is
-    missing, empty or holds a line that is not understood, or ssh-keygen fails.
+    Raises BundleError where none of them did, and ConfigError where this cannot be checked: the
+    file of signers is missing, empty or holds a line that is not understood, or ssh-keygen fails.
     """
     if len(signature) > MOST_SIGNATURE:
         raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
@@ -54,7 +57,9 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
                 f"bundle is signed by none of those in {signers} ({_output(found)}); sign it with a key that is "
                 "there (palpate-train sign), or have the administrator add the key"
             )
-        checked = _keygen("verify", "-f", allowed, "-I", names[0], "-n", namespace, "-s", signed, message=message)
+        checked = _keygen(
+            "verify", "-f", allowed, "-I", names[0], "-n", namespace, "-s", signed, message=message
+        )
     if checked.returncode:
         raise BundleError(
             f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the bundle again, or sign it "
@@ -63,37 +68,57 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
     return names[0]
 
 
-def sign(message: bytes, key: Path, namespace: str = NAMESPACE, *, interactive: bool = True) -> bytes:
+def sign(
+    message: bytes, key: Path, namespace: str = NAMESPACE, *, interactive: bool = True
+) -> bytes:
     """The signature of `message`, by default as a bundle's manifest.
 
-    key: a private key, or a public one whose private key an agent holds. interactive: ask on the terminal for what the key
-    wants. Raises ConfigError where it does not sign.
+    key: a private key, or a public one whose private key an agent holds. interactive: ask on the
+    terminal for what the key wants. Raises ConfigError where it does not sign.
     """
-    done = _keygen("sign", "-f", str(key), "-n", namespace, "-q", message=message, interactive=interactive)
+    done = _keygen(
+        "sign", "-f", str(key), "-n", namespace, "-q", message=message, interactive=interactive
+    )
     if done.returncode or not done.stdout:
-        raise ConfigError(f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519")
+        raise ConfigError(
+            f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519"
+        )
     return bytes(done.stdout)
 
 
 def _trusted(signers: Path) -> bytes:
-    """The content of the file of signers, with each line checked: ssh-keygen would skip one that it does not understand
-    without a word. Raises ConfigError."""
+    """The content of the file of signers, with each line checked: ssh-keygen would skip one that it
+    does not understand without a word. Raises ConfigError."""
     try:
         with signers.open("rb") as f:
             data = f.read(MOST_SIGNERS + 1)
         lines = data.decode().split("\n")
     except (OSError, ValueError) as e:
-        raise ConfigError(f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs") from e
+        raise ConfigError(
+            f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs"
+        ) from e
     if len(data) > MOST_SIGNERS:
-        raise ConfigError(f"{signers} has more than {MOST_SIGNERS} bytes; keep one line for each who signs")
-    entries = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+        raise ConfigError(
+            f"{signers} has more than {MOST_SIGNERS} bytes; keep one line for each who signs"
+        )
+    entries = [
+        (n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
+    ]
     if not entries:
-        raise ConfigError(f"{signers} names nobody, so no bundle can be believed; put a line `NAME KEY` there")
+        raise ConfigError(
+            f"{signers} names nobody, so no bundle can be believed; put a line `NAME KEY` there"
+        )
     for n, line in entries:
         if not _is_signer(line):
             dated = DATED.search(line)
-            why = f"{dated[0]} is not used here, a box may not know the time" if dated else "it is not understood"
-            raise ConfigError(f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a .pub file")
+            why = (
+                f"{dated[0]} is not used here, a box may not know the time"
+                if dated
+                else "it is not understood"
+            )
+            raise ConfigError(
+                f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a .pub file"
+            )
     return data
 
 
@@ -112,8 +137,8 @@ def _is_signer(line: str) -> bool:
 
 @contextmanager
 def _as_file(data: bytes) -> Iterator[str]:
-    """Path of a file in memory with `data`, which a child can open: it reads what was checked here, and no disk is
-    needed."""
+    """Path of a file in memory with `data`, which a child can open: it reads what was checked here,
+    and no disk is needed."""
     at = os.memfd_create("palpate", 0)  # children inherit it
     try:
         os.write(at, data)
@@ -122,19 +147,31 @@ def _as_file(data: bytes) -> Iterator[str]:
         os.close(at)
 
 
-def _keygen(action: str, *options: str, message: bytes = b"", interactive: bool = False) -> CompletedProcess[bytes]:
-    """Run `ssh-keygen -Y action` on `message`. interactive: it may ask a person on the terminal. Raises ConfigError."""
+def _keygen(
+    action: str, *options: str, message: bytes = b"", interactive: bool = False
+) -> CompletedProcess[bytes]:
+    """Run `ssh-keygen -Y action` on `message`. interactive: it may ask a person on the terminal.
+    Raises ConfigError."""
     import subprocess  # 200 kB, and only where a bundle was deployed
 
     try:
         return subprocess.run(
-            ["ssh-keygen", "-Y", action, *options], input=message, timeout=INTERACTIVE_S if interactive else DEADLINE_S,
-            stdout=subprocess.PIPE, stderr=None if interactive else subprocess.PIPE, close_fds=False, check=False,
-        )  # fmt: skip
+            ["ssh-keygen", "-Y", action, *options],
+            input=message,
+            timeout=INTERACTIVE_S if interactive else DEADLINE_S,
+            stdout=subprocess.PIPE,
+            stderr=None if interactive else subprocess.PIPE,
+            close_fds=False,
+            check=False,
+        )
     except FileNotFoundError as e:
-        raise ConfigError("ssh-keygen is missing, so no signature can be checked: apt install openssh-client") from e
+        raise ConfigError(
+            "ssh-keygen is missing, so no signature can be checked: apt install openssh-client"
+        ) from e
     except (OSError, subprocess.TimeoutExpired) as e:
-        raise ConfigError(f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {action}` by hand") from e
+        raise ConfigError(
+            f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {action}` by hand"
+        ) from e
 
 
 def _output(done: CompletedProcess[bytes]) -> str:

@@ -1,9 +1,10 @@
-"""What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new, whole at every
-moment.
+"""What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new,
+whole at every moment.
 
-In the store's folder, `bundles/SHA/` (bundle.name) are whole, verified bundles, the symlink `current` names the one that runs
-(missing: the packaged one), and `ledger.json` holds all else (StoreState). Each step is one atomic rename of a file, a
-folder or the link, and what the step relies on is on the disk before:
+In the store's folder, `bundles/SHA/` (bundle.name) are whole, verified bundles, the symlink
+`current` names the one that runs (missing: the packaged one), and `ledger.json` holds all else
+(StoreState). Each step is one atomic rename of a file, a folder or the link, and what the step
+relies on is on the disk before:
 
 - install: the bundle's folder gets its name; its state is written, on trial and with the bundle to go back to; then
   `current` leads to it. The state of the bundle that was current is unchanged, and holds if the power goes in between.
@@ -11,7 +12,8 @@ folder or the link, and what the step relies on is on the disk before:
 - commit: the end of the trial and the new least counter are one write.
 - going back: the state first, with the trial's starts used up or the way forward again kept; then `current`.
 
-So a reader that reads first the link and then the state needs no lock. A writer holds one on the folder.
+So a reader that reads first the link and then the state needs no lock. A writer holds one on the
+folder.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ PACKAGER = "palpate"
 INCOMPLETE = "."
 """First character of a folder's name while it is being written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
-"""How long to wait for another command, which takes some fsyncs on a slow card; and how often to try."""
+"""How long to wait for another command, which takes some fsyncs on a slow card; and how often to
+try."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +69,14 @@ class SignedBundle:
 
     @property
     def base(self) -> str:
-        """The sha256 of its manifest: for a bundle with enrolled labels that of the one that they were enrolled into."""
+        """The sha256 of its manifest: for a bundle with enrolled labels that of the one that they
+        were enrolled into."""
         return self.bundle.base
 
 
 class BundleFolder:
-    """Whole, verified bundles in `folder`, each under its name. signers: the file of trusted signers. key: of this box, for
-    labels that it enrolled."""
+    """Whole, verified bundles in `folder`, each under its name. signers: the file of trusted
+    signers. key: of this box, for labels that it enrolled."""
 
     def __init__(self, folder: Path, signers: Path, key: EnrolmentKey) -> None:
         self.folder, self._signers, self._key = folder, signers, key
@@ -82,7 +86,8 @@ class BundleFolder:
         return self.folder / sha
 
     def read(self, folder: Path) -> SignedBundle:
-        """The bundle in any `folder`, checked but not run. Raises BundleError, and ConfigError as signature.verify."""
+        """The bundle in any `folder`, checked but not run. Raises BundleError, and ConfigError as
+        signature.verify."""
         return self.checked(bundle.files(folder), folder)
 
     def checked(self, files: Mapping[str, bytes], folder: Path) -> SignedBundle:
@@ -96,8 +101,9 @@ class BundleFolder:
         return SignedBundle(loaded, signer, files)
 
     def _signer(self, files: Mapping[str, bytes], folder: Path) -> str:
-        """Who signed it. Labels that were enrolled need this box's signature, and what they were enrolled into is either
-        signed as every bundle is, or the packaged bundle, which is believed like the program that it comes with."""
+        """Who signed it. Labels that were enrolled need this box's signature, and what they were
+        enrolled into is either signed as every bundle is, or the packaged bundle, which is believed
+        like the program that it comes with."""
         enrolled = bundle.ENROLMENT in files
         if enrolled:
             if bundle.ENROLMENT_SIGNATURE not in files:
@@ -106,7 +112,9 @@ class BundleFolder:
                 )
             self._key.verify(files[bundle.ENROLMENT], files[bundle.ENROLMENT_SIGNATURE])
         if bundle.SIGNATURE in files:
-            signer = signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers)
+            signer = signature.verify(
+                files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers
+            )
         elif not enrolled:
             raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
         elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
@@ -122,7 +130,9 @@ class BundleFolder:
         """The bundle `sha`, checked again. Raises BundleError where another one is in its place."""
         signed = self.read(self.at(sha))
         if signed.sha != sha:
-            raise BundleError(f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one again")
+            raise BundleError(
+                f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one again"
+            )
         return signed
 
     def put(self, signed: SignedBundle) -> None:
@@ -136,7 +146,8 @@ class BundleFolder:
                 (new / name).write_bytes(data)
 
     def keep(self, *kept: str) -> None:
-        """Remove all other bundles, and what an interruption left. A bundle is renamed before its files are removed."""
+        """Remove all other bundles, and what an interruption left. A bundle is renamed before its
+        files are removed."""
         for folder in sorted(self.folder.iterdir()):  # incomplete ones first
             if folder.name in kept:
                 continue
@@ -157,13 +168,18 @@ class Choice:
 class Store:
     """The bundles on this box and which of them runs.
 
-    prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether it fits the
-    settings. boot: the file with the id of this boot. The methods raise OSError for trouble with the disk, BundleError for a bundle that must not run,
-    ConfigError where the settings name no trusted signers, and ApplianceError where another command holds the lock.
+    prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether
+    it fits the settings. boot: the file with the id of this boot. The methods raise OSError for
+    trouble with the disk, BundleError for a bundle that must not run, ConfigError where the
+    settings name no trusted signers, and ApplianceError where another command holds the lock.
     """
 
     def __init__(
-        self, settings: StoreConfig, prove: Callable[[Bundle], object], clock: Clock | None = None, boot: Path = BOOT
+        self,
+        settings: StoreConfig,
+        prove: Callable[[Bundle], object],
+        clock: Clock | None = None,
+        boot: Path = BOOT,
     ) -> None:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
         key = EnrolmentKey(Path(settings.enrolment_key))
@@ -180,7 +196,9 @@ class Store:
             return PACKAGED
         parent, _, sha = target.partition("/")
         if parent != self.bundles.folder.name or not SHA.fullmatch(sha):
-            raise BundleError(f"{self._link} leads to {target!r}, which is no bundle of the store; remove this link")
+            raise BundleError(
+                f"{self._link} leads to {target!r}, which is no bundle of the store; remove this link"
+            )
         return sha
 
     @property
@@ -205,22 +223,30 @@ class Store:
         return signed
 
     def install(
-        self, incoming: Path, shadow: bool = False, admit: Callable[[Bundle], object] = lambda bundle: None
+        self,
+        incoming: Path,
+        shadow: bool = False,
+        admit: Callable[[Bundle], object] = lambda bundle: None,
     ) -> str:
-        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its name.
+        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its
+        name.
 
-        shadow: it becomes the candidate instead. admit: raises BundleError for one that is not wanted now. Other files
-        in `incoming` are ignored. Somebody else may own the folder and change it meanwhile: the files are read once,
-        and what was checked is what is written.
+        shadow: it becomes the candidate instead. admit: raises BundleError for one that is not
+        wanted now. Other files in `incoming` are ignored. Somebody else may own the folder and
+        change it meanwhile: the files are read once, and what was checked is what is written.
         """
         return self._install(self.examine(incoming), shadow, admit)
 
     def enrol(self, files: Mapping[str, bytes]) -> str:
-        """Install the files of a bundle that this box has enrolled a label into, as `install`; its name."""
+        """Install the files of a bundle that this box has enrolled a label into, as `install`; its
+        name."""
         return self._install(self._proven(self.bundles.checked(files, self.folder)))
 
     def _install(
-        self, signed: SignedBundle, shadow: bool = False, admit: Callable[[Bundle], object] = lambda bundle: None
+        self,
+        signed: SignedBundle,
+        shadow: bool = False,
+        admit: Callable[[Bundle], object] = lambda bundle: None,
     ) -> str:
         admit(signed.bundle)
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
@@ -240,7 +266,9 @@ class Store:
         """Make the candidate run on trial from the next start on; its name."""
         sha = self.state.candidate
         if sha == PACKAGED:
-            raise BundleError("there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)")
+            raise BundleError(
+                "there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)"
+            )
         signed = self.bundles.get(sha)
         with self._locked() as state:
             self._admit(signed, state)
@@ -248,7 +276,8 @@ class Store:
         return sha
 
     def candidate(self) -> Bundle | None:
-        """The bundle that is to classify beside the current one, checked; None where there is none."""
+        """The bundle that is to classify beside the current one, checked; None where there is
+        none."""
         sha = self.state.candidate
         return None if sha == PACKAGED else self.bundles.get(sha).bundle
 
@@ -257,8 +286,8 @@ class Store:
         return self._kept(self.current)
 
     def choose(self) -> Choice:
-        """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or is refused, gives way
-        to the bundle it goes back to."""
+        """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or
+        is refused, gives way to the bundle it goes back to."""
         sha = self.current
         if self.state.of(sha).committed:
             return self._committed(sha)
@@ -271,14 +300,19 @@ class Store:
                     why = str(e)
             self._go_back(sha, why)
         except OSError as e:
-            log.warning(f"{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now")
+            log.warning(
+                f"{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now"
+            )
             return self._committed(self.state.of(sha).previous)
         chosen = self._committed(self.current)
-        log.warning(f"bundle {sha[:8]} has failed its trial, and {chosen.bundle.id} runs again: {why}")
+        log.warning(
+            f"bundle {sha[:8]} has failed its trial, and {chosen.bundle.id} runs again: {why}"
+        )
         return chosen
 
     def commit(self, sha: str | None = None, wait_s: float = LOCK_S) -> bool:
-        """End the trial of the current bundle, if that is `sha` (None: any) and on trial; whether it was."""
+        """End the trial of the current bundle, if that is `sha` (None: any) and on trial; whether
+        it was."""
         with self._locked(wait_s) as state:
             now = self.current
             if state.of(now).committed or sha not in (None, now):
@@ -287,8 +321,8 @@ class Store:
         return True
 
     def rollback(self) -> str:
-        """Go back to the bundle that was committed before, from the next start on; its name or PACKAGED. Going back
-        twice returns to the first one, unless that had failed its trial."""
+        """Go back to the bundle that was committed before, from the next start on; its name or
+        PACKAGED. Going back twice returns to the first one, unless that had failed its trial."""
         with self._locked() as state:
             sha = self.current
             standing = state.of(sha)
@@ -297,16 +331,24 @@ class Store:
                 raise BundleError("there is no committed bundle to go back to; deploy one")
             if back != PACKAGED:
                 self.bundles.get(back)
-            self._write(state.exchanged(sha) if standing.committed else state.left(sha, "rolled back by hand"))
+            self._write(
+                state.exchanged(sha)
+                if standing.committed
+                else state.left(sha, "rolled back by hand")
+            )
             self._set_current(back)
         return back
 
     def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come, and whether this start is one of `starts`. Does not wait:
-        ApplianceError where another command is at work."""
+        """Write down how far the trial of `sha` has come, and whether this start is one of
+        `starts`. Does not wait: ApplianceError where another command is at work."""
         boot = self._boot if counted else ""
         with self._locked(0.0) as state:
-            self._write(state.changed(sha, starts=starts, boot=boot, sweeps=sweeps, streamed_s=round(streamed_s, 1)))
+            self._write(
+                state.changed(
+                    sha, starts=starts, boot=boot, sweeps=sweeps, streamed_s=round(streamed_s, 1)
+                )
+            )
 
     def _committed(self, sha: str) -> Choice:
         """A committed bundle for this start."""
@@ -321,7 +363,9 @@ class Store:
         try:
             return self.bundles.get(sha)
         except BundleError as e:
-            raise BundleError(f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)") from e
+            raise BundleError(
+                f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)"
+            ) from e
 
     def _on_trial(self, sha: str) -> Choice:
         """A bundle on trial for this start, which was counted."""
@@ -342,7 +386,9 @@ class Store:
                 return standing.why or f"it was started {MOST_STARTS} times without being committed"
             if standing.cuts >= MOST_CUTS:
                 return f"the box was switched off {MOST_CUTS} times while it was on trial"
-            self._write(state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts))
+            self._write(
+                state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts)
+            )
         return ""
 
     @property
@@ -361,8 +407,8 @@ class Store:
                 self._set_current(state.of(sha).previous)
 
     def _admit(self, signed: SignedBundle, state: StoreState) -> None:
-        """Raise BundleError where it is older than one that was committed, unless it is the one that runs but for labels
-        that were enrolled."""
+        """Raise BundleError where it is older than one that was committed, unless it is the one
+        that runs but for labels that were enrolled."""
         with suppress(BundleError, ConfigError):  # what is damaged gives way
             running = self.running()
             if signed.base == running.base and (signed.bundle.added or running.bundle.added):
@@ -390,11 +436,15 @@ class Store:
         folder = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             if (owner := os.fstat(folder).st_uid) != os.geteuid():
-                raise ConfigError(f"{self.folder} belongs to user {owner}; do this as that user (sudo -u palpate ...)")
+                raise ConfigError(
+                    f"{self.folder} belongs to user {owner}; do this as that user (sudo -u palpate ...)"
+                )
             end_ns = self._clock.now_ns() + round(wait_s * 1e9)
             while not _try_lock(folder):
                 if self._clock.now_ns() >= end_ns:
-                    raise ApplianceError(f"{self.folder} is in use by another command; try again when that has ended")
+                    raise ApplianceError(
+                        f"{self.folder} is in use by another command; try again when that has ended"
+                    )
                 self._clock.sleep_until(self._clock.now_ns() + STEP_NS)
             yield self.state
         finally:

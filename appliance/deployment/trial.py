@@ -1,8 +1,9 @@
-"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store records: starts that
-count against the bundle, its progress, and the commit once enough went well.
+"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store
+records: starts that count against the bundle, its progress, and the commit once enough went well.
 
-`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin is away, when the
-program ends in order or because a device is missing, and at the next start where the computer was booted in between.
+`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin
+is away, when the program ends in order or because a device is missing, and at the next start where
+the computer was booted in between.
 """
 
 from __future__ import annotations
@@ -23,18 +24,21 @@ if TYPE_CHECKING:
 RETRY_NS = 10_000_000_000
 """After a write that failed, the disk is left alone for so long."""
 ERRORS = (OSError, ApplianceError)
-"""What a write to the store may raise: from the disk, or because another command holds the store."""
+"""What a write to the store may raise: from the disk, or because another command holds the
+store."""
 
 
 class TrialStore(Protocol):
-    """What a trial asks of the store. Both methods raise OSError or ApplianceError where nothing could be written."""
+    """What a trial asks of the store. Both methods raise OSError or ApplianceError where nothing
+    could be written."""
 
     @property
     def settings(self) -> StoreConfig:
         """How many sweeps and seconds a trial lasts."""
 
     def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come, and whether this start is one of `starts`."""
+        """Write down how far the trial of `sha` has come, and whether this start is one of
+        `starts`."""
 
     def commit(self, sha: str | None, wait_s: float) -> bool:
         """End the trial of `sha`; whether it was on trial."""
@@ -43,8 +47,8 @@ class TrialStore(Protocol):
 class Trial(Observer):
     """Observes one bundle's trial; also a context around the run.
 
-    standing: with this start counted. Never raises for the disk: a failed write is logged once and tried again after
-    RETRY_NS, and classifying goes on.
+    standing: with this start counted. Never raises for the disk: a failed write is logged once and
+    tried again after RETRY_NS, and classifying goes on.
     """
 
     def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
@@ -53,7 +57,9 @@ class Trial(Observer):
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
         self._last_ns: int | None = None  # the last turn's time, where frames came in it
         self._next_ns, self._over = 0, False
-        self._log = TroubleLog(f"trial of bundle {sha[:8]}: ledger.json cannot be written", "it is tried again")
+        self._log = TroubleLog(
+            f"trial of bundle {sha[:8]}: ledger.json cannot be written", "it is tried again"
+        )
 
     @property
     def text(self) -> str:
@@ -71,7 +77,8 @@ class Trial(Observer):
         self._sweeps += bool(verdict.label)
 
     def turn(self, health: Health) -> None:
-        """Add the time that the skin streams; record what has changed, or commit where it is enough."""
+        """Add the time that the skin streams; record what has changed, or commit where it is
+        enough."""
         if self._over:
             return
         if health.streams and self._last_ns is not None:
@@ -88,8 +95,14 @@ class Trial(Observer):
     def __enter__(self) -> Trial:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """An error of hardware or settings does not count against the bundle, nor does a signal; any other does."""
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        """An error of hardware or settings does not count against the bundle, nor does a signal;
+        any other does."""
         if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
             self.stopping()
 
@@ -98,7 +111,9 @@ class Trial(Observer):
         settings = self._store.settings
         if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
             return health.sweeping or self._log.attempt(self._commit, ERRORS)
-        return health.streams == self._counted or self._log.attempt(lambda: self._note(health.streams), ERRORS)
+        return health.streams == self._counted or self._log.attempt(
+            lambda: self._note(health.streams), ERRORS
+        )
 
     def _note(self, counts: bool) -> None:
         starts = self._starts - (not counts)

@@ -1,8 +1,8 @@
-"""Classifies sweeps. In: a Bundle and Sweeps. Out: Verdicts; the window is checked, classified, and fused with the
-other sweeps of its object.
+"""Classifies sweeps. In: a Bundle and Sweeps. Out: Verdicts; the window is checked, classified, and
+fused with the other sweeps of its object.
 
-The graph takes the raw counts; nothing is scaled here. A faulty window, or a material unlike all that were trained or
-enrolled, gets a status with the reason instead of a label.
+The graph takes the raw counts; nothing is scaled here. A faulty window, or a material unlike all
+that were trained or enrolled, gets a status with the reason instead of a label.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _NONE = np.empty(0)
 LEAST_PROBABILITY = 1e-12
-"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto all others."""
+"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
+all others."""
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
@@ -43,36 +44,44 @@ def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
 def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
     """Fuse the probabilities float64 [K] of several sweeps of one object into one array [K].
 
-    fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper, sec. V.D): the most
-    frequent label wins, of equally frequent ones the first, so that with two sweeps the first decides.
+    fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper,
+    sec. V.D): the most frequent label wins, of equally frequent ones the first, so that with two
+    sweeps the first decides.
     """
     if fusion == "product":
         return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
     labels = [int(np.argmax(s)) for s in scores]
     votes = np.bincount(labels, minlength=len(scores[0])) / len(labels)
-    votes[max(labels, key=lambda k: votes[k])] += 1e-9  # max() keeps the first of equals; argmax must agree
+    votes[max(labels, key=lambda k: votes[k])] += (
+        1e-9  # max() keeps the first of equals; argmax must agree
+    )
     return votes
 
 
 class Classifier:
     """Runs one bundle in one thread.
 
-    Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is answered by itself.
-    A sweep whose contact has moved is judged by the bundle's rule for it, where there is one: its own distances, limit and
-    temperature, and at least its probability.
-    They are a sequential test: `unsure` asks for one more sweep of the object, until the probability is at least
-    `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the robot continues all the
-    same, the same rule applies to all sweeps of the object, since no evidence is discarded.
-    An unknown sweep is not fused: it has no probabilities, and one touch beside the object must not invalidate what its
-    other sweeps showed.
+    Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is
+    answered by itself. A sweep whose contact has moved is judged by the bundle's rule for it, where
+    there is one: its own distances, limit and temperature, and at least its probability. They are a
+    sequential test: `unsure` asks for one more sweep of the object, until the probability is at
+    least `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the
+    robot continues all the same, the same rule applies to all sweeps of the object, since no
+    evidence is discarded. An unknown sweep is not fused: it has no probabilities, and one touch
+    beside the object must not invalidate what its other sweeps showed.
 
-    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 takes the bundle's thresholds.unsure.
-    max_sweeps: 0 means no limit. Raises BundleError if onnxruntime refuses the model; its inputs and outputs were
-    compared with the manifest by `bundle.load`.
+    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 takes the bundle's
+    thresholds.unsure. max_sweeps: 0 means no limit. Raises BundleError if onnxruntime refuses the
+    model; its inputs and outputs were compared with the manifest by `bundle.load`.
     """
 
     def __init__(
-        self, bundle: Bundle, clock: Clock, fusion: str = "product", min_probability: float = 0.0, max_sweeps: int = 0
+        self,
+        bundle: Bundle,
+        clock: Clock,
+        fusion: str = "product",
+        min_probability: float = 0.0,
+        max_sweeps: int = 0,
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
@@ -83,14 +92,21 @@ class Classifier:
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
         rule = bundle.manifest.moved
-        self._moved_means = Means(classes, known, bundle.manifest.labels, rule) if rule and known and classes else None
-        self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (self._means is not None)
+        self._moved_means = (
+            Means(classes, known, bundle.manifest.labels, rule)
+            if rule and known and classes
+            else None
+        )
+        self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (
+            self._means is not None
+        )
         # with logits always, which the self-test needs; early heads get a session of their own
         self._model = ModelRunner(bundle.model, *{"logits", *self._outputs})
 
     @property
     def rule(self) -> dict[str, Any]:
-        """The constructor's settings, for sidecars, so that a replay classifies a recorded sweep by the same rule."""
+        """The constructor's settings, for sidecars, so that a replay classifies a recorded sweep by
+        the same rule."""
         return {"how": self._fusion, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
 
     @property
@@ -109,7 +125,12 @@ class Classifier:
 
     def tell(self) -> list[object]:
         """The bundle's name, version, id and format."""
-        return [self.bundle.manifest.name, self.bundle.manifest.version, self.bundle.id, self.bundle.format]
+        return [
+            self.bundle.manifest.name,
+            self.bundle.manifest.version,
+            self.bundle.id,
+            self.bundle.format,
+        ]
 
     def set_tare(self, taxels: NDArray[Any]) -> str:
         """Take the mean of frames [n, R, C] as the unloaded skin, for the checks of contact."""
@@ -121,8 +142,8 @@ class Classifier:
         return self._classify(taxels)[0]
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C, A]; the model must have this
-        output.
+        """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C,
+        A]; the model must have this output.
 
         Frames that have not come yet may have any value: rows that depend on them are meaningless.
         """
@@ -133,7 +154,8 @@ class Classifier:
         self._model.prepare("early")
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
-        """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model must have this output."""
+        """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model
+        must have this output."""
         return self._run(("embedding",), taxels)[0]
 
     def test(self) -> str:
@@ -141,8 +163,8 @@ class Classifier:
         return f"{len(self.bundle.golden)} golden sweeps differ by {self.self_test():.2g}"
 
     def self_test(self) -> float:
-        """Run the golden sweeps; returns the largest difference of a probability. Raises BundleError if a label differs
-        or the difference is above GOLDEN_TOLERANCE."""
+        """Run the golden sweeps; returns the largest difference of a probability. Raises
+        BundleError if a label differs or the difference is above GOLDEN_TOLERANCE."""
         computed = softmax(np.stack([self.logits(g) for g in self.bundle.golden]))
         expected = softmax(self.bundle.golden_logits)
         worst = float(np.abs(computed - expected).max())
@@ -157,11 +179,14 @@ class Classifier:
         return worst
 
     def _test_means(self, means: Means) -> None:
-        """Raises BundleError if the class means do not belong to the model: they give a golden sweep another label than
-        the model's own logits."""
+        """Raises BundleError if the class means do not belong to the model: they give a golden
+        sweep another label than the model's own logits."""
         for golden in self.bundle.golden:
             logits, z = self._run(("logits", "embedding"), golden)
-            by_logits, by_means = logits.argmax(), means.logits(means.distances(z))[: len(logits)].argmax()
+            by_logits, by_means = (
+                logits.argmax(),
+                means.logits(means.distances(z))[: len(logits)].argmax(),
+            )
             if by_logits != by_means:
                 labels = self.bundle.manifest.labels
                 raise BundleError(
@@ -170,7 +195,8 @@ class Classifier:
                 )
 
     def __call__(self, sweep: Sweep) -> Verdict:
-        """The verdict on one sweep. A sweep whose status is not ok keeps it and is not classified."""
+        """The verdict on one sweep. A sweep whose status is not ok keeps it and is not
+        classified."""
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
@@ -180,14 +206,20 @@ class Classifier:
         logits, novelty = self._classify(sweep.frames.taxels, bool(moved))
         if novelty:
             return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), moved=moved)
-        return self.conclude(sweep, softmax(logits / (rule.temperature if moved and rule else 1)), moved)
+        return self.conclude(
+            sweep, softmax(logits / (rule.temperature if moved and rule else 1)), moved
+        )
 
-    def conclude(self, sweep: Sweep, scores: NDArray[np.float64], moved: str | None = None) -> Verdict:
-        """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with its object's other
-        sweeps. moved: what `_moved` gave for it, computed where it is None."""
+    def conclude(
+        self, sweep: Sweep, scores: NDArray[np.float64], moved: str | None = None
+    ) -> Verdict:
+        """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with its
+        object's other sweeps. moved: what `_moved` gave for it, computed where it is None."""
         moved = self._moved(sweep) if moved is None else moved
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
-            return self._verdict(sweep, Finding(Status.UNKNOWN, "the model gives no number"), moved=moved)
+            return self._verdict(
+                sweep, Finding(Status.UNKNOWN, "the model gives no number"), moved=moved
+            )
         if sweep.object == 0 or sweep.object != self._object or self._fusion == "none":
             self._object, self._scores = sweep.object, []
         own, self._scores = scores, [*self._scores, scores]
@@ -200,7 +232,8 @@ class Classifier:
         return self._verdict(sweep, Finding(status), scores, fused, own, moved)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
-        """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on, is not counted."""
+        """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on,
+        is not counted."""
         before = self._object, self._scores
         verdict = self.conclude(sweep, scores)
         if verdict.status is Status.OK:
@@ -213,10 +246,14 @@ class Classifier:
         graph_input = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
         return self._model(outputs, graph_input)
 
-    def _classify(self, taxels: NDArray[Any], moved: bool = False) -> tuple[NDArray[np.float32], str]:
-        """Logits [K] of one window, and its distance from known materials; "" if it is like one of them.
+    def _classify(
+        self, taxels: NDArray[Any], moved: bool = False
+    ) -> tuple[NDArray[np.float32], str]:
+        """Logits [K] of one window, and its distance from known materials; "" if it is like one of
+        them.
 
-        moved: whether its contact has moved; what that changes then does not make a material unknown.
+        moved: whether its contact has moved; what that changes then does not make a material
+        unknown.
         """
         values = self._run(self._outputs, taxels)
         means = self._moved_means if moved and self._moved_means else self._means
@@ -233,17 +270,37 @@ class Classifier:
         return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place)
 
     def _verdict(
-        self, sweep: Sweep, finding: Finding, scores: NDArray[np.float64] = _NONE, fused: int = 0,
-        own: NDArray[np.float64] = _NONE, moved: str = "",
-    ) -> Verdict:  # fmt: skip
+        self,
+        sweep: Sweep,
+        finding: Finding,
+        scores: NDArray[np.float64] = _NONE,
+        fused: int = 0,
+        own: NDArray[np.float64] = _NONE,
+        moved: str = "",
+    ) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
             order = np.argsort(-scores, kind="stable")  # of equal ones the first, as argmax
-            label, best, second = self.bundle.manifest.labels[order[0]], scores[order[0]], scores[order[1]]
+            label, best, second = (
+                self.bundle.manifest.labels[order[0]],
+                scores[order[0]],
+                scores[order[1]],
+            )
         now = self._clock.now_ns()
         return Verdict(
-            sweep=sweep.id, time_ns=now, status=finding.status, label=label, probability=float(best),
-            margin=float(best - second), scores=scores, fused=fused, lost=sweep.lost,
-            latency_ns=now - sweep.complete_ns, bundle=self.bundle.id,
-            detail="; ".join(filter(None, (moved, finding.detail))), share=sweep.share, own=own, moved=moved,
-        )  # fmt: skip
+            sweep=sweep.id,
+            time_ns=now,
+            status=finding.status,
+            label=label,
+            probability=float(best),
+            margin=float(best - second),
+            scores=scores,
+            fused=fused,
+            lost=sweep.lost,
+            latency_ns=now - sweep.complete_ns,
+            bundle=self.bundle.id,
+            detail="; ".join(filter(None, (moved, finding.detail))),
+            share=sweep.share,
+            own=own,
+            moved=moved,
+        )

@@ -1,7 +1,9 @@
-"""Gives back the memory of a library's code that only starting needed. In: the library's file. Out: how many bytes.
+"""Gives back the memory of a library's code that only starting needed. In: the library's file. Out:
+how many bytes.
 
-Opening a model runs through most of onnxruntime's code once, to register its operators: 15 MiB that stay resident as long
-as memory is not short. The processor's next access to a page that is given back reads it again from the file.
+Opening a model runs through most of onnxruntime's code once, to register its operators: 15 MiB that
+stay resident as long as memory is not short. The processor's next access to a page that is given
+back reads it again from the file.
 """
 
 from __future__ import annotations
@@ -16,9 +18,11 @@ MAPS = Path("/proc/self/maps")
 
 
 def give_back(library: str, maps: Path = MAPS) -> int:
-    """Unmap the pages of code of the file `library` until they are run again; 0 where it has none, or Linux refuses.
+    """Unmap the pages of code of the file `library` until they are run again; 0 where it has none,
+    or Linux refuses.
 
-    Only what is executable and not writable: it is as it stands in the file, so nothing can be lost.
+    Only what is executable and not writable: it is as it stands in the file, so nothing can be
+    lost.
     """
     madvise = ctypes.CDLL(None).madvise
     madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int

@@ -1,7 +1,8 @@
-"""Early exit: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status ok, or None.
+"""Early exit: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status
+ok, or None.
 
-The bundle's graph has a head for each tenth of the window; the manifest holds the probability from which each may
-answer.
+The bundle's graph has a head for each tenth of the window; the manifest holds the probability from
+which each may answer.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ if TYPE_CHECKING:
 
 
 def decides(scores: NDArray[np.float64], rule: Early) -> bool:
-    """Whether `scores` float64 [d + 1, K], the probabilities of steps 0 to d, allow an answer at step d.
+    """Whether `scores` float64 [d + 1, K], the probabilities of steps 0 to d, allow an answer at
+    step d.
 
-    They do if the last `rule.agree` steps name the same label, with at least the probability `rule.least[d]` at step d.
+    They do if the last `rule.agree` steps name the same label, with at least the probability
+    `rule.least[d]` at step d.
     """
     labels = scores[-rule.agree :].argmax(axis=1)
     agreed = len(labels) == rule.agree and (labels == labels[-1]).all()
@@ -31,7 +34,8 @@ def decides(scores: NDArray[np.float64], rule: Early) -> bool:
 
 
 class Decider:
-    """Answers sweeps that are still going on. steps: number of times in a window at which it can answer.
+    """Answers sweeps that are still going on. steps: number of times in a window at which it can
+    answer.
 
     Raises BundleError if the bundle has no early heads.
     """
@@ -48,16 +52,25 @@ class Decider:
         classifier.prepare_early()
 
     def __call__(self, sweep: Sweep) -> Verdict | None:
-        """The verdict on a sweep with share < 1, or None if the rest of it is needed; then nothing was counted.
+        """The verdict on a sweep with share < 1, or None if the rest of it is needed; then nothing
+        was counted.
 
-        The frames are checked like a whole window, and no answer is given to what would be refused. For the graph the
-        window is completed by repeating the last frame; the heads up to this step do not depend on these frames.
+        The frames are checked like a whole window, and no answer is given to what would be refused.
+        For the graph the window is completed by repeating the last frame; the heads up to this step
+        do not depend on these frames.
         """
         taxels = sweep.frames.taxels
-        if inspect(taxels, self._classifier.tare, self._manifest.thresholds).status is not Status.OK:
+        if (
+            inspect(taxels, self._classifier.tare, self._manifest.thresholds).status
+            is not Status.OK
+        ):
             return None
         scores = self.scores(sweep)
-        return self._classifier.conclude_if_ok(sweep, scores[-1]) if decides(scores, self._rule) else None
+        return (
+            self._classifier.conclude_if_ok(sweep, scores[-1])
+            if decides(scores, self._rule)
+            else None
+        )
 
     def scores(self, sweep: Sweep) -> NDArray[np.float64]:
         """Probabilities float64 [d, K] at the steps up to that of a sweep with share < 1."""

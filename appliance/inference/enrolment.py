@@ -1,7 +1,9 @@
-"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps. Out: enrolment.npz.
+"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps.
+Out: enrolment.npz.
 
-In the embedding the sweeps of every material have covariance 1 around their mean. A new material therefore needs only a
-mean, that of its sweeps; everything that was trained stays as it is, and so do the files of the bundle (bundle/enrolled.py).
+In the embedding the sweeps of every material have covariance 1 around their mean. A new material
+therefore needs only a mean, that of its sweeps; everything that was trained stays as it is, and so
+do the files of the bundle (bundle/enrolled.py).
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ from appliance.inference.novelty import Means
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """A bundle with one more label, and its enrolment.npz. warnings: for the person who enrols. disagreement: why the
-    sweeps may not be of one material, "" if they agree."""
+    """A bundle with one more label, and its enrolment.npz. warnings: for the person who enrols.
+    disagreement: why the sweeps may not be of one material, "" if they agree."""
 
     bundle: Bundle
     file: bytes
@@ -42,9 +44,13 @@ def admit(old: Bundle, label: str) -> None:
     """Raises BundleError if `label` cannot be enrolled into `old`."""
     labels = old.manifest.labels
     if label in labels:
-        raise BundleError(f"label {label!r} is taken: the bundle has {', '.join(labels)}; choose another name")
+        raise BundleError(
+            f"label {label!r} is taken: the bundle has {', '.join(labels)}; choose another name"
+        )
     if not bundle.LABEL.fullmatch(label):
-        raise BundleError(f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'")
+        raise BundleError(
+            f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+        )
     if old.classes is None:
         raise BundleError(
             f"bundle {old.manifest.name} {old.manifest.version} has no embedding and no class means, so nothing can be "
@@ -53,22 +59,30 @@ def admit(old: Bundle, label: str) -> None:
 
 
 def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
-    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n, T, R, C, A]. Deterministic.
+    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n,
+    T, R, C, A]. Deterministic.
 
-    The early heads do not know the label, so that the new bundle gives no early answers; the figures of `old` no longer
-    hold and are removed. Other problems are told in what is returned and do not prevent the enrolment.
-    Raises BundleError as `admit`, FormatError if `sweeps` do not have the bundle's format or give no embedding.
+    The early heads do not know the label, so that the new bundle gives no early answers; the
+    figures of `old` no longer hold and are removed. Other problems are told in what is returned and
+    do not prevent the enrolment. Raises BundleError as `admit`, FormatError if `sweeps` do not have
+    the bundle's format or give no embedding.
     """
     admit(old, label)
     m, f = old.manifest, old.format
     assert old.classes
     assert m.known
     if sweeps.shape[1:] != (f.window, *f.shape) or not len(sweeps) or sweeps.dtype != f.numpy_type:
-        raise FormatError(f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}")
+        raise FormatError(
+            f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
+        )
     run = Classifier(old, SystemClock())
-    z, golden = (np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden))
+    z, golden = (
+        np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden)
+    )
     if not np.isfinite(z).all():
-        raise FormatError("the model gives no number for some of the sweeps; look at the skin and take others")
+        raise FormatError(
+            "the model gives no number for some of the sweeps; look at the skin and take others"
+        )
     classes = extended(old.classes, z)
     means = Means(classes, m.known, (*m.labels, label))
     median = _median(softmax(means.logits(means.distances(z))))
@@ -87,9 +101,10 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
 def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
     """`classes` with one more label, from the embeddings `z` float64 [n, r] of its sweeps.
 
-    Its mean is that of the sweeps. Its spread is computed from the sweeps and one assumed sweep at squared distance r, the
-    average of trained labels, and is at least 1, that of trained labels: the embedding of materials that were not in
-    training scatters more. For the rest see `enrolled.extended`.
+    Its mean is that of the sweeps. Its spread is computed from the sweeps and one assumed sweep at
+    squared distance r, the average of trained labels, and is at least 1, that of trained labels:
+    the embedding of materials that were not in training scatters more. For the rest see
+    `enrolled.extended`.
     """
     n, r = z.shape
     mean = z.mean(axis=0)
@@ -100,23 +115,34 @@ def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
 def _added(
     old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
 ) -> tuple[Bundle, bytes]:
-    """`old` with the last label of `classes`, and the enrolment.npz that makes it of the bundle that was signed."""
-    before, mean, sweeps, spread = old.added, classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
+    """`old` with the last label of `classes`, and the enrolment.npz that makes it of the bundle
+    that was signed."""
+    before, mean, sweeps, spread = (
+        old.added,
+        classes.means[-1:],
+        classes.sweeps[-1:],
+        classes.spread[-1:],
+    )
     added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits)
     if before:
         added = AddedLabels(
-            old.base, (*before.labels, label), np.vstack([before.means, mean]), np.append(before.sweeps, sweeps),
-            np.append(before.spread, spread), np.concatenate([before.golden, golden[None]]), logits,
-        )  # fmt: skip
+            old.base,
+            (*before.labels, label),
+            np.vstack([before.means, mean]),
+            np.append(before.sweeps, sweeps),
+            np.append(before.spread, spread),
+            np.concatenate([before.golden, golden[None]]),
+            logits,
+        )
     file = enrolled.file(added)
     new = enrolled.with_label(old, label, mean[0], int(sweeps[0]), float(spread[0]), golden)
     return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
 
 
 def _median(scores: NDArray[np.float64]) -> int:
-    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K]: the one with the median
-    probability of the last label among those that get it, or among all. As at export: a fault changes its label, a
-    rounding error does not.
+    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K]: the one
+    with the median probability of the last label among those that get it, or among all. As at
+    export: a fault changes its label, a rounding error does not.
     """
     correct = np.flatnonzero(scores.argmax(axis=1) == scores.shape[1] - 1)
     pick = correct if len(correct) else np.arange(len(scores))
@@ -124,18 +150,27 @@ def _median(scores: NDArray[np.float64]) -> int:
 
 
 def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
-    """The files of the enrolled bundle: those of the one that it was made from as they are, and its enrolment, with its
-    signature where it has one."""
-    kept = {name: data for name, data in old.items() if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)}
-    return kept | {bundle.ENROLMENT: new.file} | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
+    """The files of the enrolled bundle: those of the one that it was made from as they are, and its
+    enrolment, with its signature where it has one."""
+    kept = {
+        name: data
+        for name, data in old.items()
+        if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+    }
+    return (
+        kept
+        | {bundle.ENROLMENT: new.file}
+        | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
+    )
 
 
 def _disagreement(means: Means, label: str, z: NDArray[np.float64]) -> str:
-    """Why the sweeps with the embeddings `z` [n, r] may not be of one material, "" where they agree.
+    """Why the sweeps with the embeddings `z` [n, r] may not be of one material, "" where they
+    agree.
 
-    The threshold is the limit beyond which a sweep is of an unknown material. Measured with five sweeps each of
-    simulated materials that were left out of training: one set in eleven disagrees, and four in five of the sets that
-    contain a sweep of another material.
+    The threshold is the limit beyond which a sweep is of an unknown material. Measured with five
+    sweeps each of simulated materials that were left out of training: one set in eleven disagrees,
+    and four in five of the sets that contain a sweep of another material.
     """
     n, r = z.shape
     away = ((z - z.mean(axis=0)) ** 2).sum(axis=1)
@@ -149,9 +184,12 @@ def _disagreement(means: Means, label: str, z: NDArray[np.float64]) -> str:
 
 
 def _closeness(means: Means, label: str, z: NDArray[np.float64]) -> str:
-    """Which label of `means` the sweeps with the embeddings `z` [n, r] will be taken for, "" for none."""
+    """Which label of `means` the sweeps with the embeddings `z` [n, r] will be taken for, "" for
+    none."""
     n, r = z.shape
-    to_old = means.distances(z.mean(axis=0)) - r / n  # minus the expected squared error of a mean of n sweeps
+    to_old = (
+        means.distances(z.mean(axis=0)) - r / n
+    )  # minus the expected squared error of a mean of n sweeps
     k = int(to_old.argmin())
     if to_old[k] >= min(means.limit, means.closest_pair()):
         return ""
@@ -194,23 +232,30 @@ class SweepCollector(Observer):
 
 
 def check_target(target: Path, swap: bool) -> None:
-    """Raises BundleError if no bundle may be written to `target`; called before the robot sweeps, too.
+    """Raises BundleError if no bundle may be written to `target`; called before the robot sweeps,
+    too.
 
     swap: a bundle that exists there may be replaced.
     """
     if target.exists() and not swap:
-        raise BundleError(f"{target} is there already; name another folder with --out, or give --replace")
+        raise BundleError(
+            f"{target} is there already; name another folder with --out, or give --replace"
+        )
     if target.exists() and not (target / bundle.MANIFEST).is_file():
-        raise BundleError(f"{target} is no bundle and will not be replaced; name another folder with --out")
+        raise BundleError(
+            f"{target} is no bundle and will not be replaced; name another folder with --out"
+        )
     if not os.access(target.resolve().parent, os.W_OK):
-        raise BundleError(f"{target.resolve().parent} is no folder that you may write to; name another with --out")
+        raise BundleError(
+            f"{target.resolve().parent} is no folder that you may write to; name another with --out"
+        )
 
 
 def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
     """Write the bundle of `files` to the folder `target`, after its self-test has passed.
 
-    At every moment, also after a loss of power, `target` is the old or the complete new bundle (`storage.folder`).
-    Raises BundleError.
+    At every moment, also after a loss of power, `target` is the old or the complete new bundle
+    (`storage.folder`). Raises BundleError.
     """
     check_target(target, swap)
     target = target.resolve()
@@ -221,4 +266,6 @@ def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
             Classifier(bundle.load(new), SystemClock()).self_test()
     except OSError as e:
         why = e.strerror or e
-        raise BundleError(f"the bundle cannot be written to {target}: {why}; name another folder with --out") from e
+        raise BundleError(
+            f"the bundle cannot be written to {target}: {why}; name another folder with --out"
+        ) from e

@@ -1,9 +1,9 @@
-"""Distances of a sweep to the known materials. In: a bundle's class means, an embedding. Out: distances, logits, and
-whether the material is unknown.
+"""Distances of a sweep to the known materials. In: a bundle's class means, an embedding. Out:
+distances, logits, and whether the material is unknown.
 
-The embedding is scaled so that the sweeps of all materials together have covariance 1 around their means. A squared
-distance in it is therefore a squared Mahalanobis distance, and the nearest mean names the material. An enrolled material
-is one more mean; nothing is trained for it.
+The embedding is scaled so that the sweeps of all materials together have covariance 1 around their
+means. A squared distance in it is therefore a squared Mahalanobis distance, and the nearest mean
+names the material. An enrolled material is one more mean; nothing is trained for it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     """Squared distances [..., K] of differences `away` [..., K, r] from the class means.
 
-    In the last b directions each material scatters in its own way, and its difference is multiplied by its matrix of
-    `shapes` [K, b, b] first; in the others all have variance 1.
+    In the last b directions each material scatters in its own way, and its difference is multiplied
+    by its matrix of `shapes` [K, b, b] first; in the others all have variance 1.
     """
     common = away.shape[-1] - shapes.shape[-1]
     own = np.einsum("...kb,kbc->...kc", away[..., common:], shapes)
@@ -35,23 +35,29 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
 class Means:
     """Computes distances and logits from a bundle's class means. labels: those of the means, [K].
 
-    moved: the rule for sweeps whose contact has moved; the distances are then those between such sweeps
-    (`classes.moved`), in which what a moved skin changes counts for little.
+    moved: the rule for sweeps whose contact has moved; the distances are then those between such
+    sweeps (`classes.moved`), in which what a moved skin changes counts for little.
     """
 
-    def __init__(self, classes: Classes, known: Known, labels: Sequence[str], moved: Moved | None = None) -> None:
+    def __init__(
+        self, classes: Classes, known: Known, labels: Sequence[str], moved: Moved | None = None
+    ) -> None:
         self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
         self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
-        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; computed from distances, logits
-        # do not suffer the cancellation of large products
+        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; computed
+        # from distances, logits do not suffer the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
         shapes = classes.shapes
         if moved and classes.moved:
             self.limit, shapes = moved.limit, classes.moved.shapes
-            self._means, self._turn = classes.moved.means.astype(np.float64), classes.moved.turn.astype(np.float64)
+            self._means, self._turn = (
+                classes.moved.means.astype(np.float64),
+                classes.moved.turn.astype(np.float64),
+            )
         self._shapes = shapes.astype(np.float64)
         n = classes.sweeps
-        # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1 / n around it
+        # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1
+        # / n around it
         self._share = np.where(n, n / (n + 1), 1.0) / classes.spread
 
     def _away(self, embedding: NDArray[Any]) -> Array:
@@ -62,22 +68,27 @@ class Means:
     def distances(self, embedding: NDArray[Any]) -> Array:
         """Squared distances float64 [..., K] from embeddings [..., r] to the class means; no unit.
 
-        The scatter is that of all materials together, so that the nearest mean is the one that LDA names.
+        The scatter is that of all materials together, so that the nearest mean is the one that LDA
+        names.
         """
         result: Array = (self._away(embedding) ** 2).sum(axis=-1)
         return result
 
     def logits(self, distances: Array) -> NDArray[np.float32]:
-        """Logits [..., K] from `distances` [..., K], up to a term that is the same for all labels."""
-        result: NDArray[np.float32] = ((self._extra - distances / 2) / self._temperature).astype(np.float32)
+        """Logits [..., K] from `distances` [..., K], up to a term that is the same for all
+        labels."""
+        result: NDArray[np.float32] = ((self._extra - distances / 2) / self._temperature).astype(
+            np.float32
+        )
         return result
 
     def novelty(self, embedding: NDArray[Any]) -> str:
-        """The distance to the nearest material if it is beyond the limit, as text; "" for a known material.
+        """The distance to the nearest material if it is beyond the limit, as text; "" for a known
+        material.
 
-        embedding: [r]. The scatter is each material's own. The distance to an enrolled label is multiplied by
-        n / (n + 1) / spread, so that about as many of its sweeps are accepted as of a trained label, for which the
-        embedding was optimised.
+        embedding: [r]. The scatter is each material's own. The distance to an enrolled label is
+        multiplied by n / (n + 1) / spread, so that about as many of its sweeps are accepted as of a
+        trained label, for which the embedding was optimised.
         """
         scaled = shaped_distances(self._away(embedding), self._shapes) * self._share
         k = int(scaled.argmin())

@@ -1,5 +1,6 @@
-"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted, and input arrays. Out: a
-session and its outputs. Errors of onnxruntime become BundleErrors. What is not requested is not computed.
+"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted, and
+input arrays. Out: a session and its outputs. Errors of onnxruntime become BundleErrors. What is not
+requested is not computed.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from appliance.inference.code_pages import give_back
 
 
 def session(model: bytes) -> ort.InferenceSession:
-    """A session with one thread, no spinning, logging of errors only and no telemetry, since the sensor shares its
-    core.
+    """A session with one thread, no spinning, logging of errors only and no telemetry, since the
+    sensor shares its core.
 
     Raises BundleError if onnxruntime refuses the model.
     """
@@ -31,12 +32,14 @@ def session(model: bytes) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as e:  # onnxruntime raises its own classes, which share no base but Exception
-        raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}") from e
+        raise BundleError(
+            f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}"
+        ) from e
 
 
 class ModelRunner:
-    """Runs one model, with a session for each group of outputs that are requested together; it has only the nodes that
-    these outputs need.
+    """Runs one model, with a session for each group of outputs that are requested together; it has
+    only the nodes that these outputs need.
 
     outputs: the group to begin with. Raises BundleError if onnxruntime refuses the model.
     """
@@ -47,7 +50,8 @@ class ModelRunner:
         self._input: str = self.prepare(*outputs).get_inputs()[0].name
 
     def prepare(self, *outputs: str) -> ort.InferenceSession:
-        """The session for `outputs`: one that gives them already, or a new one. Raises BundleError as the class."""
+        """The session for `outputs`: one that gives them already, or a new one. Raises BundleError
+        as the class."""
         able = (opened for group, opened in self._sessions.items() if set(group) >= set(outputs))
         opened = next(able, None)
         if opened is None:
@@ -57,16 +61,20 @@ class ModelRunner:
         return opened
 
     def __call__(self, outputs: tuple[str, ...], given: NDArray[Any]) -> list[NDArray[Any]]:
-        """These outputs for one input `given`, without the leading axis of length 1. Raises BundleError as `run`."""
+        """These outputs for one input `given`, without the leading axis of length 1. Raises
+        BundleError as `run`."""
         opened = self._sessions.get(outputs) or self.prepare(*outputs)
         return [out[0] for out in run(opened, outputs, {self._input: given[None]})]
 
 
 def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, Any]) -> list[Any]:
-    """The graph's `outputs` for the input arrays `given` by name. Raises BundleError if they cannot be computed."""
+    """The graph's `outputs` for the input arrays `given` by name. Raises BundleError if they cannot
+    be computed."""
     try:
         values: list[Any] = opened.run(outputs, given)
     except Exception as e:  # as above
         why = str(e).strip()[:200]
-        raise BundleError(f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again") from e
+        raise BundleError(
+            f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again"
+        ) from e
     return values

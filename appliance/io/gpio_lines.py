@@ -1,7 +1,8 @@
-"""GPIO lines by name. In: line names and the module gpiod. Out: line requests; READY, BUSY, FAULT, DECIDED, class bits
-and RESULT VALID as levels.
+"""GPIO lines by name. In: line names and the module gpiod. Out: line requests; READY, BUSY, FAULT,
+DECIDED, class bits and RESULT VALID as levels.
 
-Everything goes through libgpiod v2; the module itself (`import gpiod`, or the simulator's double) is passed in.
+Everything goes through libgpiod v2; the module itself (`import gpiod`, or the simulator's double)
+is passed in.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 MAX_CHIPS = 256
 """Largest number of GPIO devices in the kernel (GPIO_DEV_MAX)."""
 QUEUE = 1024
-"""Length of the kernel's event queue of one request, the largest that it grants; when full it drops the oldest
-event."""
+"""Length of the kernel's event queue of one request, the largest that it grants; when full it drops
+the oldest event."""
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
@@ -47,11 +48,13 @@ def check_binding(gpio: Any) -> None:
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
     """Name -> (path of its chip, offset on it), searched on all chips of this machine.
 
-    Raises LineError for a name that is given twice, missing or ambiguous, for chips that may not be opened, and if
-    there is no chip.
+    Raises LineError for a name that is given twice, missing or ambiguous, for chips that may not be
+    opened, and if there is no chip.
     """
     if len(set(names)) < len(names):
-        raise LineError(f"a gpio line is given two roles in {', '.join(names)}; give each role its own line")
+        raise LineError(
+            f"a gpio line is given two roles in {', '.join(names)}; give each role its own line"
+        )
     places, denied = _catalogue(gpio) if names else ({}, [])
     found = {}
     for name in names:
@@ -60,18 +63,26 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
                 found[name] = place
             case []:
                 if denied:
-                    what, advice = f"may not open {', '.join(denied)} (errno 13)", _ADVICE[errno.EACCES]
+                    what, advice = (
+                        f"may not open {', '.join(denied)} (errno 13)",
+                        _ADVICE[errno.EACCES],
+                    )
                     raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
                 near = closest(name, places, 3) or sorted(places)[:3]
-                raise LineError(f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists them all")
+                raise LineError(
+                    f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists them all"
+                )
             case several:
                 where = " and ".join(f"{path} line {offset}" for path, offset in several)
-                raise LineError(f"gpio line {name!r} is ambiguous: {where}; choose a line whose name is unique")
+                raise LineError(
+                    f"gpio line {name!r} is ambiguous: {where}; choose a line whose name is unique"
+                )
     return found
 
 
 def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
-    """All named lines with their (chip path, offset), and the paths of chips that may not be opened."""
+    """All named lines with their (chip path, offset), and the paths of chips that may not be
+    opened."""
     places: dict[str, list[tuple[str, int]]] = {}
     denied = []
     chips = set()
@@ -79,7 +90,9 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         try:
             with gpio.Chip(path) as chip:
                 info = chip.get_info()
-                if info.name in chips:  # a second device name of the same chip, as Raspberry Pi OS has one
+                if (
+                    info.name in chips
+                ):  # a second device name of the same chip, as Raspberry Pi OS has one
                     continue
                 chips.add(info.name)
                 for offset in range(info.num_lines):
@@ -88,7 +101,9 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         except PermissionError:
             denied.append(path)
         except OSError as e:
-            raise LineError(f"cannot list the gpio lines of {path}: {e}; see the kernel log (dmesg)") from e
+            raise LineError(
+                f"cannot list the gpio lines of {path}: {e}; see the kernel log (dmesg)"
+            ) from e
     if not chips and not denied:
         raise LineError(
             "this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one on USB; "
@@ -100,7 +115,9 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
 def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
     """A LineError that explains an errno and names the lines it concerns."""
     advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
-    return LineError(f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}")
+    return LineError(
+        f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}"
+    )
 
 
 @contextmanager
@@ -115,14 +132,17 @@ def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
 def request_lines(
     gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, separate: bool = False
 ) -> list[tuple[LineRequest, dict[int, str]]]:
-    """One request per chip, or with `separate` one per line, each with its {offset: name}; `stack` releases them."""
+    """One request per chip, or with `separate` one per line, each with its {offset: name}; `stack`
+    releases them."""
     groups: dict[tuple[str, str], dict[int, str]] = {}
     for name, (path, offset) in find_lines(gpio, names).items():
         groups.setdefault((path, name if separate else ""), {})[offset] = name
     requests = []
     for (path, _), lines in groups.items():
         with naming("request", lines.values()):
-            request = gpio.request_lines(path, {tuple(lines): settings}, consumer="palpate", event_buffer_size=QUEUE)
+            request = gpio.request_lines(
+                path, {tuple(lines): settings}, consumer="palpate", event_buffer_size=QUEUE
+            )
         stack.callback(request.release)
         requests.append((request, lines))
     return requests
@@ -143,7 +163,9 @@ class Lines:
         names = [name for name in (*self._status_lines, self._valid, *self._bits) if name]
         self._levels = dict.fromkeys(names, False)
         self._status = False, False, False, False
-        settings = gpio.LineSettings(direction=gpio.line.Direction.OUTPUT, output_value=self._value.INACTIVE)
+        settings = gpio.LineSettings(
+            direction=gpio.line.Direction.OUTPUT, output_value=self._value.INACTIVE
+        )
         with ExitStack() as stack:
             self._requests = request_lines(gpio, names, settings, stack)
             self._open = stack.pop_all()
@@ -154,7 +176,8 @@ class Lines:
         return 1 << len(self._bits)
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when BUSY rises."""
+        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when
+        BUSY rises."""
         if (ready, busy, fault, decided) == self._status:
             return
         if busy and not self._status[1]:
@@ -163,9 +186,11 @@ class Lines:
         self._write(dict(zip(self._status_lines, self._status, strict=True)))
 
     def result(self, code: int | None) -> None:
-        """Output a class code: RESULT VALID falls, the class bits change, and `settle_us` later RESULT VALID rises.
+        """Output a class code: RESULT VALID falls, the class bits change, and `settle_us` later
+        RESULT VALID rises.
 
-        With None RESULT VALID only falls. A code outside 0..capacity-1 lets it fall, too, and raises LineError.
+        With None RESULT VALID only falls. A code outside 0..capacity-1 lets it fall, too, and
+        raises LineError.
         """
         self._write({self._valid: False})
         if code is None:
@@ -179,7 +204,8 @@ class Lines:
         self._write({self._valid: True})
 
     def close(self) -> None:
-        """Set all lines low, then release them; the level of a line that nobody holds is up to its chip."""
+        """Set all lines low, then release them; the level of a line that nobody holds is up to its
+        chip."""
         try:
             self._write(dict.fromkeys(self._levels, False))
         finally:
@@ -187,13 +213,18 @@ class Lines:
             self._open.close()
 
     def _write(self, wanted: dict[str, bool]) -> None:
-        new = {name: level for name, level in wanted.items() if self._levels.get(name, level) != level}
+        new = {
+            name: level for name, level in wanted.items() if self._levels.get(name, level) != level
+        }
         for request, names in self._requests:
             changed = {offset: name for offset, name in names.items() if name in new}
             if changed:
                 with naming("write", changed.values()):
                     request.set_values(
-                        {o: self._value.ACTIVE if new[n] else self._value.INACTIVE for o, n in changed.items()}
+                        {
+                            o: self._value.ACTIVE if new[n] else self._value.INACTIVE
+                            for o, n in changed.items()
+                        }
                     )
                 self._levels.update({name: new[name] for name in changed.values()})
 

@@ -1,7 +1,9 @@
-"""Triggers for the bench and for robots without a line to spare: by command, by the space bar, by the clock.
+"""Triggers for the bench and for robots without a line to spare: by command, by the space bar, by
+the clock.
 
-In: commands of the serial line, a terminal, a period. Out: START and STOP with the time at which the command or the key
-was read, or at which the clock was due. None of them is as exact as a line, whose edges the kernel stamps.
+In: commands of the serial line, a terminal, a period. Out: START and STOP with the time at which
+the command or the key was read, or at which the clock was due. None of them is as exact as a line,
+whose edges the kernel stamps.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ Say = Callable[[str], object]
 
 
 class LinelessTrigger:
-    """What these triggers have in common: edges wait for the next turn of the loop, and none is ever lost.
+    """What these triggers have in common: edges wait for the next turn of the loop, and none is
+    ever lost.
 
     about: for the sidecar of a recorded sweep, as GpioTrigger has it.
     """
@@ -67,11 +70,13 @@ class CommandTrigger(LinelessTrigger):
 
 
 class KeyTrigger(LinelessTrigger):
-    """The space bar of a terminal starts a sweep and stops it. Restores the terminal when it is closed.
+    """The space bar of a terminal starts a sweep and stops it. Restores the terminal when it is
+    closed.
 
-    While it is open, keys are not shown, and Ctrl-\\ and Ctrl-Z do nothing, since either would leave the terminal so.
-    A sweep that was answered without a stop, for example `long`, is over: the next space starts another one.
-    terminal: its file descriptor. Raises ConfigError if it is no terminal, and in `edges` PortError once it is closed.
+    While it is open, keys are not shown, and Ctrl-\\ and Ctrl-Z do nothing, since either would
+    leave the terminal so. A sweep that was answered without a stop, for example `long`, is over:
+    the next space starts another one. terminal: its file descriptor. Raises ConfigError if it is no
+    terminal, and in `edges` PortError once it is closed.
     """
 
     def __init__(self, terminal: int, clock: Clock, say: Say) -> None:
@@ -128,13 +133,15 @@ class KeyTrigger(LinelessTrigger):
         except OSError:
             keys = b""
         if not keys:
-            raise PortError("the terminal whose space bar is the trigger was closed; start again in another one")
+            raise PortError(
+                "the terminal whose space bar is the trigger was closed; start again in another one"
+            )
         return keys
 
 
 class TimedTrigger(LinelessTrigger):
-    """Starts a sweep of `sweep_s` every `every_s` by the clock, and announces it. Raises ConfigError if one does not
-    fit into the other.
+    """Starts a sweep of `sweep_s` every `every_s` by the clock, and announces it. Raises
+    ConfigError if one does not fit into the other.
 
     held: no sweep is started, and the pause before one begins again when this ends.
     """
@@ -146,7 +153,10 @@ class TimedTrigger(LinelessTrigger):
                 f"a sweep of {config.sweep_s:g} s every {config.every_s:g} s leaves no pause; "
                 "let --every (trigger.every_s) be longer than --sweep (trigger.sweep_s)"
             )
-        self._every_ns, self._sweep_ns = round(config.every_s * SECOND), round(config.sweep_s * SECOND)
+        self._every_ns, self._sweep_ns = (
+            round(config.every_s * SECOND),
+            round(config.sweep_s * SECOND),
+        )
         self._say = say
         self._due_ns = clock.now_ns() + self._every_ns - self._sweep_ns
         self._sweeping, self._announced = False, COUNTDOWN + 1
@@ -166,7 +176,9 @@ class TimedTrigger(LinelessTrigger):
             self._edges.append(Edge(kind, self._due_ns))
             self._due_ns += self._every_ns - self._sweep_ns if self._sweeping else self._sweep_ns
             self._sweeping, self._announced = not self._sweeping, COUNTDOWN + 1
-            self._say(f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind))
+            self._say(
+                f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind)
+            )
         left = -(-(self._due_ns - now_ns) // SECOND)
         if not (self._sweeping or self.held) and left < self._announced:
             self._announced = left
@@ -201,5 +213,9 @@ def standard_input() -> int:
     """The file descriptor of standard input, -1 where there is none."""
     try:
         return sys.stdin.fileno()
-    except (AttributeError, OSError, ValueError):  # closed, or replaced by something without a descriptor
+    except (
+        AttributeError,
+        OSError,
+        ValueError,
+    ):  # closed, or replaced by something without a descriptor
         return -1

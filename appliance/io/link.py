@@ -1,6 +1,8 @@
-"""What a way to a readout board offers, however it is attached; requests as single bytes (PROTOCOL.md, part 1).
+"""What a way to a readout board offers, however it is attached; requests as single bytes
+(PROTOCOL.md, part 1).
 
-In: bytes written and read. Out: replies. The ways: `usb_link` (bulk), `serial_link` (any serial port).
+In: bytes written and read. Out: replies. The ways: `usb_link` (bulk), `serial_link` (any serial
+port).
 """
 
 from __future__ import annotations
@@ -36,8 +38,8 @@ class SkinLink(Protocol):
 
 
 def reply_to(request: packets.Request, read: Callable[[int, int], bytes], clock: Clock) -> bytes:
-    """The reply to a request that was sent as a byte. read: as `SkinLink.read`. Frames before it belong to a stream that an
-    earlier program did not stop, and are left out.
+    """The reply to a request that was sent as a byte. read: as `SkinLink.read`. Frames before it
+    belong to a stream that an earlier program did not stop, and are left out.
 
     Raises SensorMismatch if none comes within REPLY_MS.
     """

@@ -1,7 +1,8 @@
-"""Packets of the readout board (firmware_config/PROTOCOL.md, part 1) in pure functions. In: bytes. Out: packets, and
-how many bytes and frames were lost.
+"""Packets of the readout board (firmware_config/PROTOCOL.md, part 1) in pure functions. In: bytes.
+Out: packets, and how many bytes and frames were lost.
 
-No received bytes make `unpack` or `follow` raise, and only frames of packets with a correct CRC are returned.
+No received bytes make `unpack` or `follow` raise, and only frames of packets with a correct CRC are
+returned.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
 MAX_FRAMES = 255
 RECENT = 1 << 16
-"""A packet at most this many frames behind the newest is a repetition; further behind, the board has restarted its
-count."""
+"""A packet at most this many frames behind the newest is a repetition; further behind, the board
+has restarted its count."""
 
 _DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DATA_TYPES)
 _IDENTITY = struct.Struct("<BBBB16s16s")
@@ -48,7 +49,8 @@ class Flag(IntFlag):
 
 
 class Request(IntEnum):
-    """Requests: bRequest of a vendor device, or one byte on the bulk OUT endpoint of a CDC-ACM board."""
+    """Requests: bRequest of a vendor device, or one byte on the bulk OUT endpoint of a CDC-ACM
+    board."""
 
     IDENTITY = 1
     FORMAT = 2
@@ -58,8 +60,8 @@ class Request(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Consecutive frames. seq, t_us: sequence number and time of the first, 32 bits as sent. flags: bits of Flag.
-    taxels: raw counts [n, R, C] or [n, R, C, A]."""
+    """Consecutive frames. seq, t_us: sequence number and time of the first, 32 bits as sent. flags:
+    bits of Flag. taxels: raw counts [n, R, C] or [n, R, C, A]."""
 
     seq: int
     t_us: int
@@ -77,7 +79,8 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Unpacked:
-    """What bytes contained: packets and replies in order, the number of bytes outside them, and the unfinished rest."""
+    """What bytes contained: packets and replies in order, the number of bytes outside them, and the
+    unfinished rest."""
 
     packets: list[Packet]
     replies: list[Reply]
@@ -87,7 +90,8 @@ class Unpacked:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A readout board's answer to IDENTITY: protocol version, firmware version, board name, serial number."""
+    """A readout board's answer to IDENTITY: protocol version, firmware version, board name, serial
+    number."""
 
     protocol: int
     firmware: tuple[int, int, int]
@@ -97,7 +101,8 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a packet, axes."""
+    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a
+    packet, axes."""
 
     rows: int
     cols: int
@@ -115,8 +120,8 @@ class SkinFormat:
 
 @dataclass(frozen=True, slots=True)
 class StreamPosition:
-    """Position in the stream: number of the enumeration, and the unwrapped number of the next frame; None before the
-    first."""
+    """Position in the stream: number of the enumeration, and the unwrapped number of the next
+    frame; None before the first."""
 
     epoch: int
     next: int | None = None
@@ -127,8 +132,8 @@ def _seal(head: bytes, payload: bytes) -> bytes:
 
 
 def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
-    """A frame packet. taxels: raw counts [n, R, C] or [n, R, C, A] of one of DATA_TYPES. seq and t_us are sent modulo
-    2**32.
+    """A frame packet. taxels: raw counts [n, R, C] or [n, R, C, A] of one of DATA_TYPES. seq and
+    t_us are sent modulo 2**32.
 
     Raises FormatError if the frames do not fit one packet.
     """
@@ -140,15 +145,28 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
             f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype} do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
         )
     head = HEADER.pack(
-        MAGIC, VERSION, PacketKind.FRAMES, len(payload), flags, n, rows, cols, code, _axes_byte(*axes),
-        seq % (1 << 32), t_us % (1 << 32),
-    )  # fmt: skip
+        MAGIC,
+        VERSION,
+        PacketKind.FRAMES,
+        len(payload),
+        flags,
+        n,
+        rows,
+        cols,
+        code,
+        _axes_byte(*axes),
+        seq % (1 << 32),
+        t_us % (1 << 32),
+    )
     return _seal(head, payload)
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
     """A reply packet: a CDC-ACM board's answer to a request byte."""
-    return _seal(HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0, 0), payload)
+    return _seal(
+        HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0, 0),
+        payload,
+    )
 
 
 def unpack(data: bytes) -> Unpacked:
@@ -177,12 +195,20 @@ def unpack(data: bytes) -> Unpacked:
 
 
 def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
-    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if there is no packet."""
+    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if there is no
+    packet."""
     if len(data) - at < HEADER.size:
         return None, 0
-    _, version, kind, length, flags, count, rows, cols, code, axes, seq, t_us = HEADER.unpack_from(data, at)
+    _, version, kind, length, flags, count, rows, cols, code, axes, seq, t_us = HEADER.unpack_from(
+        data, at
+    )
     axes = axes or 1
-    frames = kind == PacketKind.FRAMES and version == VERSION and code < len(_DTYPES) and axes <= MOST_AXES
+    frames = (
+        kind == PacketKind.FRAMES
+        and version == VERSION
+        and code < len(_DTYPES)
+        and axes <= MOST_AXES
+    )
     if frames:
         frames = 0 < length == count * rows * cols * axes * _DTYPES[code].itemsize
     if length > MAX_PAYLOAD or not (frames or kind == PacketKind.REPLY):
@@ -202,16 +228,22 @@ def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
 def follow(
     packets: list[Packet], position: StreamPosition
 ) -> tuple[list[tuple[int, Packet]], StreamPosition, int, int]:
-    """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new position, lost and stale frames).
+    """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new position, lost
+    and stale frames).
 
-    A packet behind the position is stale (repeated or late) and is left out. One that is more than RECENT frames behind
-    begins a new epoch, since the board has restarted its count. Frames are lost where the count jumps ahead.
+    A packet behind the position is stale (repeated or late) and is left out. One that is more than
+    RECENT frames behind begins a new epoch, since the board has restarted its count. Frames are
+    lost where the count jumps ahead.
     """
     fresh: list[tuple[int, Packet]] = []
     lost = stale = 0
     for p in packets:
         n = len(p.taxels)
-        ahead = 0 if position.next is None else (p.seq - position.next + (1 << 31)) % (1 << 32) - (1 << 31)
+        ahead = (
+            0
+            if position.next is None
+            else (p.seq - position.next + (1 << 31)) % (1 << 32) - (1 << 31)
+        )
         if -RECENT <= ahead < 0:
             stale += n
             continue
@@ -229,11 +261,14 @@ def follow(
 
 def pack_identity(who: Identity) -> bytes:
     """Payload of the IDENTITY reply."""
-    return _IDENTITY.pack(who.protocol, *who.firmware, who.board.encode()[:16], who.serial.encode()[:16])
+    return _IDENTITY.pack(
+        who.protocol, *who.firmware, who.board.encode()[:16], who.serial.encode()[:16]
+    )
 
 
 def unpack_identity(payload: bytes) -> Identity:
-    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer board may send a longer one."""
+    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer board may send a
+    longer one."""
     if len(payload) < _IDENTITY.size:
         raise FormatError(
             f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check the firmware"
@@ -246,22 +281,35 @@ def pack_format(skin: SkinFormat) -> bytes:
     """Payload of the FORMAT reply."""
     code, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
     return _FORMAT.pack(
-        skin.rows, skin.cols, code, _axes_byte(skin.axes), rate_mhz, skin.fifo_frames, skin.packet_frames
+        skin.rows,
+        skin.cols,
+        code,
+        _axes_byte(skin.axes),
+        rate_mhz,
+        skin.fifo_frames,
+        skin.packet_frames,
     )
 
 
 def unpack_format(payload: bytes) -> SkinFormat:
-    """Read a FORMAT reply. Raises FormatError if it is too short, or its data type or number of axes is unknown."""
+    """Read a FORMAT reply. Raises FormatError if it is too short, or its data type or number of
+    axes is unknown."""
     if len(payload) < _FORMAT.size:
-        raise FormatError(f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware")
+        raise FormatError(
+            f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware"
+        )
     rows, cols, code, axes, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
     if code >= len(DATA_TYPES):
-        raise FormatError(f"data type {code} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance")
+        raise FormatError(
+            f"data type {code} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance"
+        )
     if axes > MOST_AXES:
         raise FormatError(
             f"{axes} axes of each taxel are more than the {MOST_AXES} that there can be; check the firmware"
         )
-    return SkinFormat(rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1)
+    return SkinFormat(
+        rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1
+    )
 
 
 def _axes_byte(axes: int = 1) -> int:

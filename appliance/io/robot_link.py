@@ -1,4 +1,5 @@
-"""The serial line to the robot. In: verdicts, and bytes of the robot controller. Out: sentences, and its commands.
+"""The serial line to the robot. In: verdicts, and bytes of the robot controller. Out: sentences,
+and its commands.
 
 What sentences are stands in `core.sentences`. Nothing here waits for the port: if the peer does not
 read, sentences are dropped and counted, and no frame is lost.
@@ -23,8 +24,21 @@ from appliance.core.types import Verdict
 from appliance.io import serial_port
 
 COMMANDS = (
-    "ID", "STATE", "TEST", "LABEL", "TARE", "NEW", "ABORT", "START", "STOP", "MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD",
-)  # fmt: skip
+    "ID",
+    "STATE",
+    "TEST",
+    "LABEL",
+    "TARE",
+    "NEW",
+    "ABORT",
+    "START",
+    "STOP",
+    "MATERIAL",
+    "POSITION",
+    "SESSION",
+    "NEXT",
+    "DISCARD",
+)
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
 """The commands that have a text after a comma."""
 RETRY_NS = 1_000_000_000
@@ -32,8 +46,9 @@ RETRY_NS = 1_000_000_000
 
 
 class Port(Protocol):
-    """A line to the robot controller: verdicts and other sentences out, commands in. name: of the port, for a person.
-    dropped: sentences that were not sent. trouble: why the line does not work, "" where it does."""
+    """A line to the robot controller: verdicts and other sentences out, commands in. name: of the
+    port, for a person. dropped: sentences that were not sent. trouble: why the line does not work,
+    "" where it does."""
 
     name: str
     dropped: int
@@ -58,8 +73,8 @@ class Port(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A line from the robot controller: one of COMMANDS with its text if it has one, or `error`: why it is no
-    command."""
+    """A line from the robot controller: one of COMMANDS with its text if it has one, or `error`:
+    why it is no command."""
 
     name: str
     text: str = ""
@@ -72,12 +87,23 @@ class Command:
 
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
-    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay). loss_known: whether lost
-    frames of the skin can be seen; if not, a last field says so, for which the detail is cut if need be."""
+    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay).
+    loss_known: whether lost frames of the skin can be seen; if not, a last field says so, for which
+    the detail is cut if need be."""
     fields = (
-        v.sweep, f"{v.time_ns / 1e9:.3f}", v.status, v.label, f"{v.probability:.3f}", f"{v.margin:.3f}",
-        v.fused, v.lost, f"{v.latency_ns / 1e6:.2f}", v.bundle, source, f"{v.share:.2f}",
-    )  # fmt: skip
+        v.sweep,
+        f"{v.time_ns / 1e9:.3f}",
+        v.status,
+        v.label,
+        f"{v.probability:.3f}",
+        f"{v.margin:.3f}",
+        v.fused,
+        v.lost,
+        f"{v.latency_ns / 1e6:.2f}",
+        v.bundle,
+        source,
+        f"{v.share:.2f}",
+    )
     if loss_known:
         return sentence("RES", *fields, v.detail)
     room = MAX_LINE - len(sentence("RES", *fields, "", 1))
@@ -85,9 +111,12 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
-    """The commands in `data`, which continues `rest`, and the new unfinished rest: see `sentences.parse`."""
+    """The commands in `data`, which continues `rest`, and the new unfinished rest: see
+    `sentences.parse`."""
     found, rest = sentences.parse(data, rest)
-    return [Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found], rest
+    return [
+        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found
+    ], rest
 
 
 def command(name: str, text: str | None = None) -> Command:
@@ -95,7 +124,9 @@ def command(name: str, text: str | None = None) -> Command:
     if name not in COMMANDS or UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in TEXT_COMMANDS) != (text is not None):
-        return Command(name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS))
+        return Command(
+            name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS)
+        )
     return Command(name, text or "")
 
 
@@ -106,7 +137,13 @@ class StdoutPort:
     """
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
-        self.name, self.dropped, self.trouble, self._source, self._commands = "standard output", 0, "", source, commands
+        self.name, self.dropped, self.trouble, self._source, self._commands = (
+            "standard output",
+            0,
+            "",
+            source,
+            commands,
+        )
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Print a verdict's sentence."""
@@ -128,12 +165,16 @@ class StdoutPort:
 class SerialSink:
     """Sentences to and commands from a serial port, which may be unplugged and come back.
 
-    opener: creates a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that the peer did not
-    read.
+    opener: creates a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that
+    the peer did not read.
     """
 
     def __init__(
-        self, config: SerialConfig, clock: Clock, source: str, opener: Callable[..., Any] = serial.Serial
+        self,
+        config: SerialConfig,
+        clock: Clock,
+        source: str,
+        opener: Callable[..., Any] = serial.Serial,
     ) -> None:
         self.name, self.dropped, self.trouble = config.port, 0, ""
         self._config, self._clock, self._source, self._opener = config, clock, source, opener
@@ -148,7 +189,8 @@ class SerialSink:
         self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
-        """Queue a sentence; if the queue is full the oldest one that was not begun is dropped and counted."""
+        """Queue a sentence; if the queue is full the oldest one that was not begun is dropped and
+        counted."""
         if len(self._queue) >= self._config.queue:
             del self._queue[1 if self._begun else 0]
             self.dropped += 1
@@ -181,7 +223,8 @@ class SerialSink:
             return
         while self._queue:
             try:
-                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits as long as the peer does not read
+                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits as long as the peer
+                # does not read
                 self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
             except BlockingIOError:
                 return
@@ -201,14 +244,20 @@ class SerialSink:
             port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
         except (OSError, ValueError) as e:  # SerialException is an OSError
             held = serial_port.is_held(e)
-            advice = "end the program that has it (fuser shows it)" if held else "check serial.port and group dialout"
+            advice = (
+                "end the program that has it (fuser shows it)"
+                if held
+                else "check serial.port and group dialout"
+            )
             self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
             return False
         self._port, self.trouble, self._rest = port, "", b""
         return True
 
     def _lose(self, e: OSError) -> None:
-        self.trouble = f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
+        self.trouble = (
+            f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
+        )
         self.close()
         self._begun = 0
         self._retry_ns = self._clock.now_ns() + RETRY_NS

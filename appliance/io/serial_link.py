@@ -1,7 +1,7 @@
 """A readout board on a serial port: finds and opens the port, sends bytes, reads what has come.
 
-In: the path of a port or its USB ids. Out: bytes, or a SensorError that explains what failed. With `request` it carries
-PROTOCOL.md, part 1; skins of other protocols use `write` and `read` alone.
+In: the path of a port or its USB ids. Out: bytes, or a SensorError that explains what failed. With
+`request` it carries PROTOCOL.md, part 1; skins of other protocols use `write` and `read` alone.
 """
 
 from __future__ import annotations
@@ -24,20 +24,27 @@ from appliance.io.link import REPLY_MS, TTY_BYTES, reply_to
 from appliance.io.serial_port import PortInfo
 
 BAUD = 115200
-"""Where nothing else is set; a port that is USB down to the microcontroller has no speed and ignores it."""
+"""Where nothing else is set; a port that is USB down to the microcontroller has no speed and
+ignores it."""
 COLLECT_NS = 8_000_000
-"""Least time between two reads, as between two packets of a readout board at 750 Hz: a port at 2 Mbaud is ready some
-thousand times a second, and every turn of the loop costs more than the bytes of one. Times of frames do not suffer,
-since the fit takes the promptest arrivals. Half of it after a read of half of what a port holds, and no pause after a full one."""
+"""Least time between two reads, as between two packets of a readout board at 750 Hz: a port at 2
+Mbaud is ready some thousand times a second, and every turn of the loop costs more than the bytes of
+one. Times of frames do not suffer, since the fit takes the promptest arrivals. Half of it after a
+read of half of what a port holds, and no pause after a full one."""
 
 
 class SerialLink:
-    """An opened serial port: requests are single bytes, replies come as packets. wait: see `Devices`."""
+    """An opened serial port: requests are single bytes, replies come as packets. wait: see
+    `Devices`."""
 
     def __init__(
-        self, path: str, baud: int, clock: Clock, opener: Callable[..., Any] = serial.Serial,
+        self,
+        path: str,
+        baud: int,
+        clock: Clock,
+        opener: Callable[..., Any] = serial.Serial,
         wait: Callable[[int, float], bool] = wait_readable,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.path, self._clock, self._wait = path, clock, wait
         self._next_ns = 0  # the next read
         try:
@@ -52,7 +59,8 @@ class SerialLink:
         return reply_to(request, self.read, self._clock) if length else b""
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises SensorLost if the port is gone or takes nothing for REPLY_MS."""
+        """Send all of `data`. Raises SensorLost if the port is gone or takes nothing for
+        REPLY_MS."""
         while data:
             try:
                 if not select.select([], [self._port.fileno()], [], REPLY_MS / 1000)[1]:
@@ -64,7 +72,8 @@ class SerialLink:
                 raise _lost(self.path, e) from e
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorLost if the port is gone."""
+        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorLost if the port
+        is gone."""
         try:
             if not self._wait(self._port.fileno(), timeout_ms / 1000):
                 return b""
@@ -104,7 +113,8 @@ def open_board(
 
 
 def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:
-    """The path of the first port with one of the USB `ids` (vendor, product) and this serial number, "" for any.
+    """The path of the first port with one of the USB `ids` (vendor, product) and this serial
+    number, "" for any.
 
     Raises SensorAbsent naming the ports that there are.
     """
@@ -122,8 +132,9 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
 
 
 def _be_prompt(port: Any) -> None:
-    """Let a USB adapter pass on what it has without collecting it for 16 ms, and leave DTR up when the port is closed:
-    many boards restart when it rises, and would never be ready for a program that tries again."""
+    """Let a USB adapter pass on what it has without collecting it for 16 ms, and leave DTR up when
+    the port is closed: many boards restart when it rises, and would never be ready for a program
+    that tries again."""
     with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
         port.set_low_latency_mode(True)
     with contextlib.suppress(termios.error, OSError):
@@ -136,12 +147,20 @@ def _refused(path: str, e: Exception) -> SensorError:
     """Why a port could not be opened."""
     code = getattr(e, "errno", None)
     if serial_port.is_held(e):
-        return SensorBusy(f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows which")
+        return SensorBusy(
+            f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows which"
+        )
     if code == errno.EACCES:
-        return SensorDenied(f"{path} may not be opened by this user (errno 13); add the user to group dialout")
+        return SensorDenied(
+            f"{path} may not be opened by this user (errno 13); add the user to group dialout"
+        )
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return SensorAbsent(f"no port {path} (errno {code}); plug the skin in, or correct --port (sensor.port)")
-    return SensorLost(f"{path} cannot be opened: {e}; check sensor.port and the baud rate of its profile")
+        return SensorAbsent(
+            f"no port {path} (errno {code}); plug the skin in, or correct --port (sensor.port)"
+        )
+    return SensorLost(
+        f"{path} cannot be opened: {e}; check sensor.port and the baud rate of its profile"
+    )
 
 
 def _lost(path: str, e: OSError) -> SensorLost:

@@ -1,4 +1,5 @@
-"""Serial ports, for the line to the robot and for skins: which ones there are, opening one alone, what went wrong.
+"""Serial ports, for the line to the robot and for skins: which ones there are, opening one alone,
+what went wrong.
 
 In: paths. Out: an open `serial.Serial` that no other program can read from.
 """
@@ -22,8 +23,8 @@ PSEUDO_TERMINALS = range(136, 144)
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """A serial port of this machine. vendor_id, product_id: USB ids, 0 where it is not on USB. serial: its USB serial
-    number. name: what its maker calls it."""
+    """A serial port of this machine. vendor_id, product_id: USB ids, 0 where it is not on USB.
+    serial: its USB serial number. name: what its maker calls it."""
 
     path: str
     vendor_id: int = 0
@@ -32,7 +33,11 @@ class PortInfo:
     name: str = ""
 
     def __str__(self) -> str:
-        return f"{self.path} ({self.vendor_id:04x}:{self.product_id:04x} {self.name})" if self.vendor_id else self.path
+        return (
+            f"{self.path} ({self.vendor_id:04x}:{self.product_id:04x} {self.name})"
+            if self.vendor_id
+            else self.path
+        )
 
 
 def ports() -> list[PortInfo]:
@@ -40,15 +45,23 @@ def ports() -> list[PortInfo]:
     from serial.tools.list_ports import comports
 
     return [
-        PortInfo(p.device, p.vid or 0, p.pid or 0, p.serial_number or "", p.product or p.description or "")
+        PortInfo(
+            p.device,
+            p.vid or 0,
+            p.pid or 0,
+            p.serial_number or "",
+            p.product or p.description or "",
+        )
         for p in sorted(comports(), key=lambda p: str(p.device))
     ]
 
 
 def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:
-    """The port at `path`, not waiting, empty, and kept from other programs. opener: makes a `serial.Serial`.
+    """The port at `path`, not waiting, empty, and kept from other programs. opener: makes a
+    `serial.Serial`.
 
-    Raises OSError or ValueError (a speed that the port cannot do); `is_held` says whether another program has it.
+    Raises OSError or ValueError (a speed that the port cannot do); `is_held` says whether another
+    program has it.
     """
     port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
     try:
@@ -62,7 +75,8 @@ def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial)
 def close(port: Any) -> None:
     """Close a port that `open_alone` has opened, also one that is gone."""
     with contextlib.suppress(OSError):
-        # if another program opened the port before, the exclusive mode would outlast us and lock us out, too
+        # if another program opened the port before, the exclusive mode would outlast us and lock us
+        # out, too
         fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
     with contextlib.suppress(OSError):
         port.close()
@@ -74,10 +88,11 @@ def is_held(e: Exception) -> bool:
 
 
 def _keep_others_out(port: int) -> None:
-    """Make the kernel refuse any further open of `port`, except by root: another reader would take bytes away, and a
-    lock only binds programs that ask for it.
+    """Make the kernel refuse any further open of `port`, except by root: another reader would take
+    bytes away, and a lock only binds programs that ask for it.
 
-    Pseudo-terminals are left out: one would stay locked, also for us, if we were killed while its other end is open.
+    Pseudo-terminals are left out: one would stay locked, also for us, if we were killed while its
+    other end is open.
     """
     if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
         fcntl.ioctl(port, termios.TIOCEXCL)

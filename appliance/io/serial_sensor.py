@@ -1,6 +1,8 @@
-"""A skin on a serial port that does not speak PROTOCOL.md, as its profile describes it. In: a port, a clock. Out: Frames.
+"""A skin on a serial port that does not speak PROTOCOL.md, as its profile describes it. In: a port,
+a clock. Out: Frames.
 
-It only listens, but for the commands of the profile: a skin that is not the expected one is told nothing else.
+It only listens, but for the commands of the profile: a skin that is not the expected one is told
+nothing else.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ class ProfileLink:
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """These skins know no requests."""
-        raise SensorMismatch(f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}")
+        raise SensorMismatch(
+            f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}"
+        )
 
     def close(self) -> None:
         """Send the commands for stopping, unless the skin is gone, and release the port."""
@@ -77,13 +81,16 @@ class SerialSensor(LinkSensor):
         open_port: Callable[[str, int], BytePort] | None = None,
         ports: Callable[[], list[PortInfo]] = serial_port.ports,
     ) -> None:
-        super().__init__(config, fmt, clock, lambda counters: skin_stream.stream(profile, fmt, counters), tap)
+        super().__init__(
+            config, fmt, clock, lambda counters: skin_stream.stream(profile, fmt, counters), tap
+        )
         self._profile, self._ports = profile, ports
         self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
         self._deaf_ns = 0  # until then the skin tares itself
 
     def read(self) -> Frames:
-        """Frames that have come since the last call; waits at most `timeout_ms`. None while the skin tares itself."""
+        """Frames that have come since the last call; waits at most `timeout_ms`. None while the
+        skin tares itself."""
         frames = super().read()
         return frames if self._clock.now_ns() >= self._deaf_ns else Frames.empty(self._format)
 
@@ -110,7 +117,10 @@ class SerialSensor(LinkSensor):
     def _check_format(self) -> None:
         """Raises SensorMismatch where the bundle's format is not what the skin can send."""
         sent, wanted = self._profile.format, self._format
-        able = wanted.rate_hz in self._profile.rates_hz or abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
+        able = (
+            wanted.rate_hz in self._profile.rates_hz
+            or abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
+        )
         if sent.skin != wanted.skin or not able:
             rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
             raise SensorMismatch(

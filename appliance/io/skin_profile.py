@@ -1,6 +1,8 @@
-"""Skin profiles: what goes over a skin's wire, as a TOML file. In: a name and folders. Out: a checked `SkinProfile`.
+"""Skin profiles: what goes over a skin's wire, as a TOML file. In: a name and folders. Out: a
+checked `SkinProfile`.
 
-The fields of `SkinProfile` are the schema; firmware_config/skins/matrix.toml explains each of them to a person.
+The fields of `SkinProfile` are the schema; firmware_config/skins/matrix.toml explains each of them
+to a person.
 """
 
 from __future__ import annotations
@@ -62,7 +64,11 @@ def _is_usb_id(value: Any) -> bool:
 
 
 def _is_command(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= 128 and (not value.startswith("hex:") or _binary(value))
+    return (
+        isinstance(value, str)
+        and 0 < len(value) <= 128
+        and (not value.startswith("hex:") or _binary(value))
+    )
 
 
 def _binary(value: str) -> bool:
@@ -84,14 +90,16 @@ def _is_rate(value: Any) -> bool:
 class SkinProfile:
     """What goes over a skin's wire. Raises ConfigError for values that contradict each other.
 
-    about: what it is, in a line. source: where these facts are from. measured: who has compared them with a device; ""
-    nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start, stop: commands when it is opened and closed.
-    tare: command for the unloaded zero, which then takes tare_s.
-    codec: how frames are told apart. marker, trailer: bytes before and after a frame ("fixed"). lines: what a line of
-    text holds. number, byte_order: one number on the wire. values: numbers of one taxel on the wire. take: which of them
-    are used, in this order; the last is the one along the skin's normal. rows, cols: grid as it is on the wire.
-    orientation: turns that make the rows lie along the direction of sliding. sequence: type of a count after the marker.
-    rate_hz: frames per second; rates_hz: those to which `start` can set it with {rate} or {period_ms}.
+    about: what it is, in a line. source: where these facts are from. measured: who has compared
+    them with a device; "" nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
+    stop: commands when it is opened and closed. tare: command for the unloaded zero, which then
+    takes tare_s. codec: how frames are told apart. marker, trailer: bytes before and after a frame
+    ("fixed"). lines: what a line of text holds. number, byte_order: one number on the wire. values:
+    numbers of one taxel on the wire. take: which of them are used, in this order; the last is the
+    one along the skin's normal. rows, cols: grid as it is on the wire. orientation: turns that make
+    the rows lie along the direction of sliding. sequence: type of a count after the marker.
+    rate_hz: frames per second; rates_hz: those to which `start` can set it with {rate} or
+    {period_ms}.
     """
 
     about: str = ""
@@ -100,7 +108,9 @@ class SkinProfile:
     codec: Literal["palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf"] = "palpate"
     usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
     baud: int = limited(115200, 1200, 4_000_000)
-    start: tuple[str, ...] = _several('commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command)
+    start: tuple[str, ...] = _several(
+        'commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command
+    )
     stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _is_command)
     tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _is_command)
     tare_s: float = limited(0.0, 0.0, 60.0)
@@ -113,7 +123,9 @@ class SkinProfile:
     rows: int = limited(4, 1, 255)
     cols: int = limited(4, 1, 255)
     values: int = limited(1, 1, 64)
-    take: tuple[int, ...] = _several("positions among the values of a taxel such as [1, 2, 3]", _is_channel, (0,))
+    take: tuple[int, ...] = _several(
+        "positions among the values of a taxel such as [1, 2, 3]", _is_channel, (0,)
+    )
     orientation: tuple[str, ...] = _several(f"some of {', '.join(_TURNS)}", _TURNS.__contains__)
     rate_hz: float = limited(100.0, 0.1, 100_000.0)
     rates_hz: tuple[float, ...] = _several("rates such as [100, 250]", _is_rate)
@@ -129,30 +141,42 @@ class SkinProfile:
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """Which of MARKS its frames do not have. Without a sequence number, lost frames cannot be seen."""
-        has = {"palpate": MARKS, "papillarray": MARKS, "fixed": MARKS[:1] if self.sequence else ()}.get(self.codec, ())
+        """Which of MARKS its frames do not have. Without a sequence number, lost frames cannot be
+        seen."""
+        has = {
+            "palpate": MARKS,
+            "papillarray": MARKS,
+            "fixed": MARKS[:1] if self.sequence else (),
+        }.get(self.codec, ())
         return tuple(mark for mark in MARKS if mark not in has)
 
     @property
     def format(self) -> SweepFormat:
         """The format of its sweeps, rows along the direction of sliding; window of WINDOW_S."""
-        rows, cols = (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
+        rows, cols = (
+            (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
+        )
         return with_window(rows, cols, self.rate_hz, self.number, len(self.take))
 
     def commands(self, texts: Sequence[str], rate_hz: float) -> list[bytes]:
-        """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds: decimal in a text,
-        one byte in a command that begins with hex:."""
+        """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds:
+        decimal in a text, one byte in a command that begins with hex:."""
         period = max(1, min(255, round(1000 / rate_hz)))
         return [
             bytes.fromhex(text[4:].replace("{period_ms}", f"{period:02x}"))
             if text.startswith("hex:")
-            else text.replace("{rate}", f"{rate_hz:g}").replace("{period_ms}", str(period)).encode("latin-1", "replace")
+            else text.replace("{rate}", f"{rate_hz:g}")
+            .replace("{period_ms}", str(period))
+            .encode("latin-1", "replace")
             for text in texts
         ]
 
     def json(self) -> dict[str, Any]:
         """All fields by name, for JSON; `from_json` reads them."""
-        return {name: value.hex() if isinstance(value, bytes) else value for name, value in asdict(self).items()}
+        return {
+            name: value.hex() if isinstance(value, bytes) else value
+            for name, value in asdict(self).items()
+        }
 
 
 _KEYS = keys(SkinProfile)
@@ -166,13 +190,16 @@ def _contradiction(p: SkinProfile) -> str:
         return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
     if p.codec != "fixed" and (p.marker or p.trailer or p.sequence):
         return f'marker, trailer and sequence belong to codec = "fixed", not to "{p.codec}"; remove them'
-    if not p.take or len(p.take) > MOST_AXES or len({*p.take}) < len(p.take) or max(p.take) >= p.values:
+    if (
+        not p.take
+        or len(p.take) > MOST_AXES
+        or len({*p.take}) < len(p.take)
+        or max(p.take) >= p.values
+    ):
         return f"take = {list(p.take)} is not 1 to {MOST_AXES} different ones of 0 to {p.values - 1} (see values)"
     if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
         values, kind = _VALUES[p.codec]
-        return (
-            f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = {values}, number = "{kind}"'
-        )
+        return f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = {values}, number = "{kind}"'
     if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
         return 'usb_ids, start, stop and tare are not for codec = "palpate"; sensor.link and sensor.vendor_id say where it is'
     if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
@@ -185,8 +212,8 @@ PALPATE = SkinProfile()
 
 
 def load(name: str, folders: Sequence[Path]) -> SkinProfile:
-    """The profile NAME.toml in the first of the folders that has one; that of DEFAULT needs no file. A name that ends in
-    .toml is a file.
+    """The profile NAME.toml in the first of the folders that has one; that of DEFAULT needs no
+    file. A name that ends in .toml is a file.
 
     Raises ConfigError naming the file, the key, the value and what is allowed.
     """
@@ -196,21 +223,30 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
     if name not in there:
         near = closest(name, there)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(there) or 'none'}"
-        raise ConfigError(f"sensor.skin = {shown(name)} has no profile in {' or '.join(map(str, folders))}; {hint}")
+        raise ConfigError(
+            f"sensor.skin = {shown(name)} has no profile in {' or '.join(map(str, folders))}; {hint}"
+        )
     path = there[name]
     try:
         table = tomllib.loads(path.read_text("utf-8"))
     except OSError as e:
-        raise ConfigError(f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it") from e
+        raise ConfigError(
+            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
+        ) from e
     except (ValueError, RecursionError) as e:
-        raise ConfigError(f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes") from e
+        raise ConfigError(
+            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
+        ) from e
     return _made(table, str(path))
 
 
 def from_json(table: Any, where: str) -> SkinProfile:
-    """The profile that `json` wrote, checked like a file. where: for messages. Raises ConfigError."""
+    """The profile that `json` wrote, checked like a file. where: for messages. Raises
+    ConfigError."""
     if not isinstance(table, dict):
-        raise ConfigError(f"{where}: {shown(table)} is no skin profile; take one that was not changed")
+        raise ConfigError(
+            f"{where}: {shown(table)} is no skin profile; take one that was not changed"
+        )
     return _made(table, where)
 
 
@@ -218,9 +254,13 @@ def _made(table: dict[str, Any], where: str) -> SkinProfile:
     def unknown(name: str) -> ConfigError:
         near = closest(name, _KEYS)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_KEYS)}"
-        return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")
+        return ConfigError(
+            f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}"
+        )
 
-    values = read_table(_KEYS, table, unknown=unknown, refused=lambda why: ConfigError(f"{where}: {why}"))
+    values = read_table(
+        _KEYS, table, unknown=unknown, refused=lambda why: ConfigError(f"{where}: {why}")
+    )
     missing = next((name for name in _NEEDED if not values.get(name)), None)
     if missing:
         raise ConfigError(f"{where}: {missing} is missing; matrix.toml explains each key")
@@ -241,20 +281,27 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
-    """The profile with what the settings change: sensor.grid, sensor.rate_hz, sensor.baud. Raises ConfigError."""
+    """The profile with what the settings change: sensor.grid, sensor.rate_hz, sensor.baud. Raises
+    ConfigError."""
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
-        raise ConfigError(f"sensor.{key} is for skins that do not say it; this one speaks PROTOCOL.md, so remove it")
+        raise ConfigError(
+            f"sensor.{key} is for skins that do not say it; this one speaks PROTOCOL.md, so remove it"
+        )
     grid = _GRID.fullmatch(config.grid)
     if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
-        raise ConfigError(f"sensor.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32")
+        raise ConfigError(
+            f"sensor.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32"
+        )
     changes: dict[str, Any] = {}
     if grid:
         changes |= {"rows": int(grid[1]), "cols": int(grid[2])}
     if config.rate_hz:
         if profile.rates_hz and config.rate_hz not in profile.rates_hz:
             allowed = ", ".join(f"{rate:g}" for rate in profile.rates_hz)
-            raise ConfigError(f"sensor.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of {allowed}")
+            raise ConfigError(
+                f"sensor.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of {allowed}"
+            )
         changes["rate_hz"] = config.rate_hz
     if config.baud:
         changes["baud"] = config.baud

@@ -1,8 +1,8 @@
-"""From the bytes of a skin to Frames, whatever its profile. In: what was read, and when. Out: Frames with numbers and host
-times, and counts of what was lost; no I/O.
+"""From the bytes of a skin to Frames, whatever its profile. In: what was read, and when. Out:
+Frames with numbers and host times, and counts of what was lost; no I/O.
 
-Skins with a clock and a count go the way of PROTOCOL.md (`usb_sensor.Stream`). For all others, frames are counted as they
-come, and their times are fitted to their arrivals.
+Skins with a clock and a count go the way of PROTOCOL.md (`usb_sensor.Stream`). For all others,
+frames are counted as they come, and their times are fitted to their arrivals.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import FrameStream, SensorCounters, Stream
 
 RATE_WANDER = 0.05
-"""Largest relative difference between the measured rate and the expected one. Oscillators of microcontrollers differ by
-1 %, their loops by some more; from 5 % on, textures would be taken for others that are as much finer or coarser."""
+"""Largest relative difference between the measured rate and the expected one. Oscillators of
+microcontrollers differ by 1 %, their loops by some more; from 5 % on, textures would be taken for
+others that are as much finer or coarser."""
 _FIT = {"settle_s": 0.5, "span_s": 2.5, "step_s": 0.1, "max_ppm": 1.2e6 * RATE_WANDER}
-"""Of the fit of arrivals (DeviceClock). A short past: a loop that becomes slower by 2 % is 20 ms late before it is followed."""
+"""Of the fit of arrivals (DeviceClock). A short past: a loop that becomes slower by 2 % is 20 ms
+late before it is followed."""
 SUSPECT_NS, SUSPECT_FRAMES = 60_000_000, 3
-"""Frames that come later than this are held back until it is known whether others are missing before them."""
+"""Frames that come later than this are held back until it is known whether others are missing
+before them."""
 _STEP_NS, _STEP_FRAMES = 250_000_000, 8
 """Arrivals are judged by steps of this length."""
 _STEPS = 8
@@ -55,7 +58,8 @@ def stream(profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> 
 
 
 def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacked:
-    """Frames with count and clock as packets of consecutive frames. Raises SensorMismatch for another grid."""
+    """Frames with count and clock as packets of consecutive frames. Raises SensorMismatch for
+    another grid."""
     found = codec(Rest(), data)
     if found.wrong:
         raise SensorMismatch(_of_another(found.wrong))
@@ -69,15 +73,18 @@ def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacke
 
 
 def _of_another(why: str) -> str:
-    return f"the skin is another one: {why}; correct sensor.grid, or name its profile with sensor.skin"
+    return (
+        f"the skin is another one: {why}; correct sensor.grid, or name its profile with sensor.skin"
+    )
 
 
 class CountedStream:
     """Frames of a skin without a clock: numbered as they come, timed by a fit of their arrivals.
 
-    A frame is never taken for newer than it is: what piled up while nobody read keeps the times that its numbers give.
-    Where the driver has thrown bytes away, frames stay late for good. Then they are held back, and once that is certain
-    numbers begin a new epoch and the missing ones are counted, as far as the time that they take tells.
+    A frame is never taken for newer than it is: what piled up while nobody read keeps the times
+    that its numbers give. Where the driver has thrown bytes away, frames stay late for good. Then
+    they are held back, and once that is certain numbers begin a new epoch and the missing ones are
+    counted, as far as the time that they take tells.
     """
 
     def __init__(self, profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> None:
@@ -141,7 +148,8 @@ class CountedStream:
         self._fitted = False
 
     def _numbered(self, found: Decoded) -> NDArray[np.int64]:
-        """The number of each frame in this epoch. Counts frames, garbage, and what is missing between them."""
+        """The number of each frame in this epoch. Counts frames, garbage, and what is missing
+        between them."""
         n, first = len(found), not self._count
         before = self._skipped + (int(found.skipped[0]) if n else found.garbage)  # the next frame
         if not n:
@@ -150,7 +158,9 @@ class CountedStream:
             return np.empty(0, np.int64)
         self._skipped = found.garbage - int(found.skipped.sum())
         # the rest of a frame that was under way when the port was opened is no garbage
-        uncounted = min(before, round(found.size)) - (before - int(found.skipped[0])) if first else 0
+        uncounted = (
+            min(before, round(found.size)) - (before - int(found.skipped[0])) if first else 0
+        )
         self._counters.garbage_bytes += found.garbage - uncounted
         if len(found.counts):
             missing = self._gaps(found.counts)
@@ -171,13 +181,17 @@ class CountedStream:
         return (np.diff(counts, prepend=before) - 1) % self._wrap
 
     def _arrival(self, end: int) -> int:
-        """When the read came that holds the byte before `end`; a frame may be known for one only with the next one."""
+        """When the read came that holds the byte before `end`; a frame may be known for one only
+        with the next one."""
         while self._arrivals[0][0] < end:
             self._arrivals.popleft()
         return self._arrivals[0][1]
 
-    def _timed(self, numbers: NDArray[np.int64], taxels: NDArray[Any], arrived_ns: int, *, piled: bool) -> Frames:
-        """Frames with times, after those that were held back; none while they are held back themselves."""
+    def _timed(
+        self, numbers: NDArray[np.int64], taxels: NDArray[Any], arrived_ns: int, *, piled: bool
+    ) -> Frames:
+        """Frames with times, after those that were held back; none while they are held back
+        themselves."""
         last = int(numbers[-1])
         late_ns = self._late(last, arrived_ns)
         suspect = late_ns > max(SUSPECT_NS, SUSPECT_FRAMES * self._format.period_ns)
@@ -195,7 +209,8 @@ class CountedStream:
         return Frames.joined([*held, frames]) if held else frames
 
     def _late(self, number: int, arrived_ns: int) -> int:
-        """How much later frame `number` came than it should have; the fit learns from it unless that is far too much."""
+        """How much later frame `number` came than it should have; the fit learns from it unless
+        that is far too much."""
         device_ns = round(number * self._format.period_ns)
         if self._fitted:
             late_ns = arrived_ns - self._fit.to_host_ns(device_ns)
@@ -208,10 +223,13 @@ class CountedStream:
     def _times(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Host times of frames [n]. A better fit may move them back; they never run backwards."""
         first, last = int(numbers[0]), int(numbers[-1])
-        first_ns, last_ns = (self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last))
+        first_ns, last_ns = (
+            self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last)
+        )
         within_ns = (numbers - first) * ((last_ns - first_ns) / max(1, last - first))
         t_ns: NDArray[np.int64] = np.maximum(
-            first_ns + np.rint(within_ns).astype(np.int64), self._last_ns + 1 + np.arange(len(numbers))
+            first_ns + np.rint(within_ns).astype(np.int64),
+            self._last_ns + 1 + np.arange(len(numbers)),
         )
         self._last_ns = int(t_ns[-1])
         return t_ns
@@ -228,11 +246,13 @@ class CountedStream:
 
 
 class ArrivalWatch:
-    """Decides from arrivals whether frames are missing that nobody has counted, and how fast they come.
+    """Decides from arrivals whether frames are missing that nobody has counted, and how fast they
+    come.
 
-    While a backlog is read, frames come faster than the skin takes them and are less and less late. Where they come at
-    an even pace and stay as late as they are, nothing is piled up any more, so frames are missing. pace: frames a second
-    as a share of what is expected, over some steps of an even pace; 0 while that is not known.
+    While a backlog is read, frames come faster than the skin takes them and are less and less late.
+    Where they come at an even pace and stay as late as they are, nothing is piled up any more, so
+    frames are missing. pace: frames a second as a share of what is expected, over some steps of an
+    even pace; 0 while that is not known.
     """
 
     def __init__(self, period_ns: float) -> None:
@@ -243,15 +263,19 @@ class ArrivalWatch:
         self._last_ns = 0  # the arrival before
         self._least_ns = 0
         self._piled = False
-        self._steps: deque[tuple[int, int, int]] = deque(maxlen=_STEPS)  # (frames, time in ns, least lateness in ns)
+        self._steps: deque[tuple[int, int, int]] = deque(
+            maxlen=_STEPS
+        )  # (frames, time in ns, least lateness in ns)
         self.pace = 0.0
 
     def missing(self, number: int, arrival_ns: int, late_ns: int, *, piled: bool) -> int:
-        """How many frames are missing, as far as is certain now; 0 if none. late_ns: lateness of the frame `number`.
-        piled: more was waiting when it was read."""
+        """How many frames are missing, as far as is certain now; 0 if none. late_ns: lateness of
+        the frame `number`. piled: more was waiting when it was read."""
         self.pace = 0.0
         # a host that reads once in a while finds frames that came at any time since it last did
-        late_ns -= max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns)) if self._begun else 0
+        late_ns -= (
+            max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns)) if self._begun else 0
+        )
         self._last_ns = arrival_ns
         if self._begun is None:
             self._begun, self._least_ns = (number, arrival_ns), late_ns
@@ -277,7 +301,11 @@ class ArrivalWatch:
         if len(paces) < 2 or not abs(paces[-1] - 1) < _STEADY or not abs(paces[-2] - 1) < _STEADY:
             return 0
         before_ns, now_ns = self._steps[-2][2], self._steps[-1][2]
-        stays = min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns) and abs(now_ns - before_ns) < _SAME_NS
-        # whatever it is: after some steps at the right pace, what is still late will not become prompt any more
+        stays = (
+            min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns)
+            and abs(now_ns - before_ns) < _SAME_NS
+        )
+        # whatever it is: after some steps at the right pace, what is still late will not become
+        # prompt any more
         stuck = bool(self.pace) and abs(self.pace - 1) <= RATE_WANDER and now_ns > self._suspect_ns
         return max(1, round(now_ns / self._period_ns)) if stays or stuck else 0

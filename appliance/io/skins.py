@@ -1,5 +1,5 @@
-"""The skin of a box, whatever it speaks. In: settings and devices. Out: its profile, its sensor, the form of its sweeps
-before there is a bundle."""
+"""The skin of a box, whatever it speaks. In: settings and devices. Out: its profile, its sensor,
+the form of its sweeps before there is a bundle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import LinkSensor, TransferObserver, UsbSensor, ask, open_link
 
 OWN = SITE.parent / "skins"
-"""Profiles that the owner of the box has written; one of the name of a delivered profile replaces it."""
+"""Profiles that the owner of the box has written; one of the name of a delivered profile replaces
+it."""
 _FORM = re.compile(r"(\d{1,9})x(\d{1,9})(?:x(\d{1,9}))?:(\w+):(\d{1,9}(?:\.\d+)?)", re.ASCII)
 
 
@@ -29,11 +30,16 @@ def folders(settings: Config) -> list[Path]:
 
 def profile(settings: Config) -> SkinProfile:
     """The profile that the settings name, with what they change in it. Raises ConfigError."""
-    return skin_profile.adapted(skin_profile.load(settings.sensor.skin, folders(settings)), settings.sensor)
+    return skin_profile.adapted(
+        skin_profile.load(settings.sensor.skin, folders(settings)), settings.sensor
+    )
 
 
-def sensor(settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferObserver | None = None) -> LinkSensor:
-    """The sensor for the skin of the settings, which has to send sweeps of `fmt`. Raises ConfigError."""
+def sensor(
+    settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferObserver | None = None
+) -> LinkSensor:
+    """The sensor for the skin of the settings, which has to send sweeps of `fmt`. Raises
+    ConfigError."""
     chosen = profile(settings)
     if chosen.codec == "palpate":
         return UsbSensor(_config(settings, chosen), fmt, devices.clock, devices.backend, tap)
@@ -48,7 +54,8 @@ def sensor(settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferOb
 
 
 def open_board(settings: Config, devices: Devices) -> SkinLink:
-    """The opened board of a skin that speaks PROTOCOL.md. Raises ConfigError for another skin, SensorError if there is none."""
+    """The opened board of a skin that speaks PROTOCOL.md. Raises ConfigError for another skin,
+    SensorError if there is none."""
     chosen = profile(settings)
     if chosen.codec != "palpate":
         raise ConfigError(
@@ -59,30 +66,37 @@ def open_board(settings: Config, devices: Devices) -> SkinLink:
 
 
 def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = None) -> SweepFormat:
-    """The form of the skin's sweeps where no bundle says it: what the board announces, or what its profile says, with a
-    window of skin_profile.WINDOW_S. wanted: its rate is taken where the skin can be set to it.
+    """The form of the skin's sweeps where no bundle says it: what the board announces, or what its
+    profile says, with a window of skin_profile.WINDOW_S. wanted: its rate is taken where the skin
+    can be set to it.
 
     Raises ConfigError, and SensorError where a board cannot be asked.
     """
     chosen = profile(settings)
     if chosen.codec != "palpate":
         settable = wanted and wanted.rate_hz in chosen.rates_hz
-        return replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
+        return (
+            replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
+        )
     try:
         board = open_board(settings, devices)
     except SensorAbsent as e:
-        raise SensorAbsent(f"{e}, or name another skin with --skin; `palpate skin detect` says which") from e
+        raise SensorAbsent(
+            f"{e}, or name another skin with --skin; `palpate skin detect` says which"
+        ) from e
     with closing(board):
         skin = ask(board)[1]
     try:
         return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)
     except FormatError as e:
-        raise SensorMismatch(f"the skin announces a form that cannot be: {e}; check its firmware") from e
+        raise SensorMismatch(
+            f"the skin announces a form that cannot be: {e}; check its firmware"
+        ) from e
 
 
 def described(text: str) -> SweepFormat:
-    """The form that a person describes as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example "5x3:float32:100". Raises
-    ConfigError."""
+    """The form that a person describes as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example
+    "5x3:float32:100". Raises ConfigError."""
     found = _FORM.fullmatch(text.strip())
     if not found:
         raise ConfigError(

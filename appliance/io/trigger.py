@@ -1,7 +1,8 @@
-"""The robot's trigger lines. In: GPIO edges, time-stamped by the kernel. Out: START, STOP and NEW OBJECT, debounced and
-in order of time.
+"""The robot's trigger lines. In: GPIO edges, time-stamped by the kernel. Out: START, STOP and NEW
+OBJECT, debounced and in order of time.
 
-Edges that the kernel dropped or that came in a storm are reported as LOST; nothing is invented in their place.
+Edges that the kernel dropped or that came in a storm are reported as LOST; nothing is invented in
+their place.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 class EdgeCounters:
     """Counts since the program started.
 
-    glitches: bursts that did not change the level. lost_edges: dropped by the kernel because its queue was full.
-    storms: bursts of more than `trigger.storm_edges` edges.
+    glitches: bursts that did not change the level. lost_edges: dropped by the kernel because its
+    queue was full. storms: bursts of more than `trigger.storm_edges` edges.
     """
 
     glitches: int = 0
@@ -46,7 +47,8 @@ class Trigger(Protocol):
 
     @property
     def about(self) -> dict[str, str]:
-        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: what the time of an edge is."""
+        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: what the time of an
+        edge is."""
         ...
 
     @property
@@ -61,7 +63,8 @@ _Meaning = tuple[EdgeKind | None, EdgeKind | None]
 
 @dataclass(slots=True)
 class _Line:
-    """An input line: its request, its settled level, and the burst of edges that has not settled yet."""
+    """An input line: its request, its settled level, and the burst of edges that has not settled
+    yet."""
 
     request: LineRequest
     offset: int
@@ -79,13 +82,15 @@ class _Line:
 class GpioTrigger:
     """Debounces the robot's lines.
 
-    A burst is a series of edges on one line with less than `glitch_us` between neighbours. It is settled `glitch_us`
-    after its last edge. If the level then differs from the level before, the burst was one edge, with the time stamp of
-    the first; otherwise it was a glitch. A clean edge is therefore reported `glitch_us` late but with its exact time
-    (the kernel's own debouncing would shift the time stamp). An edge waits for older bursts on other lines, so that
-    edges are always in order of time.
+    A burst is a series of edges on one line with less than `glitch_us` between neighbours. It is
+    settled `glitch_us` after its last edge. If the level then differs from the level before, the
+    burst was one edge, with the time stamp of the first; otherwise it was a glitch. A clean edge is
+    therefore reported `glitch_us` late but with its exact time (the kernel's own debouncing would
+    shift the time stamp). An edge waits for older bursts on other lines, so that edges are always
+    in order of time.
 
-    A call reads at most `storm_edges` events. Raises LineError if lines cannot be found, requested or read.
+    A call reads at most `storm_edges` events. Raises LineError if lines cannot be found, requested
+    or read.
     """
 
     def __init__(self, config: TriggerConfig, gpio: Any) -> None:
@@ -95,16 +100,24 @@ class GpioTrigger:
         self.edge_counters = EdgeCounters()
         self.about = {"mode": config.mode, "times": "edge, stamped by the kernel"}
         self._pending: list[Edge] = []
-        self._blind_ns: int | None  # newest edge since the levels became unknown; None: they are known
+        self._blind_ns: (
+            int | None
+        )  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)
         with ExitStack() as stack:
-            # separate: with several lines in a request the interrupt handler counts an edge and its thread delivers it;
-            # of two edges before the thread has run one count is never delivered, and each bounce would look like a
-            # loss
+            # separate: with several lines in a request the interrupt handler counts an edge and its
+            # thread delivers it; of two edges before the thread has run one count is never
+            # delivered, and each bounce would look like a loss
             names = [name for name, _ in roles]
-            requests = request_lines(gpio, names, _input_settings(config, gpio), stack, separate=True)
+            requests = request_lines(
+                gpio, names, _input_settings(config, gpio), stack, separate=True
+            )
             meaning = dict(roles)
-            self._lines = [_Line(r, o, name, meaning[name]) for r, found in requests for o, name in found.items()]
+            self._lines = [
+                _Line(r, o, name, meaning[name])
+                for r, found in requests
+                for o, name in found.items()
+            ]
             self._active, self._rising = gpio.line.Value.ACTIVE, gpio.EdgeEvent.Type.RISING_EDGE
             self._read_levels()
             self._open = stack.pop_all()
@@ -115,20 +128,27 @@ class GpioTrigger:
         return self._blind_ns is not None
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Edges that are settled at `now_ns` (the time before the call), in order of time; never waits."""
+        """Edges that are settled at `now_ns` (the time before the call), in order of time; never
+        waits."""
         for line in self._lines:
             try:  # not `naming`: its generator costs more than polling an empty queue
                 self._read(line, now_ns)
             except OSError as e:
                 raise line_error("read", [line.name], e) from e
-        if self._blind_ns is None and not self._pending and not any(line.count for line in self._lines):
+        if (
+            self._blind_ns is None
+            and not self._pending
+            and not any(line.count for line in self._lines)
+        ):
             return []
         horizon_ns = min(line.known_ns for line in self._lines)
         for line in self._lines:
             if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
                 self._settle(line)
         # the levels are read now, so all events that led to them must have been read before
-        if self._blind_ns is not None and horizon_ns >= max(now_ns, self._blind_ns + self._glitch_ns):
+        if self._blind_ns is not None and horizon_ns >= max(
+            now_ns, self._blind_ns + self._glitch_ns
+        ):
             self._read_levels()
         until_ns = min([horizon_ns, *(line.first_ns for line in self._lines if line.count)])
         self._pending.sort(key=lambda edge: edge.t_ns)
@@ -171,8 +191,13 @@ class GpioTrigger:
             self._settle(line)
         if not line.count:
             line.first_ns = t_ns
-        # a rise may follow a rise: the kernel reads the level only after the interrupt, so the newest event is right
-        line.count, line.last_ns, line.after = line.count + 1, t_ns, event.event_type is self._rising
+        # a rise may follow a rise: the kernel reads the level only after the interrupt, so the
+        # newest event is right
+        line.count, line.last_ns, line.after = (
+            line.count + 1,
+            t_ns,
+            event.event_type is self._rising,
+        )
         if line.count > self._storm_edges:
             self.edge_counters.storms += 1
             self._lose(t_ns)
@@ -188,9 +213,12 @@ class GpioTrigger:
             self._pending.append(Edge(kind, line.first_ns))
 
     def _lose(self, t_ns: int) -> None:
-        """Report LOST at `t_ns` and discard later edges on all lines: a STOP may be missing as well as a START."""
+        """Report LOST at `t_ns` and discard later edges on all lines: a STOP may be missing as well
+        as a START."""
         if self._blind_ns is None:
-            self._pending = [edge for edge in self._pending if edge.t_ns <= t_ns] + [Edge(EdgeKind.LOST, t_ns)]
+            self._pending = [edge for edge in self._pending if edge.t_ns <= t_ns] + [
+                Edge(EdgeKind.LOST, t_ns)
+            ]
             self._blind_ns = t_ns
         for line in self._lines:
             line.count = 0

@@ -1,4 +1,5 @@
-"""A readout board on USB: finds, opens and claims it, sends requests, reads bulk transfers (PROTOCOL.md, part 1).
+"""A readout board on USB: finds, opens and claims it, sends requests, reads bulk transfers
+(PROTOCOL.md, part 1).
 
 In: a pyusb backend. Out: bytes, or a SensorError that explains the errno.
 """
@@ -34,11 +35,12 @@ DTR, RTS = 1, 2
 
 
 class Context(libusb1._LibUSB):  # type: ignore[misc]
-    """A context of libusb that lives as long as a device it has found: libusb frees it otherwise, and pyusb does not look.
+    """A context of libusb that lives as long as a device it has found: libusb frees it otherwise,
+    and pyusb does not look.
 
-    libusb strikes a board that fails with ENODEV off its context's list, and lists it again when it is plugged in, but not
-    when only its driver was taken away and given back. So `open_board` looks through a new context after each failure,
-    where pyusb alone keeps one for ever.
+    libusb strikes a board that fails with ENODEV off its context's list, and lists it again when it
+    is plugged in, but not when only its driver was taken away and given back. So `open_board` looks
+    through a new context after each failure, where pyusb alone keeps one for ever.
     """
 
     newest: Context | None = None
@@ -75,16 +77,22 @@ class VendorLink:
         return [self._number]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request; returns a reply of at most `length` bytes, b"" for length 0. Raises SensorError."""
-        kind = usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
+        """Send a request; returns a reply of at most `length` bytes, b"" for length 0. Raises
+        SensorError."""
+        kind = (
+            usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
+        )
         with _explained():
-            reply = self._device.ctrl_transfer(kind, request, 0, self._number, length or None, REPLY_MS)
+            reply = self._device.ctrl_transfer(
+                kind, request, 0, self._number, length or None, REPLY_MS
+            )
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
         """One bulk transfer of at most `size` bytes; b"" if none came within `timeout_ms`.
 
-        Raises SensorOverflow for a larger one, else SensorError. A stalled endpoint is cleared for the next read.
+        Raises SensorOverflow for a larger one, else SensorError. A stalled endpoint is cleared for
+        the next read.
         """
         try:
             return bytes(self._device.read(self._in, size, timeout_ms))
@@ -104,7 +112,8 @@ class VendorLink:
 
 
 class AcmLink(VendorLink):
-    """An opened CDC-ACM board: requests are single bytes on bulk OUT, replies come as packets on bulk IN."""
+    """An opened CDC-ACM board: requests are single bytes on bulk OUT, replies come as packets on
+    bulk IN."""
 
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
@@ -113,17 +122,25 @@ class AcmLink(VendorLink):
 
     def _claimed(self) -> list[int]:
         # the kernel's cdc_acm holds both the control and the data interface
-        return [i.bInterfaceNumber for i in self._device.get_active_configuration() if i.bInterfaceClass in (2, 10)]
+        return [
+            i.bInterfaceNumber
+            for i in self._device.get_active_configuration()
+            if i.bInterfaceClass in (2, 10)
+        ]
 
     def _raise_dtr(self) -> None:
-        """Tell the board that somebody reads, as the kernel's driver does (SET_CONTROL_LINE_STATE, USB PSTN 1.2, 6.3.12).
+        """Tell the board that somebody reads, as the kernel's driver does (SET_CONTROL_LINE_STATE,
+        USB PSTN 1.2, 6.3.12).
 
-        Without it TinyUSB, and with it MicroPython, overwrites what it has not yet sent. A board need not know the request.
+        Without it TinyUSB, and with it MicroPython, overwrites what it has not yet sent. A board
+        need not know the request.
         """
         configuration = self._device.get_active_configuration()
         control = [i.bInterfaceNumber for i in configuration if i.bInterfaceClass == CDC_CONTROL]
         with contextlib.suppress(usb.core.USBError):
-            self._device.ctrl_transfer(0x21, 0x22, DTR | RTS, control[0] if control else self._number, None, REPLY_MS)
+            self._device.ctrl_transfer(
+                0x21, 0x22, DTR | RTS, control[0] if control else self._number, None, REPLY_MS
+            )
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """Send a request byte; returns the reply, b"" for length 0. Raises SensorError."""
@@ -133,13 +150,18 @@ class AcmLink(VendorLink):
 
 
 def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
-    """Find and claim the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
+    """Find and claim the configured board. Raises SensorError if it is absent, held, refused or of
+    another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
         bus = backend or Context.chosen()
-        found = list(usb.core.find(True, bus, idVendor=config.vendor_id, idProduct=config.product_id))
+        found = list(
+            usb.core.find(True, bus, idVendor=config.vendor_id, idProduct=config.product_id)
+        )
     except usb.core.NoBackendError as e:
-        raise SensorAbsent("libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0") from e
+        raise SensorAbsent(
+            "libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0"
+        ) from e
     device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
     if device is None:
         serial = f" with serial number {config.serial}" if config.serial else ""
@@ -150,7 +172,9 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
     try:
         interface = usb.util.find_descriptor(_configuration(device), bInterfaceClass=wanted)
         if interface is None:
-            raise SensorMismatch(f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link")
+            raise SensorMismatch(
+                f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link"
+            )
         return link(device, interface, clock)
     except usb.core.USBError as e:
         _let_go(device)
@@ -169,7 +193,9 @@ def _serial(device: usb.core.Device) -> str:
     except usb.core.USBError as e:
         raise _explain(e) from e
     except UnicodeDecodeError as e:
-        raise SensorMismatch(f"the skin's serial number is no text ({e}); check its firmware") from e
+        raise SensorMismatch(
+            f"the skin's serial number is no text ({e}); check its firmware"
+        ) from e
     except ValueError as e:  # pyusb raises it if the string descriptors may not be read
         raise SensorDenied(
             f"the skin's serial number cannot be read ({e}); install the udev rule, join group plugdev"
@@ -177,7 +203,8 @@ def _serial(device: usb.core.Device) -> str:
 
 
 def _configuration(device: usb.core.Device) -> Any:
-    """The active configuration; set only if there is none, since setting it again resets the board."""
+    """The active configuration; set only if there is none, since setting it again resets the
+    board."""
     try:
         return device.get_active_configuration()
     except usb.core.USBError:
@@ -217,15 +244,21 @@ def _explained() -> Iterator[None]:
 def _explain(e: usb.core.USBError) -> SensorError:
     """The SensorError that explains an errno of libusb."""
     if e.errno == errno.EOVERFLOW:
-        return SensorOverflow("a USB transfer was larger than sensor.read_bytes (errno 75); it is lost, increase it")
+        return SensorOverflow(
+            "a USB transfer was larger than sensor.read_bytes (errno 75); it is lost, increase it"
+        )
     if e.errno == errno.EACCES:
         return SensorDenied(
             "the skin may not be opened by this user (errno 13); install the udev rule, join group plugdev"
         )
     if e.errno == errno.EBUSY:
-        return SensorBusy("another program holds the skin (errno 16); stop it, or unplug and replug the skin")
+        return SensorBusy(
+            "another program holds the skin (errno 16); stop it, or unplug and replug the skin"
+        )
     if e.errno == errno.ENODEV:
-        return SensorLost("the skin was unplugged (errno 19); plug it in again, it is taken up by itself")
+        return SensorLost(
+            "the skin was unplugged (errno 19); plug it in again, it is taken up by itself"
+        )
     return SensorLost(
         f"the skin failed ({e.strerror or e}, errno {e.errno}); trying again, check its cable if this stays"
     )

@@ -1,6 +1,8 @@
-"""A skin that speaks PROTOCOL.md, also when it is unplugged and plugged in again. In: a link, a clock. Out: Frames, state.
+"""A skin that speaks PROTOCOL.md, also when it is unplugged and plugged in again. In: a link, a
+clock. Out: Frames, state.
 
-No failure of the link makes `read` raise: it returns no frames, `state` and `trouble` say why, and it tries again.
+No failure of the link makes `read` raise: it returns no frames, `state` and `trouble` say why, and
+it tries again.
 """
 
 from __future__ import annotations
@@ -14,20 +16,28 @@ import numpy as np
 
 from appliance.core.clock import Clock, DeviceClock
 from appliance.core.config import SensorConfig
-from appliance.core.errors import FormatError, SensorError, SensorMismatch, SensorOverflow, SensorSilent
+from appliance.core.errors import (
+    FormatError,
+    SensorError,
+    SensorMismatch,
+    SensorOverflow,
+    SensorSilent,
+)
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat, shown
 from appliance.io import packets
 from appliance.io.link import SkinLink
 
 RATE_TOLERANCE = 0.01
-"""Largest relative difference between the board's rate and the bundle's: 1 %, since crystals and timers differ."""
+"""Largest relative difference between the board's rate and the bundle's: 1 %, since crystals and
+timers differ."""
 STAMPS_NS = 5_000_000
-"""Largest jitter of a board's time stamps: it may count milliseconds, or be delayed by an interrupt. Windows do not
-move by that."""
+"""Largest jitter of a board's time stamps: it may count milliseconds, or be delayed by an
+interrupt. Windows do not move by that."""
 
 PROOF_NS = 5_000_000_000
-"""A skin that announces nothing and turned out to be another one within this time after it was opened has to send for
-as long without a fault before it counts as streaming again: READY does not come and go with a wrong skin."""
+"""A skin that announces nothing and turned out to be another one within this time after it was
+opened has to send for as long without a fault before it counts as streaming again: READY does not
+come and go with a wrong skin."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
@@ -36,9 +46,10 @@ _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 class SensorCounters:
     """Counts since the program started.
 
-    frames: received. lost_frames: missing in the count of sequence numbers. stale_frames: repeated or late ones, left
-    out. garbage_bytes: bytes in no packet. overflows: transfers larger than the read. fifo_overflows: packets whose
-    OVERFLOW flag says that the board's FIFO was full. enumerations: times the board was found and started.
+    frames: received. lost_frames: missing in the count of sequence numbers. stale_frames: repeated
+    or late ones, left out. garbage_bytes: bytes in no packet. overflows: transfers larger than the
+    read. fifo_overflows: packets whose OVERFLOW flag says that the board's FIFO was full.
+    enumerations: times the board was found and started.
     """
 
     frames: int = 0
@@ -75,7 +86,8 @@ class Sensor(Protocol):
 
     @property
     def loss_known(self) -> bool:
-        """Whether each lost frame is seen. Where it is not, `lost_frames` holds what can be inferred from times."""
+        """Whether each lost frame is seen. Where it is not, `lost_frames` holds what can be
+        inferred from times."""
         ...
 
     @property
@@ -114,7 +126,8 @@ class FrameStream(Protocol):
         ...
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, the clock starts again."""
+        """Begin an enumeration, also the first: frame numbers get the next epoch, the clock starts
+        again."""
         ...
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
@@ -123,8 +136,8 @@ class FrameStream(Protocol):
 
 
 class Stream:
-    """Converts the bytes of one board to Frames with unwrapped numbers and host times; no I/O. Damaged data is
-    counted. unpack: finds the packets in bytes, as `packets.unpack`."""
+    """Converts the bytes of one board to Frames with unwrapped numbers and host times; no I/O.
+    Damaged data is counted. unpack: finds the packets in bytes, as `packets.unpack`."""
 
     loss_known = True
 
@@ -142,10 +155,13 @@ class Stream:
         self._position = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
-        self._mark: tuple[int, int] | None = None  # (number, device ns) of a frame at most a second ago
+        self._mark: tuple[int, int] | None = (
+            None  # (number, device ns) of a frame at most a second ago
+        )
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, the device clock starts again."""
+        """Begin an enumeration, also the first: frame numbers get the next epoch, the device clock
+        starts again."""
         self._counters.enumerations += 1
         self._position = packets.StreamPosition(self._position.epoch + 1)
         self._device, self._mark = DeviceClock(), None
@@ -159,7 +175,8 @@ class Stream:
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
         """The frames of a transfer that ended at `arrival_ns`.
 
-        Raises SensorMismatch if they have another format, or if the board's clock disagrees with its frame count.
+        Raises SensorMismatch if they have another format, or if the board's clock disagrees with
+        its frame count.
         """
         unpacked = self._unpack(self._leftover + data)
         self._leftover = unpacked.leftover
@@ -167,39 +184,53 @@ class Stream:
         for p in unpacked.packets:
             if p.taxels.shape[1:] != self._shape or p.taxels.dtype != self._dtype:
                 form = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
-                raise SensorMismatch(f"the skin sent {form}, but it had announced {self._format}; check its firmware")
+                raise SensorMismatch(
+                    f"the skin sent {form}, but it had announced {self._format}; check its firmware"
+                )
             self._counters.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
         fresh, position, lost, stale = packets.follow(unpacked.packets, self._position)
         if position.epoch != self._position.epoch:
             self._device, self._mark = DeviceClock(), None
         self._position = position
         now = [item for item in fresh if item[0] >> EPOCH_BITS == position.epoch]
-        # frames from before a restart of the board in the same transfer have no host time and count as lost
-        self._counters.lost_frames += lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
+        # frames from before a restart of the board in the same transfer have no host time and count
+        # as lost
+        self._counters.lost_frames += (
+            lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
+        )
         self._counters.stale_frames += stale
         return self._stamp(now, arrival_ns)
 
     def _stamp(self, fresh: list[tuple[int, packets.Packet]], arrival_ns: int) -> Frames:
-        """Frames of packets [(number of the first frame, packet)] of one epoch, with numbers and host times."""
+        """Frames of packets [(number of the first frame, packet)] of one epoch, with numbers and
+        host times."""
         if not fresh:
             return Frames.empty(self._format)
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
         for start, (first, _) in zip(starts, fresh, strict=True):
             self._check_pace(first, start)
-        self._device.update(starts[-1] + int(self._within_ns[len(fresh[-1][1].taxels) - 1]), arrival_ns)
+        self._device.update(
+            starts[-1] + int(self._within_ns[len(fresh[-1][1].taxels) - 1]), arrival_ns
+        )
         runs = []
         for start, (first, p) in zip(starts, fresh, strict=True):
             n = len(p.taxels)
             self._counters.frames += n
-            runs.append(Frames(self._device.to_host_ns(start) + self._within_ns[:n], first + _COUNT[:n], p.taxels))
+            runs.append(
+                Frames(
+                    self._device.to_host_ns(start) + self._within_ns[:n],
+                    first + _COUNT[:n],
+                    p.taxels,
+                )
+            )
         return runs[0] if len(runs) == 1 else Frames.joined(runs)
 
     def _check_pace(self, first: int, start_ns: int) -> None:
-        """Compare the board's clock with its frame count. If they disagree, host times and the windows cut by them are
-        wrong.
+        """Compare the board's clock with its frame count. If they disagree, host times and the
+        windows cut by them are wrong.
 
-        The reference is a frame up to one second ago: a jump of either is detected at once, a wrong rate within that
-        second. Raises SensorMismatch.
+        The reference is a frame up to one second ago: a jump of either is detected at once, a wrong
+        rate within that second. Raises SensorMismatch.
         """
         self._mark = self._mark or (first, start_ns)
         counted_ns = round((first - self._mark[0]) * self._format.period_ns)
@@ -217,9 +248,9 @@ class Stream:
 class LinkSensor(ABC):
     """A skin behind a link: what all skins have in common.
 
-    States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where `trouble` says what to do.
-    A skin that is plugged in again is a new enumeration: its frames get a new epoch in `seq` and a new clock.
-    announced: the skin says what it sends when it is opened.
+    States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where
+    `trouble` says what to do. A skin that is plugged in again is a new enumeration: its frames get
+    a new epoch in `seq` and a new clock. announced: the skin says what it sends when it is opened.
     """
 
     announced = True
@@ -243,7 +274,9 @@ class LinkSensor(ABC):
         self._quiet_ns = 0  # time spent reading since the last frame
         self._unheard = 0  # bytes since then
         self._opened_ns = 0
-        self._proof_ns: int | None = None  # how long it has to send before it counts as streaming; None: not at all
+        self._proof_ns: int | None = (
+            None  # how long it has to send before it counts as streaming; None: not at all
+        )
 
     @property
     def clock(self) -> dict[str, float] | None:
@@ -262,7 +295,8 @@ class LinkSensor(ABC):
         begun = self._clock.now_ns()
         data = self._transfer()
         now = self._clock.now_ns()
-        # a read that took longer than its timeout was not scheduled: the skin may have been sending all the time
+        # a read that took longer than its timeout was not scheduled: the skin may have been sending
+        # all the time
         self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
         frames, before = Frames.empty(self._format), self.counters.frames
         if data:
@@ -290,10 +324,13 @@ class LinkSensor(ABC):
 
     def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
         """Why no frame has come for `quiet_ms`. unheard: bytes that came in this time."""
-        return SensorSilent(f"the skin is there but sent no frame for {quiet_ms} ms; starting it again")
+        return SensorSilent(
+            f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"
+        )
 
     def _connect(self) -> bool:
-        """Find, open, check and start the skin; False, with state and trouble set, if that fails."""
+        """Find, open, check and start the skin; False, with state and trouble set, if that
+        fails."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
@@ -330,14 +367,16 @@ class LinkSensor(ABC):
             return Frames.empty(self._format)
 
     def _check_silence(self) -> None:
-        """Restart a skin that is connected but has sent no complete frame in `silence_ms` of reading."""
+        """Restart a skin that is connected but has sent no complete frame in `silence_ms` of
+        reading."""
         quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
             self._drop(self._mute(quiet_ms, self._unheard), 0)
 
     def _drop(self, why: SensorError, proof_ns: int | None = None) -> None:
-        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it has to send before it
-        counts as streaming again, 0 for a frame; None: nothing speaks against it once it is opened."""
+        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it
+        has to send before it counts as streaming again, 0 for a frame; None: nothing speaks against
+        it once it is opened."""
         self.close()
         self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
@@ -350,7 +389,8 @@ class LinkSensor(ABC):
 
 
 def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
-    """Whether a skin sends what a bundle or a recording wants; the length of a window is no matter of the skin."""
+    """Whether a skin sends what a bundle or a recording wants; the length of a window is no matter
+    of the skin."""
     same_rate = abs(skin.rate_hz / wanted.rate_hz - 1) <= RATE_TOLERANCE
     return (skin.shape, skin.dtype) == wanted.skin and same_rate
 
@@ -386,7 +426,8 @@ class UsbSensor(LinkSensor):
 
 
 def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
-    """What a board says about itself. Raises SensorMismatch if it is not as PROTOCOL.md says, or of another version."""
+    """What a board says about itself. Raises SensorMismatch if it is not as PROTOCOL.md says, or of
+    another version."""
     try:
         who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
         if who.protocol != packets.VERSION:
@@ -400,7 +441,8 @@ def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
 
 
 def open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
-    """Find and open the configured board. Raises SensorError if it is absent, held, refused or of another kind."""
+    """Find and open the configured board. Raises SensorError if it is absent, held, refused or of
+    another kind."""
     # each kind is imported when it is used: most boxes use one of them for ever
     if config.link == "serial":
         from appliance.io import serial_link

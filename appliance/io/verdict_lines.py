@@ -1,6 +1,8 @@
-"""The verdict as a class code on GPIO lines. In: verdicts. Out: class bits and RESULT VALID on Lines.
+"""The verdict as a class code on GPIO lines. In: verdicts. Out: class bits and RESULT VALID on
+Lines.
 
-Separate from gpio_lines.py, which must not import numpy: `cli.lower_outputs` uses it to lower the lines quickly.
+Separate from gpio_lines.py, which must not import numpy: `cli.lower_outputs` uses it to lower the
+lines quickly.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from appliance.io.gpio_lines import Lines
 
 
 class LineSink(Observer):
-    """Outputs the verdict as a code: 1 + the label's index in the manifest if the status is ok, otherwise 0."""
+    """Outputs the verdict as a code: 1 + the label's index in the manifest if the status is ok,
+    otherwise 0."""
 
     def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
         check_bits(lines.capacity, labels)

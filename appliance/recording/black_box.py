@@ -1,7 +1,8 @@
-"""The black box: the last sweeps in service with their verdicts. In: sweeps, verdicts. Out: files for `palpate replay`.
+"""The black box: the last sweeps in service with their verdicts. In: sweeps, verdicts. Out: files
+for `palpate replay`.
 
-Sweeps without a window are not kept. Their sentence holds everything that is known, and a robot that continues without
-a skin would displace the sweeps that have a window.
+Sweeps without a window are not kept. Their sentence holds everything that is known, and a robot
+that continues without a skin would displace the sweeps that have a window.
 """
 
 from __future__ import annotations
@@ -26,9 +27,13 @@ class BlackBox(Observer):
         self._path, self._format, self._most = folder, fmt, most
         self._folder: SweepFolder | None = None
         self._log = TroubleLog(
-            "black box: no sweep is kept", f"see to {folder}", end="black box: sweeps are kept again"
-        )  # fmt: skip
-        self._with_folder(lambda folder: None)  # now, at the start, since it waits for the disk several times
+            "black box: no sweep is kept",
+            f"see to {folder}",
+            end="black box: sweeps are kept again",
+        )
+        self._with_folder(
+            lambda folder: None
+        )  # now, at the start, since it waits for the disk several times
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and remove the oldest if there are too many."""
@@ -42,13 +47,16 @@ class BlackBox(Observer):
 
     def _with_folder(self, act: Callable[[SweepFolder], None]) -> None:
         def attempt() -> None:
-            # a folder that cannot be used at the start may be usable later, and must not stop the box
+            # a folder that cannot be used at the start may be usable later, and must not stop the
+            # box
             self._folder = self._folder or SweepFolder(self._path, self._format)
             act(self._folder)
 
         self._log.attempt(attempt)
 
-    def _put(self, folder: SweepFolder, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+    def _put(
+        self, folder: SweepFolder, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
+    ) -> None:
         while True:
             try:
                 folder.put(sweep, verdict, circumstances)

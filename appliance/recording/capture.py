@@ -1,5 +1,6 @@
-"""Captures: everything that the box receives, in one file. In: transfers, sensor states, edges and commands with their
-times. Out: a file; and `Playback`, which gives its content to the same modules again.
+"""Captures: everything that the box receives, in one file. In: transfers, sensor states, edges and
+commands with their times. Out: a file; and `Playback`, which gives its content to the same modules
+again.
 
 The verdicts of a capture are the same bit for bit, since they depend on nothing else.
 """
@@ -47,23 +48,31 @@ class RecordKind(IntEnum):
 
 
 class CaptureWriter(Observer):
-    """Writes a capture while the box runs; a power failure loses at most what the system had not written yet.
+    """Writes a capture while the box runs; a power failure loses at most what the system had not
+    written yet.
 
-    If the file cannot be written any more the capture ends, since one with a gap would replay differently; classifying
-    goes on. A file that is there, of an earlier start, becomes `path.1`, or the next number that is free. profile: of the
-    skin, which decides how its bytes are read. Raises ConfigError if the file cannot be opened.
+    If the file cannot be written any more the capture ends, since one with a gap would replay
+    differently; classifying goes on. A file that is there, of an earlier start, becomes `path.1`,
+    or the next number that is free. profile: of the skin, which decides how its bytes are read.
+    Raises ConfigError if the file cannot be opened.
     """
 
     def __init__(self, path: Path, fmt: SweepFormat, profile: SkinProfile = PALPATE) -> None:
         # that of PROTOCOL.md is left out, so that captures remain those of earlier versions
-        head = json.dumps(fmt.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})).encode()
+        head = json.dumps(
+            fmt.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
+        ).encode()
         self._ended = False
-        self._log = TroubleLog(f"capture: {path} cannot be written", "it ends here, classifying goes on")
+        self._log = TroubleLog(
+            f"capture: {path} cannot be written", "it ends here, classifying goes on"
+        )
         try:
             _set_aside(path)
             self._file: IO[bytes] = path.open("wb")
         except OSError as e:
-            raise ConfigError(f"--capture {path}: {e.strerror}; name a file that can be written") from e
+            raise ConfigError(
+                f"--capture {path}: {e.strerror}; name a file that can be written"
+            ) from e
         self._put(lambda: self._file.write(MAGIC + len(head).to_bytes(4, "little") + head))
 
     def transfer(self, t_ns: int, data: bytes) -> None:
@@ -76,7 +85,11 @@ class CaptureWriter(Observer):
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Write edges that the trigger returned at `t_ns`."""
-        self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges))
+        self._write(
+            RecordKind.EDGES,
+            t_ns,
+            b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges),
+        )
 
     def command(self, t_ns: int, line: str) -> None:
         """Write a command that was executed, in the form of a sentence."""
@@ -95,29 +108,35 @@ class CaptureWriter(Observer):
 
 
 def _set_aside(path: Path) -> None:
-    """Give the capture of an earlier start another name: a box restarts by itself. Raises OSError, and ConfigError where
-    there are too many."""
+    """Give the capture of an earlier start another name: a box restarts by itself. Raises OSError,
+    and ConfigError where there are too many."""
     if not path.is_file() or not path.stat().st_size:  # /dev/full, a pipe
         return
     kept = (path.with_name(f"{path.name}.{i}") for i in range(1, MOST_KEPT + 1))
     free = next((name for name in kept if not name.exists()), None)
     if not free:
-        raise ConfigError(f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them away")
+        raise ConfigError(
+            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them away"
+        )
     path.rename(free)
     log.info(f"capture: {path} was there, of an earlier start; it is {free.name} now")
 
 
 class Playback:
-    """Sensor, trigger, clock and source of commands of a replayed capture: each record is returned at its time.
+    """Sensor, trigger, clock and source of commands of a replayed capture: each record is returned
+    at its time.
 
-    Raises FormatError if the file cannot be read or is no capture; an incomplete last record is left out.
+    Raises FormatError if the file cannot be read or is no capture; an incomplete last record is
+    left out.
     """
 
     def __init__(self, path: Path) -> None:
         try:
             data = path.read_bytes()
         except OSError as e:
-            raise FormatError(f"{path}: cannot be read: {e.strerror}; name what `palpate run --capture` wrote") from e
+            raise FormatError(
+                f"{path}: cannot be read: {e.strerror}; name what `palpate run --capture` wrote"
+            ) from e
         if not data.startswith(MAGIC):
             raise FormatError(
                 f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` writes one"
@@ -129,13 +148,17 @@ class Playback:
             self.format = typed(SweepFormat, head)
             profile = PALPATE if skin is None else skin_profile.from_json(skin, "skin")
         except (ValueError, TypeError, RecursionError, ConfigError) as e:
-            raise FormatError(f"{path}: the capture's head cannot be read: {e}; capture again") from e
+            raise FormatError(
+                f"{path}: the capture's head cannot be read: {e}; capture again"
+            ) from e
         self.state = "absent"
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
         self.counters = SensorCounters()
         self.about = {"mode": "capture", "times": "as captured"}
-        self.edge_counters = EdgeCounters()  # a capture holds the edges that were reported, none of the others
+        self.edge_counters = (
+            EdgeCounters()
+        )  # a capture holds the edges that were reported, none of the others
         self._stream = skin_stream.stream(profile, self.format, self.counters)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0
@@ -186,26 +209,37 @@ class Playback:
     def edges(self, now_ns: int) -> list[Edge]:
         """Trigger: the edges that the box was given at this time."""
         edges = []
-        while self._records and self._records[0][0] == RecordKind.EDGES and self._records[0][1] <= now_ns:
+        while (
+            self._records
+            and self._records[0][0] == RecordKind.EDGES
+            and self._records[0][1] <= now_ns
+        ):
             edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
         return edges
 
     def commands(self) -> list[Command]:
         """Port: the commands that were executed at this time."""
         found = []
-        while self._records and self._records[0][0] == RecordKind.COMMAND and self._records[0][1] <= self._now_ns:
+        while (
+            self._records
+            and self._records[0][0] == RecordKind.COMMAND
+            and self._records[0][1] <= self._now_ns
+        ):
             found.append(_command(self._records.popleft()[2]))
         return found
 
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
-    """The records (kind, host ns, content) from byte `at` on. Raises FormatError for an unknown one."""
+    """The records (kind, host ns, content) from byte `at` on. Raises FormatError for an unknown
+    one."""
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
         whole = len(body) == size
         if kind >= len(RecordKind) or (whole and not _written(kind, t_ns, body)):
-            raise FormatError(f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again")
+            raise FormatError(
+                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again"
+            )
         if whole:
             yield RecordKind(kind), t_ns, body
         at += _RECORD.size + size
@@ -214,7 +248,9 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
     """Whether CaptureWriter can have written this record."""
     if kind == RecordKind.EDGES:
-        return not len(body) % _EDGE.size and all(k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body))
+        return not len(body) % _EDGE.size and all(
+            k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body)
+        )
     if kind == RecordKind.COMMAND:
         return not _command(body).error
     return t_ns < _MOST_NS and (kind == RecordKind.TRANSFER or body.isalpha())

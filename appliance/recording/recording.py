@@ -1,6 +1,8 @@
-"""Records sweeps to files, with labels that a researcher gives by commands while the robot works (`palpate record`).
+"""Records sweeps to files, with labels that a researcher gives by commands while the robot works
+(`palpate record`).
 
-In: sweeps with their verdicts, commands. Out: sweep-NNNNNN.npy and .json in one folder, a REC sentence for each sweep.
+In: sweeps with their verdicts, commands. Out: sweep-NNNNNN.npy and .json in one folder, a REC
+sentence for each sweep.
 """
 
 from __future__ import annotations
@@ -31,25 +33,29 @@ from appliance.service.systemd import words
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errnos of a full disk."""
 LEAST_FREE = 64 << 20, 20
-"""Space that is left free for the system: this many bytes, or on a small disk one part in this many. A card that is
-completely full can stop more than a recording."""
+"""Space that is left free for the system: this many bytes, or on a small disk one part in this
+many. A card that is completely full can stop more than a recording."""
 TARGET = 10
 """Sweeps that are wanted of each material at each position, where nothing else is asked for."""
 MOST_CHANGES = 1024
-"""Number of label changes that are kept until the sweeps before them are answered; far more than a person makes."""
+"""Number of label changes that are kept until the sweeps before them are answered; far more than a
+person makes."""
 DISCARDED = ".discarded"
-"""Suffix of what is left of a discarded sweep, so that its number is not used again: its sidecar under another name, since
-a rename needs no space. It goes when a later number is in use."""
-_KEPT = re.compile(rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?")
+"""Suffix of what is left of a discarded sweep, so that its number is not used again: its sidecar
+under another name, since a rename needs no space. It goes when a later number is in use."""
+_KEPT = re.compile(
+    rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?"
+)
 
 
 class SweepFolder:
-    """A folder of sweeps with their verdicts. Numbers continue after a restart, and none is used twice.
+    """A folder of sweeps with their verdicts. Numbers continue after a restart, and none is used
+    twice.
 
-    Unfinished files of a program that was killed are removed. One program at a time uses the folder; its lock ends with
-    the program. numbers: of the sweeps in the folder, in order. run: the number of this run's sweep 0; sidecars hold
-    it, since each run counts its sweeps and objects from 1. Raises OSError if the folder cannot be made, read or
-    locked.
+    Unfinished files of a program that was killed are removed. One program at a time uses the
+    folder; its lock ends with the program. numbers: of the sweeps in the folder, in order. run: the
+    number of this run's sweep 0; sidecars hold it, since each run counts its sweeps and objects
+    from 1. Raises OSError if the folder cannot be made, read or locked.
     """
 
     def __init__(self, folder: Path, fmt: SweepFormat) -> None:
@@ -63,9 +69,15 @@ class SweepFolder:
             raise
 
     def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
-        """Write a sweep with its verdict and `about`, completely or not at all; returns its number. Raises OSError."""
+        """Write a sweep with its verdict and `about`, completely or not at all; returns its number.
+        Raises OSError."""
         number = self.run + sweep.id
-        save(self.path(number), sweep, self._format, {**about, "run": self.run, "verdict": verdict.as_dict()})
+        save(
+            self.path(number),
+            sweep,
+            self._format,
+            {**about, "run": self.run, "verdict": verdict.as_dict()},
+        )
         self.numbers.append(number)
         return number
 
@@ -96,11 +108,15 @@ class SweepFolder:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as e:
-            raise BlockingIOError(e.errno, "another program keeps sweeps there", str(self.folder)) from e
+            raise BlockingIOError(
+                e.errno, "another program keeps sweeps there", str(self.folder)
+            ) from e
         names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
         # an unfinished sweep was never reported as stored, but its number is not used again
         self.run = max((int(name[1]) for name in names), default=0)
-        self.numbers = sorted({int(name[1]) for name in names if name[2] != DISCARDED and not name[3]})
+        self.numbers = sorted(
+            {int(name[1]) for name in names if name[2] != DISCARDED and not name[3]}
+        )
         for name in names:
             if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
                 (self.folder / name[0]).unlink()
@@ -109,14 +125,17 @@ class SweepFolder:
 def _make(folder: Path) -> None:
     """Make the folder and those above it, and sync them to the disk."""
     folder.mkdir(parents=True, exist_ok=True)
-    for above in folder.resolve().parents:  # all: a run that was killed may have made folders without syncing them
+    for above in (
+        folder.resolve().parents
+    ):  # all: a run that was killed may have made folders without syncing them
         with suppress(PermissionError):  # a folder that we may not open was not made by us
             storage.sync(above)
 
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Material, position on it, and session; "" is not known. Raises ConfigError for a text that cannot be sent."""
+    """Material, position on it, and session; "" is not known. Raises ConfigError for a text that
+    cannot be sent."""
 
     material: str = ""
     position: str = ""
@@ -132,20 +151,29 @@ class Labels:
 
 
 class RecordingSession(Observer):
-    """Records each sweep that has a window, with the labels that applied at its start edge, and logs what is missing.
+    """Records each sweep that has a window, with the labels that applied at its start edge, and
+    logs what is missing.
 
-    say: takes REC sentences. target: sweeps that are wanted of each material at each position; sweeps of earlier runs in
-    the folder count. Raises ConfigError if the folder cannot be used, or holds sweeps of another form.
+    say: takes REC sentences. target: sweeps that are wanted of each material at each position;
+    sweeps of earlier runs in the folder count. Raises ConfigError if the folder cannot be used, or
+    holds sweeps of another form.
     """
 
     def __init__(
-        self, folder: Path, fmt: SweepFormat, labels: Labels, clock: Clock, say: Callable[[bytes], None],
+        self,
+        folder: Path,
+        fmt: SweepFormat,
+        labels: Labels,
+        clock: Clock,
+        say: Callable[[bytes], None],
         target: int = TARGET,
-    ) -> None:  # fmt: skip
+    ) -> None:
         try:
             self._folder = SweepFolder(folder, fmt)
         except OSError as e:
-            raise ConfigError(f"--out {folder}: {e.strerror}; name a folder that can be written") from e
+            raise ConfigError(
+                f"--out {folder}: {e.strerror}; name a folder that can be written"
+            ) from e
         self._progress = RecordingProgress(target)
         self._count_earlier(fmt)
         self._clock, self._say = clock, say
@@ -156,9 +184,12 @@ class RecordingSession(Observer):
         self._last: dict[str, Any] | None = None
         self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
-            "MATERIAL": partial(self._change, "material"), "POSITION": partial(self._change, "position"),
-            "SESSION": partial(self._change, "session"), "NEXT": self._next, "DISCARD": self._discard,
-        }  # fmt: skip
+            "MATERIAL": partial(self._change, "material"),
+            "POSITION": partial(self._change, "position"),
+            "SESSION": partial(self._change, "session"),
+            "NEXT": self._next,
+            "DISCARD": self._discard,
+        }
 
     @property
     def stored(self) -> int:
@@ -166,20 +197,30 @@ class RecordingSession(Observer):
         return len(self._stored)
 
     def about(self) -> dict[str, Any]:
-        """How far the recording has got, for JSON: labels that hold now, sweeps of this run, what there is of each
-        material and position, how many are wanted of each, and what is missing in words; what became of the last sweep,
-        as in REC, and the number of the one that DISCARD would remove (None: there is none)."""
+        """How far the recording has got, for JSON: labels that hold now, sweeps of this run, what
+        there is of each material and position, how many are wanted of each, and what is missing in
+        words; what became of the last sweep, as in REC, and the number of the one that DISCARD
+        would remove (None: there is none)."""
         return {
-            **asdict(self._labels[-1][1]), "stored": self.stored, "counts": self._progress.counts,
-            "target": self._progress.target, "missing": self._progress.missing(), "last": self._last,
+            **asdict(self._labels[-1][1]),
+            "stored": self.stored,
+            "counts": self._progress.counts,
+            "target": self._progress.target,
+            "missing": self._progress.missing(),
+            "last": self._last,
             "discard": self._stored[-1][0] - self._folder.run if self._stored else None,
-        }  # fmt: skip
+        }
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
         self._answered = True
-        labels = next((labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns), Labels())
-        sweep = replace(sweep, material=labels.material, position=labels.position, session=labels.session)
+        labels = next(
+            (labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns),
+            Labels(),
+        )
+        sweep = replace(
+            sweep, material=labels.material, position=labels.position, session=labels.session
+        )
         outcome, detail = "skipped", f"{verdict.status}"
         if len(sweep.frames):
             outcome, detail = self._store(sweep, verdict, circumstances)
@@ -188,7 +229,16 @@ class RecordingSession(Observer):
         self._tell(verdict, outcome, labels)
         self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **asdict(labels)}
         self._say(
-            sentence("REC", sweep.id, outcome, self.stored, labels.material, labels.position, labels.session, detail)
+            sentence(
+                "REC",
+                sweep.id,
+                outcome,
+                self.stored,
+                labels.material,
+                labels.position,
+                labels.session,
+                detail,
+            )
         )
 
     def close(self) -> None:
@@ -196,15 +246,22 @@ class RecordingSession(Observer):
         self._folder.close()
         if not self._answered:
             return
-        log.info(f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}")
+        log.info(
+            f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}"
+        )
 
     def _count_earlier(self, fmt: SweepFormat) -> None:
-        """Count the sweeps that the folder holds already. Raises ConfigError for one of another form."""
+        """Count the sweeps that the folder holds already. Raises ConfigError for one of another
+        form."""
         for number in self._folder.numbers:
             path = self._folder.path(number)
             try:
                 about = sidecar(path)
-                form, status, labels = about["format"], Status(about["verdict"]["status"]), _labels(about)
+                form, status, labels = (
+                    about["format"],
+                    Status(about["verdict"]["status"]),
+                    _labels(about),
+                )
             except (FormatError, ConfigError, KeyError, TypeError, ValueError):
                 continue  # not one of ours, or damaged: train names it
             if form != fmt.json():
@@ -228,7 +285,9 @@ class RecordingSession(Observer):
         else:
             log.info(f"{words(verdict)}; {self._progress.line(labels.material, labels.position)}")
 
-    def _store(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> tuple[str, str]:
+    def _store(
+        self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
+    ) -> tuple[str, str]:
         """The outcome ("stored", "full" or "failed") and details for a person."""
         try:
             disk = os.statvfs(self._folder.folder)
@@ -243,7 +302,9 @@ class RecordingSession(Observer):
         self._stored.append((number, labels, verdict.status))
         self._count(labels, verdict.status)
         fault = f" {verdict.status}" if verdict.status.faulty else ""
-        return "stored", self._folder.path(number).stem + fault + " no material" * (not sweep.material)
+        return "stored", self._folder.path(number).stem + fault + " no material" * (
+            not sweep.material
+        )
 
     def _change(self, name: str, text: str) -> list[object]:
         """Set a label for sweeps that start from now on; returns the labels that then apply."""
@@ -254,11 +315,14 @@ class RecordingSession(Observer):
     def _next(self, _: str) -> list[object]:
         position = self._labels[-1][1].position
         if not position.isdecimal():
-            raise ApplianceError(f"position {position!r} has no next one; begin with PPLP POSITION 1")
+            raise ApplianceError(
+                f"position {position!r} has no next one; begin with PPLP POSITION 1"
+            )
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
     def _discard(self, which: str) -> list[object]:
-        """Remove the last stored sweep of this run; returns its number, how many are left, and its file name.
+        """Remove the last stored sweep of this run; returns its number, how many are left, and its
+        file name.
 
         which: its number, from who has seen it and means no later one; "" for whichever it is.
         """
@@ -266,11 +330,15 @@ class RecordingSession(Observer):
             raise ApplianceError("no sweep of this run is left to discard")
         number, labels, status = self._stored[-1]
         if which and which != str(number - self._folder.run):
-            raise ApplianceError(f"the last stored sweep is {number - self._folder.run}, not {which}; look at it first")
+            raise ApplianceError(
+                f"the last stored sweep is {number - self._folder.run}, not {which}; look at it first"
+            )
         try:
             self._folder.remove(number, reserve=True)
         except OSError as e:
-            raise ApplianceError(f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}") from e
+            raise ApplianceError(
+                f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}"
+            ) from e
         self._stored.pop()
         self._count(labels, status, -1)
         if self._last and self._last["sweep"] == number - self._folder.run:

@@ -1,6 +1,8 @@
-"""Answers sweeps that are recorded before there is a bundle. In: Sweeps, frames. Out: Verdicts without a label.
+"""Answers sweeps that are recorded before there is a bundle. In: Sweeps, frames. Out: Verdicts
+without a label.
 
-The status is `recorded`, or what a skin's counts alone show to be wrong: no contact, saturation, stuck and dead taxels.
+The status is `recorded`, or what a skin's counts alone show to be wrong: no contact, saturation,
+stuck and dead taxels.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat,
 from appliance.signal.unloaded import UnloadedTracker
 from appliance.signal.window_check import Finding, inspect_bare
 
-UNCHECKED = Finding(Status.RECORDED, "contact not checked: the skin was not both touched and let go so far")
+UNCHECKED = Finding(
+    Status.RECORDED, "contact not checked: the skin was not both touched and let go so far"
+)
 
 
 class SweepCheck(Observer):
-    """Checks each window against the unloaded skin, which it finds by itself; a TARE says where it is. model: "", since
-    there is none.
+    """Checks each window against the unloaded skin, which it finds by itself; a TARE says where it
+    is. model: "", since there is none.
     """
 
     model = ""
@@ -47,10 +51,20 @@ class SweepCheck(Observer):
             finding = self._checked(sweep.frames.taxels)
         now = self._clock.now_ns()
         return Verdict(
-            sweep=sweep.id, time_ns=now, status=finding.status, label="", probability=0.0, margin=0.0,
-            scores=np.empty(0), fused=0, lost=sweep.lost, latency_ns=now - sweep.complete_ns, bundle=self.model,
-            detail=finding.detail, share=sweep.share,
-        )  # fmt: skip
+            sweep=sweep.id,
+            time_ns=now,
+            status=finding.status,
+            label="",
+            probability=0.0,
+            margin=0.0,
+            scores=np.empty(0),
+            fused=0,
+            lost=sweep.lost,
+            latency_ns=now - sweep.complete_ns,
+            bundle=self.model,
+            detail=finding.detail,
+            share=sweep.share,
+        )
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):
@@ -59,9 +73,12 @@ class SweepCheck(Observer):
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 
     def about(self) -> dict[str, Any]:
-        """For sidecars: the unloaded skin as it was found, level and noise in counts; None where it was not certain."""
+        """For sidecars: the unloaded skin as it was found, level and noise in counts; None where it
+        was not certain."""
         found = self._unloaded.skin if self._unloaded.certain else None
-        return {"unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}}
+        return {
+            "unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}
+        }
 
     def tell(self) -> list[object]:
         """No bundle, and the format."""

@@ -1,8 +1,9 @@
-"""Cuts the window of each sweep from the stream of frames. In: Frames of the sensor, edges of the trigger. Out: one
-Sweep per trigger, with a complete window or a status that says why there is none; the open sweep so far, for early
-answers.
+"""Cuts the window of each sweep from the stream of frames. In: Frames of the sensor, edges of the
+trigger. Out: one Sweep per trigger, with a complete window or a status that says why there is none;
+the open sweep so far, for early answers.
 
-The window is the middle of the sweep (paper, sec. II.B): it is located by time and cut by sequence number.
+The window is the middle of the sweep (paper, sec. II.B): it is located by time and cut by sequence
+number.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from appliance.core.config import SweepConfig
 from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 
 MAX_GAP = 2
-"""Largest number of consecutive missing frames that are interpolated; with more the status is `gap`."""
+"""Largest number of consecutive missing frames that are interpolated; with more the status is
+`gap`."""
 
 
 @dataclass(slots=True)
 class _Open:
-    """A sweep between its edges. answered: it was answered already, and only its stop edge is still expected.
+    """A sweep between its edges. answered: it was answered already, and only its stop edge is still
+    expected.
 
-    first: number of the first frame for early answers, None until it has come. step: steps that `so_far` has returned.
+    first: number of the first frame for early answers, None until it has come. step: steps that
+    `so_far` has returned.
     """
 
     id: int
@@ -37,21 +41,28 @@ class _Open:
 
 
 class SweepCutter:
-    """Cuts windows: holds the frames of a little more than `max_duration_s`, and the sweeps that were not answered
-    yet."""
+    """Cuts windows: holds the frames of a little more than `max_duration_s`, and the sweeps that
+    were not answered yet."""
 
     def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
         self._format = fmt
         self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
-        self._size = fmt.window + 2 * MAX_GAP + int((config.max_duration_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
-        # slot = seq % size: a frame is found without searching and stays available until it is overwritten
+        self._size = (
+            fmt.window
+            + 2 * MAX_GAP
+            + int((config.max_duration_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
+        )
+        # slot = seq % size: a frame is found without searching and stays available until it is
+        # overwritten
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
         self._taxels = np.zeros((self._size, *fmt.shape), fmt.numpy_type)
         self._newest = -1
         self._open: _Open | None = None
-        self._closing: list[tuple[_Open, int]] = []  # (sweep, stop ns) whose window may still lack frames
+        self._closing: list[
+            tuple[_Open, int]
+        ] = []  # (sweep, stop ns) whose window may still lack frames
         self._done: list[Sweep] = []
         self._count = self._object = 0
 
@@ -61,7 +72,8 @@ class SweepCutter:
         return bool(self._closing) or (self._open is not None and not self._open.answered)
 
     def put(self, frames: Frames, now_ns: int) -> None:
-        """Put frames into the ring. Frames of a new enumeration end the open sweep, which began before it."""
+        """Put frames into the ring. Frames of a new enumeration end the open sweep, which began
+        before it."""
         if not len(frames):
             return
         if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
@@ -71,11 +83,16 @@ class SweepCutter:
         slots: slice | NDArray[np.int64] = slice(at, at + n)
         if at + n > self._size or frames.seq[-1] - frames.seq[0] != n - 1:
             slots = frames.seq % self._size
-        self._seq[slots], self._t_ns[slots], self._taxels[slots] = frames.seq, frames.t_ns, frames.taxels
+        self._seq[slots], self._t_ns[slots], self._taxels[slots] = (
+            frames.seq,
+            frames.t_ns,
+            frames.taxels,
+        )
         self._newest = int(frames.seq[-1])
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
-        """Process trigger edges of one turn in their order. ready: whether the box could take a sweep when they came."""
+        """Process trigger edges of one turn in their order. ready: whether the box could take a
+        sweep when they came."""
         before = self._count
         for edge in edges:
             if edge.kind is EdgeKind.START:
@@ -93,7 +110,8 @@ class SweepCutter:
         self._object += 1
 
     def interrupt(self, status: Status, now_ns: int) -> bool:
-        """Answer all unanswered sweeps with `status`; False if there was none. A later stop edge gives no answer."""
+        """Answer all unanswered sweeps with `status`; False if there was none. A later stop edge
+        gives no answer."""
         had = self.sweeping
         if self._open and not self._open.answered:
             self._answer(self._open, now_ns, status, now_ns)
@@ -104,7 +122,11 @@ class SweepCutter:
 
     def finished(self, now_ns: int) -> list[Sweep]:
         """The sweeps that can be answered at `now_ns`, in the order of their numbers."""
-        if self._open and not self._open.answered and now_ns - self._open.start_ns > self._max_duration_ns:
+        if (
+            self._open
+            and not self._open.answered
+            and now_ns - self._open.start_ns > self._max_duration_ns
+        ):
             self._answer(self._open, now_ns, Status.LONG, now_ns)
         waiting = []
         for item in self._closing:
@@ -118,11 +140,13 @@ class SweepCutter:
         return sorted(done, key=lambda s: s.id)
 
     def so_far(self, steps: int, now_ns: int) -> Iterator[Sweep]:
-        """The open sweep at each step that was reached since the last call, until `settle` marks it as answered.
+        """The open sweep at each step that was reached since the last call, until `settle` marks it
+        as answered.
 
-        steps: D; step d = 1..D is reached with frame ceil(d * window / (D + 1)) of the window that begins `lead_ms`
-        after the start edge, and gives a Sweep of exactly these frames, however they were grouped in transfers. After a
-        gap that cannot be filled no further steps are returned.
+        steps: D; step d = 1..D is reached with frame ceil(d * window / (D + 1)) of the window that
+        begins `lead_ms` after the start edge, and gives a Sweep of exactly these frames, however
+        they were grouped in transfers. After a gap that cannot be filled no further steps are
+        returned.
         """
         sweep = self._open
         while sweep and not sweep.answered and not self._closing and sweep.step < steps:
@@ -138,9 +162,16 @@ class SweepCutter:
             frames, lost = self._window(sweep.first, n)
             if len(frames):
                 yield Sweep(
-                    sweep.id, sweep.start_ns, int(frames.t_ns[-1]), Status.OK, frames, lost, now_ns, sweep.object,
+                    sweep.id,
+                    sweep.start_ns,
+                    int(frames.t_ns[-1]),
+                    Status.OK,
+                    frames,
+                    lost,
+                    now_ns,
+                    sweep.object,
                     share=sweep.step / (steps + 1),
-                )  # fmt: skip
+                )
 
     def settle(self) -> None:
         """Mark the open sweep as answered early; its stop edge then gives no answer."""
@@ -148,10 +179,15 @@ class SweepCutter:
             self._open.answered = True
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if some of them are missing."""
+        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if some
+        of them are missing."""
         window = np.arange(self._newest - n + 1, self._newest + 1)
         slots = window % self._size
-        return self._taxels[slots] if self._newest >= 0 and (self._seq[slots] == window).all() else None
+        return (
+            self._taxels[slots]
+            if self._newest >= 0 and (self._seq[slots] == window).all()
+            else None
+        )
 
     def _begin(self, t_ns: int) -> _Open:
         self._count += 1
@@ -181,7 +217,9 @@ class SweepCutter:
         """Finish a sweep with a status and without frames."""
         sweep.answered = True
         none = Frames.empty(self._format)
-        self._done.append(Sweep(sweep.id, sweep.start_ns, stop_ns, status, none, 0, now_ns, sweep.object))
+        self._done.append(
+            Sweep(sweep.id, sweep.start_ns, stop_ns, status, none, 0, now_ns, sweep.object)
+        )
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while frames of it may still come."""
@@ -195,8 +233,8 @@ class SweepCutter:
         return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
 
     def _window(self, first: int, n: int) -> tuple[Frames, int]:
-        """Frames `first` to `first + n`, missing ones interpolated, and their number; no frames if a gap is too
-        wide."""
+        """Frames `first` to `first + n`, missing ones interpolated, and their number; no frames if
+        a gap is too wide."""
         pad = MAX_GAP
         seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
@@ -207,13 +245,15 @@ class SweepCutter:
         return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
 
     def _seq_at(self, t_ns: float) -> int:
-        """Number of the frame that was taken nearest to `t_ns`, computed from the nearest frame in the ring."""
+        """Number of the frame that was taken nearest to `t_ns`, computed from the nearest frame in
+        the ring."""
         k = int(np.abs(self._t_ns - round(t_ns)).argmin())
         return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
 
 
 def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
-    """Interpolate the rows `missing` of `frames` in place from their neighbours in `have`; False if a gap is too wide.
+    """Interpolate the rows `missing` of `frames` in place from their neighbours in `have`; False if
+    a gap is too wide.
 
     have, missing: int64, sorted row indices.
     """

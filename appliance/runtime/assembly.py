@@ -1,4 +1,5 @@
-"""How a box is put together. In: settings, a bundle or none, devices. Out: a Box; the simulator is not known here."""
+"""How a box is put together. In: settings, a bundle or none, devices. Out: a Box; the simulator is
+not known here."""
 
 from __future__ import annotations
 
@@ -39,17 +40,22 @@ from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Answerer, Box, CommandHandler, Pipeline
 
-UNSIGNED = (
-    "bundles are allowed: classifier.allow_unsigned = true; take it out of the settings once the bundle is signed"
-)
+UNSIGNED = "bundles are allowed: classifier.allow_unsigned = true; take it out of the settings once the bundle is signed"
 """What is told with "unsigned" before it while that setting is on."""
 NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
 
 
 def box(
-    settings: Config, bundle: Bundle, devices: Devices, port: Port | None, stack: ExitStack, *,
-    capture: CaptureWriter | None = None, observers: Iterable[Observer] = (), labels: tuple[str, ...] = (),
-) -> Box:  # fmt: skip
+    settings: Config,
+    bundle: Bundle,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    *,
+    capture: CaptureWriter | None = None,
+    observers: Iterable[Observer] = (),
+    labels: tuple[str, ...] = (),
+) -> Box:
     """The box that classifies; `stack` closes it again.
 
     capture: of all that comes in. labels: what the class bits must hold beside the bundle's labels.
@@ -57,28 +63,62 @@ def box(
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
     return _assembled(
-        devices.wire(settings), run, devices, port, stack, capture, observers, NO_COMMANDS,
-        codes=(*bundle.manifest.labels, *labels), early=early_exit(settings, run),
-    )  # fmt: skip
+        devices.wire(settings),
+        run,
+        devices,
+        port,
+        stack,
+        capture,
+        observers,
+        NO_COMMANDS,
+        codes=(*bundle.manifest.labels, *labels),
+        early=early_exit(settings, run),
+    )
 
 
 def recorder(
-    settings: Config, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack, *,
-    capture: CaptureWriter | None = None, observers: Iterable[Observer] = (),
-    commands: Mapping[str, CommandHandler] = NO_COMMANDS, ordered: bool = False,
-) -> Box:  # fmt: skip
-    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. ordered: commands come from elsewhere
-    than the port, too. Other parameters as for `box`."""
+    settings: Config,
+    fmt: SweepFormat,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    *,
+    capture: CaptureWriter | None = None,
+    observers: Iterable[Observer] = (),
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+    ordered: bool = False,
+) -> Box:
+    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. ordered:
+    commands come from elsewhere than the port, too. Other parameters as for `box`."""
     check = SweepCheck(fmt, devices.clock)
     watching = [check, *observers]
-    return _assembled(devices.wire(settings), check, devices, port, stack, capture, watching, commands, ordered=ordered)
+    return _assembled(
+        devices.wire(settings),
+        check,
+        devices,
+        port,
+        stack,
+        capture,
+        watching,
+        commands,
+        ordered=ordered,
+    )
 
 
 def _assembled(
-    settings: Config, answerer: Answerer, devices: Devices, port: Port | None, stack: ExitStack,
-    capture: CaptureWriter | None, observers: Iterable[Observer], commands: Mapping[str, CommandHandler], *,
-    codes: tuple[str, ...] = (), early: Decider | None = None, ordered: bool = False,
-) -> Box:  # fmt: skip
+    settings: Config,
+    answerer: Answerer,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    capture: CaptureWriter | None,
+    observers: Iterable[Observer],
+    commands: Mapping[str, CommandHandler],
+    *,
+    codes: tuple[str, ...] = (),
+    early: Decider | None = None,
+    ordered: bool = False,
+) -> Box:
     """Put the components together. codes: labels that the class bits hold."""
     watching = [*observers, *([capture] if capture else [])]
     commands = {**commands, "LABEL": partial(_label, codes)}
@@ -98,15 +138,28 @@ def _assembled(
         watching.append(LineSink(lines, codes))
     cutter = SweepCutter(answerer.format, settings.sweep)
     return Box(
-        Pipeline(sensor, trigger, cutter, answerer, early), devices.clock, port=port, panel=lines,
-        observers=watching, commands=commands, source=devices.source, state_s=settings.serial.state_s,
-    )  # fmt: skip
+        Pipeline(sensor, trigger, cutter, answerer, early),
+        devices.clock,
+        port=port,
+        panel=lines,
+        observers=watching,
+        commands=commands,
+        source=devices.source,
+        state_s=settings.serial.state_s,
+    )
 
 
 def _trigger(
-    config: TriggerConfig, fmt: SweepFormat, devices: Devices, port: Port | None, stack: ExitStack, *, ordered: bool
+    config: TriggerConfig,
+    fmt: SweepFormat,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    *,
+    ordered: bool,
 ) -> Trigger:
-    """What starts and stops sweeps. Raises ConfigError where the settings leave nothing that could."""
+    """What starts and stops sweeps. Raises ConfigError where the settings leave nothing that
+    could."""
     if config.mode == "serial":
         if not ordered and (port is None or isinstance(port, StdoutPort)):
             raise ConfigError(
@@ -134,7 +187,8 @@ def _trigger(
 
 
 def _label(labels: tuple[str, ...], code: str) -> list[object]:
-    """The label with this code on the class bits, and the number of labels. Raises FormatError if there is none."""
+    """The label with this code on the class bits, and the number of labels. Raises FormatError if
+    there is none."""
     if not labels:
         raise FormatError("sweeps are recorded without a bundle, so there are no labels")
     if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
@@ -171,7 +225,8 @@ def early_exit(settings: Config, run: Classifier) -> Decider | None:
 
 
 def prove(settings: Config, bundle: Bundle) -> None:
-    """Raises BundleError or ConfigError where this machine, set as it is, does not run a bundle as it should."""
+    """Raises BundleError or ConfigError where this machine, set as it is, does not run a bundle as
+    it should."""
     run = classifier(settings, bundle, SystemClock())
     run.self_test()
     early_exit(settings, run)
@@ -187,8 +242,8 @@ def store(settings: Config) -> Store:
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:
     """The bundle that the settings ask for: the one named, the one deployed, or the packaged one.
 
-    answers: whether a robot gets what it says. Then it has to be signed, unless classifier.allow_unsigned is set. Raises
-    BundleError or ConfigError.
+    answers: whether a robot gets what it says. Then it has to be signed, unless
+    classifier.allow_unsigned is set. Raises BundleError or ConfigError.
     """
     name = settings.classifier.bundle
     return named(settings, Path(name), answers=answers) if name else store(settings).running()
@@ -202,11 +257,14 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
     try:
         return store(settings).bundles.read(folder)
     except ApplianceError as e:
-        raise type(e)(f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true") from e
+        raise type(e)(
+            f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
+        ) from e
 
 
 def port(settings: Config, devices: Devices) -> Port | None:
-    """The serial line, or standard output where none is configured; not into the journal, which a person reads."""
+    """The serial line, or standard output where none is configured; not into the journal, which a
+    person reads."""
     if settings.serial.port:
         return SerialSink(settings.serial, devices.clock, devices.source)
     return None if in_journal() else StdoutPort(devices.source)

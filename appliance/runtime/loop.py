@@ -1,6 +1,8 @@
-"""The loop of the box: one thread. In: frames, edges, commands. Out: a verdict for every trigger, states, answers.
+"""The loop of the box: one thread. In: frames, edges, commands. Out: a verdict for every trigger,
+states, answers.
 
-Which devices these come from is decided elsewhere (assembly); nothing here knows whether they are real.
+Which devices these come from is decided elsewhere (assembly); nothing here knows whether they are
+real.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ TARE_S = 0.5
 """How much of the latest signal a tare averages."""
 
 CommandHandler = Callable[[str], list[object]]
-"""Carries out a command: its text -> the fields of its answer. What it raises as ApplianceError is the answer."""
+"""Carries out a command: its text -> the fields of its answer. What it raises as ApplianceError is
+the answer."""
 
 
 class Panel(Protocol):
@@ -41,7 +44,8 @@ class Panel(Protocol):
 
 
 class Answerer(Protocol):
-    """Gives each sweep its verdict: the classifier, or while sweeps are only recorded what checks them."""
+    """Gives each sweep its verdict: the classifier, or while sweeps are only recorded what checks
+    them."""
 
     @property
     def format(self) -> SweepFormat:
@@ -76,7 +80,8 @@ class Answerer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """What a sweep passes on its way to a verdict. early: answers sweeps that still go on, or None."""
+    """What a sweep passes on its way to a verdict. early: answers sweeps that still go on, or
+    None."""
 
     sensor: Sensor
     trigger: Trigger
@@ -86,20 +91,33 @@ class Pipeline:
 
 
 class Box:
-    """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer, listen.
+    """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer,
+    listen.
 
-    port: where verdicts and state sentences go and commands come from, or None. panel: READY, BUSY, FAULT, DECIDED, or
-    None. observers: called in this order, after the port. commands: further commands by name. source: where the frames
-    come from, as sentences name it. state_s: time between two state sentences.
+    port: where verdicts and state sentences go and commands come from, or None. panel: READY, BUSY,
+    FAULT, DECIDED, or None. observers: called in this order, after the port. commands: further
+    commands by name. source: where the frames come from, as sentences name it. state_s: time
+    between two state sentences.
     """
 
     def __init__(
-        self, pipeline: Pipeline, clock: Clock, *, port: Port | None = None, panel: Panel | None = None,
-        observers: Sequence[Observer] = (), commands: Mapping[str, CommandHandler] = MappingProxyType({}),
-        source: str = "usb", state_s: float = 1.0,
-    ) -> None:  # fmt: skip
+        self,
+        pipeline: Pipeline,
+        clock: Clock,
+        *,
+        port: Port | None = None,
+        panel: Panel | None = None,
+        observers: Sequence[Observer] = (),
+        commands: Mapping[str, CommandHandler] = MappingProxyType({}),
+        source: str = "usb",
+        state_s: float = 1.0,
+    ) -> None:
         self.answered = 0
-        self._sensor, self._trigger, self._cutter = pipeline.sensor, pipeline.trigger, pipeline.cutter
+        self._sensor, self._trigger, self._cutter = (
+            pipeline.sensor,
+            pipeline.trigger,
+            pipeline.cutter,
+        )
         self._answerer, self._early = pipeline.answerer, pipeline.early
         self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
         self._source, self._state_ns = source, round(state_s * 1e9)
@@ -107,14 +125,20 @@ class Box:
         self._on_frames = [o.frames for o in observers if type(o).frames is not Observer.frames]
         self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
         self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
-        self._on_answered = [o.answered for o in observers if type(o).answered is not Observer.answered]
+        self._on_answered = [
+            o.answered for o in observers if type(o).answered is not Observer.answered
+        ]
         self._on_sweep = [o.sweep for o in observers if type(o).sweep is not Observer.sweep]
         self._on_turn = [o.turn for o in observers if type(o).turn is not Observer.turn]
-        self._on_stopping = [o.stopping for o in observers if type(o).stopping is not Observer.stopping]
+        self._on_stopping = [
+            o.stopping for o in observers if type(o).stopping is not Observer.stopping
+        ]
         self._decided = False
         self._next_state_ns = self._turn_ns = clock.now_ns()
         self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
-        self._port_log = TroubleLog("serial", end=f"serial: {port.name} open" if port else "", known=False)
+        self._port_log = TroubleLog(
+            "serial", end=f"serial: {port.name} open" if port else "", known=False
+        )
 
     @property
     def counters(self) -> SensorCounters:
@@ -175,7 +199,9 @@ class Box:
         sweeping, able = self._cutter.sweeping, self._able
         self._decided = self._decided and not sweeping
         if self._panel:
-            self._panel.show(ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided)
+            self._panel.show(
+                ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided
+            )
 
     def _decide(self, now_ns: int) -> list[Verdict]:
         """Answer the open sweep early, where that is wanted and possible."""
@@ -199,7 +225,8 @@ class Box:
         return verdicts
 
     def _pass_on(self, sweeps: Sequence[Sweep], verdicts: Sequence[Verdict]) -> None:
-        """Give answered sweeps to whoever keeps them: a disk takes its time, so after all answers."""
+        """Give answered sweeps to whoever keeps them: a disk takes its time, so after all
+        answers."""
         if not (sweeps and self._on_sweep):
             return
         circumstances = self.circumstances()
@@ -231,21 +258,36 @@ class Box:
         """The state now."""
         sensor, counters, edges = self._sensor, self._sensor.counters, self._trigger.edge_counters
         return Health(
-            time_ns=self._clock.now_ns(), skin=sensor.state, trouble=str(sensor.trouble or ""),
-            streams=sensor.state == "streaming" and counters.frames > 0, sweeping=self._cutter.sweeping,
-            answered=self.answered, frames=counters.frames, lost_frames=counters.lost_frames,
-            garbage_bytes=counters.garbage_bytes, enumerations=counters.enumerations,
-            dropped=self._port.dropped if self._port else 0, bundle=self._answerer.model, source=self._source,
-            stale_frames=counters.stale_frames, overflows=counters.overflows, fifo_overflows=counters.fifo_overflows,
-            glitches=edges.glitches, lost_edges=edges.lost_edges, storms=edges.storms,
-            loss_known=sensor.loss_known, ready=self._able and not self._cutter.sweeping,
-        )  # fmt: skip
+            time_ns=self._clock.now_ns(),
+            skin=sensor.state,
+            trouble=str(sensor.trouble or ""),
+            streams=sensor.state == "streaming" and counters.frames > 0,
+            sweeping=self._cutter.sweeping,
+            answered=self.answered,
+            frames=counters.frames,
+            lost_frames=counters.lost_frames,
+            garbage_bytes=counters.garbage_bytes,
+            enumerations=counters.enumerations,
+            dropped=self._port.dropped if self._port else 0,
+            bundle=self._answerer.model,
+            source=self._source,
+            stale_frames=counters.stale_frames,
+            overflows=counters.overflows,
+            fifo_overflows=counters.fifo_overflows,
+            glitches=edges.glitches,
+            lost_edges=edges.lost_edges,
+            storms=edges.storms,
+            loss_known=sensor.loss_known,
+            ready=self._able and not self._cutter.sweeping,
+        )
 
     def circumstances(self) -> dict[str, Any]:
-        """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for JSON.
+        """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for
+        JSON.
 
-        device: the board's name, serial number and firmware, None before it was asked. clock: see DeviceClock.quality.
-        trigger: see Trigger.about. loss_known: whether lost frames can be seen at all.
+        device: the board's name, serial number and firmware, None before it was asked. clock: see
+        DeviceClock.quality. trigger: see Trigger.about. loss_known: whether lost frames can be seen
+        at all.
         """
         who = self._sensor.identity
         return {
@@ -261,10 +303,25 @@ class Box:
         """Fields of the STA sentence (PROTOCOL.md, part 2)."""
         h = self.health
         return [
-            f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), h.answered, h.frames, h.lost_frames, h.garbage_bytes,
-            h.enumerations, h.dropped, h.bundle, h.source, h.stale_frames, h.overflows, h.fifo_overflows, h.glitches,
-            h.lost_edges, h.storms, *([] if h.loss_known else [1]),
-        ]  # fmt: skip
+            f"{h.time_ns / 1e9:.3f}",
+            h.skin,
+            int(h.sweeping),
+            h.answered,
+            h.frames,
+            h.lost_frames,
+            h.garbage_bytes,
+            h.enumerations,
+            h.dropped,
+            h.bundle,
+            h.source,
+            h.stale_frames,
+            h.overflows,
+            h.fifo_overflows,
+            h.glitches,
+            h.lost_edges,
+            h.storms,
+            *([] if h.loss_known else [1]),
+        ]
 
     def _answer_to(self, command: Command) -> bytes:
         """Carry out a command; its ANS sentence."""
@@ -276,8 +333,9 @@ class Box:
             return sentence("ANS", command.name, "error", e)
 
     def obey(self, command: Command) -> list[object]:
-        """Carry out a command, wherever it comes from; the fields of its answer. Only between two turns or in an observer's
-        `turn`. Raises ApplianceError with the reason where it is refused."""
+        """Carry out a command, wherever it comes from; the fields of its answer. Only between two
+        turns or in an observer's `turn`. Raises ApplianceError with the reason where it is
+        refused."""
         for note in self._on_command:
             note(self._turn_ns, command.line)
         if command.name in self._commands:
@@ -300,7 +358,9 @@ class Box:
         """Take the mean of the latest signal as the unloaded skin."""
         frames = self._cutter.latest(max(1, round(TARE_S * self.format.rate_hz)))
         if frames is None or self._cutter.sweeping or self._sensor.state != "streaming":
-            raise ApplianceError(f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again")
+            raise ApplianceError(
+                f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again"
+            )
         return [self._answerer.set_tare(frames)]
 
     def _new_object(self) -> list[object]:

@@ -1,7 +1,8 @@
-"""Judges recorded data again. In: a capture, a kept sweep, a folder of these. Out: their sentences, and whether they differ.
+"""Judges recorded data again. In: a capture, a kept sweep, a folder of these. Out: their sentences,
+and whether they differ.
 
-A kept sweep is judged as it was: by the same rule, with the same tare, after the same sweeps of its object, at the same
-time. So its verdict must be that of its sidecar, bit for bit.
+A kept sweep is judged as it was: by the same rule, with the same tare, after the same sweeps of its
+object, at the same time. So its verdict must be that of its sidecar, bit for bit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
-"""SAME: the verdict, bit for bit. ALONE: the scores of this sweep, but earlier sweeps of its object are missing."""
+"""SAME: the verdict, bit for bit. ALONE: the scores of this sweep, but earlier sweeps of its object
+are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
 FUSIONS = get_args(get_type_hints(ClassifierConfig)["fuse"])
 
@@ -39,10 +41,11 @@ class OtherBundle(FormatError):
 
 
 def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], object]) -> int:
-    """Replay the file or folder at `path`: its sentences, and for each kept sweep whether the verdict is the same.
+    """Replay the file or folder at `path`: its sentences, and for each kept sweep whether the
+    verdict is the same.
 
-    out: takes each line. Returns 1 where a verdict differs, else 0. Raises FormatError where the file is not readable,
-    of another format or of another bundle.
+    out: takes each line. Returns 1 where a verdict differs, else 0. Raises FormatError where the
+    file is not readable, of another format or of another bundle.
     """
     if path.is_dir():
         return _folder(path, Judge(settings, bundle), out)
@@ -56,7 +59,8 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """The rule by which a classifier turns probabilities into answers. Its fields are the keys of sidecars."""
+    """The rule by which a classifier turns probabilities into answers. Its fields are the keys of
+    sidecars."""
 
     how: str
     sure: float
@@ -71,8 +75,9 @@ class ReplayRule:
 class KeptSweep:
     """A kept sweep with the content of its sidecar; older sidecars hold less.
 
-    object: the folder, run and object number that fused sweeps share. rule: None where the sidecar has none. tare:
-    [R, C] or [R, C, A] raw counts, None where the sidecar has none. bundle: its id, or "". verdict: as `Verdict.as_dict` gives it, or empty.
+    object: the folder, run and object number that fused sweeps share. rule: None where the sidecar
+    has none. tare: [R, C] or [R, C, A] raw counts, None where the sidecar has none. bundle: its id,
+    or "". verdict: as `Verdict.as_dict` gives it, or empty.
     """
 
     sweep: Sweep
@@ -89,7 +94,11 @@ class KeptSweep:
         sweep, fmt = load(path)
         about = sidecar(path)
         try:
-            tare = np.broadcast_to(np.asarray(about["tare"], np.float64), fmt.shape) if "tare" in about else None
+            tare = (
+                np.broadcast_to(np.asarray(about["tare"], np.float64), fmt.shape)
+                if "tare" in about
+                else None
+            )
             rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
@@ -97,7 +106,9 @@ class KeptSweep:
                 raise TypeError("the verdict's fused and time_ns must be whole numbers")
             return cls(sweep, fmt, touched, rule, tare, about.get("bundle", ""), verdict)
         except (TypeError, ValueError) as e:
-            raise FormatError(f"{path}: its sidecar cannot be used: {e}; take one that was not changed") from e
+            raise FormatError(
+                f"{path}: its sidecar cannot be used: {e}; take one that was not changed"
+            ) from e
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +121,8 @@ class ReplayResult:
 
 
 class ReplayClock:
-    """A clock that stands still until it is set: a verdict is given again at the time at which it was given."""
+    """A clock that stands still until it is set: a verdict is given again at the time at which it
+    was given."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -124,17 +136,21 @@ class ReplayClock:
 
 
 class Judge:
-    """Judges kept sweeps again, in their order. Holds the fused probabilities of the object so far."""
+    """Judges kept sweeps again, in their order. Holds the fused probabilities of the object so
+    far."""
 
     def __init__(self, settings: Config, bundle: Bundle) -> None:
         self._settings, self._bundle = settings, bundle
         self._clock = ReplayClock()
         self._classifier: Classifier | None = None
         self._made: object = None  # what the classifier was made for
-        self._last: object = None  # (object, sweeps fused) of the last sweep with all earlier ones of its object
+        self._last: object = (
+            None  # (object, sweeps fused) of the last sweep with all earlier ones of its object
+        )
 
     def __call__(self, kept: KeptSweep) -> ReplayResult:
-        """The verdict on `kept`, compared with that of its sidecar. Raises FormatError where it is not of the bundle."""
+        """The verdict on `kept`, compared with that of its sidecar. Raises FormatError where it is
+        not of the bundle."""
         if kept.bundle not in ("", self._bundle.id):
             raise OtherBundle(
                 f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is {self._bundle.id}; "
@@ -153,13 +169,19 @@ class Judge:
         if not whole:
             own = verdict.own if verdict else Decider(classifier).scores(sweep)[-1]
             same = own.tolist() == was.get("own")
-            return ReplayResult(verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there")
+            return ReplayResult(
+                verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there"
+            )
         if verdict is None:
-            return ReplayResult(verdict, DIFFERENT, "it was answered early, which this bundle does not do")
+            return ReplayResult(
+                verdict, DIFFERENT, "it was answered early, which this bundle does not do"
+            )
         if not (was and kept.bundle):  # recorded without a bundle
             return ReplayResult(verdict, SILENT)
         now = verdict.as_dict()
-        changed = [_change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)]
+        changed = [
+            _change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)
+        ]
         return ReplayResult(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
 
     def _prepared(self, kept: KeptSweep) -> Classifier:
@@ -188,11 +210,14 @@ def _print(path: Path, judged: ReplayResult, out: Callable[[str], object]) -> st
 
 
 def _folder(folder: Path, judge: Judge, out: Callable[[str], object]) -> int:
-    """Replay all kept sweeps in `folder` and below; one of another bundle is named, but counts as no difference."""
+    """Replay all kept sweeps in `folder` and below; one of another bundle is named, but counts as
+    no difference."""
     outcomes: Counter[str] = Counter()
     paths = sorted(folder.rglob("*.npy"), key=_order)
     if not paths:
-        raise FormatError(f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black box")
+        raise FormatError(
+            f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black box"
+        )
     for path in paths:
         try:
             judged = judge(KeptSweep.read(path))
@@ -208,10 +233,13 @@ def _order(path: Path) -> tuple[Path, int, str]:
 
 
 def _with_earlier(path: Path) -> list[KeptSweep]:
-    """The sweep at `path`, after the earlier sweeps of its object in the same folder. Raises FormatError."""
+    """The sweep at `path`, after the earlier sweeps of its object in the same folder. Raises
+    FormatError."""
     found = [KeptSweep.read(path)]
     if found[0].sweep.object:
-        for earlier in sorted((p for p in path.parent.glob("*.npy") if _order(p) < _order(path)), key=_order)[::-1]:
+        for earlier in sorted(
+            (p for p in path.parent.glob("*.npy") if _order(p) < _order(path)), key=_order
+        )[::-1]:
             kept = KeptSweep.read(earlier)
             if kept.object != found[0].object:
                 break
@@ -228,7 +256,9 @@ def _check(what: str, fmt: SweepFormat, bundle: Bundle) -> None:
 
 def _check_length(sweep: Sweep, fmt: SweepFormat) -> None:
     n = len(sweep.frames)
-    if sweep.status is Status.OK and not (n == fmt.window if sweep.share == 1 else 0 < n < fmt.window):
+    if sweep.status is Status.OK and not (
+        n == fmt.window if sweep.share == 1 else 0 < n < fmt.window
+    ):
         raise FormatError(
             f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {fmt}; take one that was not changed"
         )

@@ -1,6 +1,7 @@
 """The self-test behind `palpate check`: bundle, golden sweeps, lines, skin, port, each by itself.
 
-In: the settings and the devices. Out: one result for each component, with its trouble where it has one.
+In: the settings and the devices. Out: one result for each component, with its trouble where it has
+one.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from appliance.runtime.assembly import UNSIGNED, gpio
 LISTEN_S = 1.0
 """How long frames of the skin are counted."""
 MOST_READING = 0.5
-"""Share of a core that reading a skin may take: the loop has one, and answers, recordings and readers of the feed need the rest."""
+"""Share of a core that reading a skin may take: the loop has one, and answers, recordings and
+readers of the feed need the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +41,13 @@ class CheckResult:
 
 
 def check(
-    settings: Config, load: Callable[[], Bundle], devices: Devices, spent_ns: Callable[[], int] = time.thread_time_ns
+    settings: Config,
+    load: Callable[[], Bundle],
+    devices: Devices,
+    spent_ns: Callable[[], int] = time.thread_time_ns,
 ) -> Iterator[CheckResult]:
-    """Check one component after another; the check goes on after one that fails. The skin needs no bundle.
+    """Check one component after another; the check goes on after one that fails. The skin needs no
+    bundle.
 
     spent_ns: processor time that this thread has taken so far.
     """
@@ -50,7 +56,9 @@ def check(
     def bundle() -> str:
         loaded.append(load())
         m = loaded[0].manifest
-        enrolled = "".join(f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items())
+        enrolled = "".join(
+            f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items()
+        )
         return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}"
 
     def golden() -> str:
@@ -65,7 +73,9 @@ def check(
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
-    yield _try("skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns))
+    yield _try(
+        "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
+    )
     yield from _triggered(settings, devices)
     if settings.serial.port:
         yield _try("serial port", lambda: _port(settings, devices))
@@ -78,7 +88,9 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
         return CheckResult(component, False, str(e))
 
 
-def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]) -> str:
+def _skin(
+    settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]
+) -> str:
     """What the skin is, sends and costs. wanted: by the bundle.
 
     Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
@@ -94,8 +106,11 @@ def _skin(settings: Config, wanted: SweepFormat | None, devices: Devices, spent_
     return f"{sends}; warning: {slow}" if slow else sends
 
 
-def _listened(settings: Config, fmt: SweepFormat, devices: Devices, spent_ns: Callable[[], int]) -> str:
-    """What comes from the skin, and what reading it takes of a core once it streams: imports and asking it take longer."""
+def _listened(
+    settings: Config, fmt: SweepFormat, devices: Devices, spent_ns: Callable[[], int]
+) -> str:
+    """What comes from the skin, and what reading it takes of a core once it streams: imports and
+    asking it take longer."""
     sensor = skins.sensor(settings, fmt, devices)
     now_ns = devices.clock.now_ns
     until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
@@ -106,15 +121,19 @@ def _listened(settings: Config, fmt: SweepFormat, devices: Devices, spent_ns: Ca
                 streams = now_ns(), spent_ns()
         share = (spent_ns() - streams[1]) / max(now_ns() - streams[0], 1)
         if sensor.trouble or not sensor.counters.frames:
-            raise sensor.trouble or SensorError(f"the skin sent no frame within {LISTEN_S} s; replug it")
+            raise sensor.trouble or SensorError(
+                f"the skin sent no frame within {LISTEN_S} s; replug it"
+            )
         who = sensor.identity
         counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
         form = f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
-        lost = f"{counters.lost_frames} lost" if sensor.loss_known else "whether frames were lost cannot be seen"
-        sends = (
-            f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}, {100 * share:.1f} % of a core"
+        lost = (
+            f"{counters.lost_frames} lost"
+            if sensor.loss_known
+            else "whether frames were lost cannot be seen"
         )
+        sends = f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}, {100 * share:.1f} % of a core"
         if share > MOST_READING:
             raise SensorError(
                 f"{sends}: {MOST_READING:.0%} at most leave room for answers, recordings and readers; use a faster board, or "
@@ -137,9 +156,14 @@ def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
 
 def _lines(settings: Config, devices: Devices) -> str:
     module = gpio(devices)
-    with GpioTrigger(settings.trigger, module), Lines(settings.output, module, devices.clock) as lines:
+    with (
+        GpioTrigger(settings.trigger, module),
+        Lines(settings.output, module, devices.clock) as lines,
+    ):
         codes = lines.capacity
-    inputs = [n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n]
+    inputs = [
+        n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n
+    ]
     return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
 
 

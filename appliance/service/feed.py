@@ -1,9 +1,10 @@
-"""The feed: what the box does, for programs that watch it. In: health, verdicts, frames, readers' requests. Out: JSON
-lines on a local socket (PROTOCOL.md, part 4).
+"""The feed: what the box does, for programs that watch it. In: health, verdicts, frames, readers'
+requests. Out: JSON lines on a local socket (PROTOCOL.md, part 4).
 
-Nothing here waits for a reader: what one does not take in time is dropped and counted. Every PERIOD_NS a bounded part of
-the work is done, and after a costly one more time passes, so that readers take no more than SHARE of a core whatever they
-do: many of them, or bad ones, get their lines later, and the loop is none the slower.
+Nothing here waits for a reader: what one does not take in time is dropped and counted. Every
+PERIOD_NS a bounded part of the work is done, and after a costly one more time passes, so that
+readers take no more than SHARE of a core whatever they do: many of them, or bad ones, get their
+lines later, and the loop is none the slower.
 """
 
 from __future__ import annotations
@@ -38,9 +39,11 @@ MOST_READERS = 64
 QUEUE_BYTES = 64 * 1024
 """What waits for one reader; lines that several readers wait for are held once."""
 SWEEP_BYTES = 640 * 1024
-"""Most of a line with a window. Of those that are larger than a queue there is one at a time, held once for all readers."""
+"""Most of a line with a window. Of those that are larger than a queue there is one at a time, held
+once for all readers."""
 TAKE_NS = 5_000_000_000
-"""When the next of these comes, a reader that has not taken the last one within this time is closed."""
+"""When the next of these comes, a reader that has not taken the last one within this time is
+closed."""
 HEAD_BYTES = 512
 """At most what stands beside the data in a line with a window."""
 MOST_REQUEST = 1024
@@ -48,11 +51,14 @@ MOST_REQUEST = 1024
 MOST_HZ = 20.0
 """Frames a second that a reader may ask for."""
 MOST_VALUES_S = 10_000
-"""Raw counts a second that are written as text: of a large skin fewer frames a second are offered."""
+"""Raw counts a second that are written as text: of a large skin fewer frames a second are
+offered."""
 PERIOD_NS = 30_000_000
-"""Time between two looks at the sockets; system calls in every turn of the loop would cost more than all that is sent."""
+"""Time between two looks at the sockets; system calls in every turn of the loop would cost more
+than all that is sent."""
 SHARE = 0.004
-"""Most of a core that the looks at the sockets may take; waking the caches for them costs about as much again."""
+"""Most of a core that the looks at the sockets may take; waking the caches for them costs about as
+much again."""
 MOST_PERIOD_NS = 250_000_000
 """One costly look, as when the machine is busy, holds up the next by no more than this."""
 SOON_NS = 5_000_000
@@ -60,7 +66,8 @@ SOON_NS = 5_000_000
 SERVED, HEARD, HEARD_BYTES = 16, 2, 64
 """Readers that are written to, and sockets and bytes that are read, at one look."""
 KERNEL_BYTES = 16 * 1024
-"""What the kernel may hold for a reader; it doubles this. Its default would come to 13 MB with 64 readers."""
+"""What the kernel may hold for a reader; it doubles this. Its default would come to 13 MB with 64
+readers."""
 STATE = ("skin", "trouble", "sweeping", "ready")
 HEALTH_NS = 1_000_000_000
 RETRY_NS = 5_000_000_000
@@ -71,7 +78,8 @@ _PARTS = 64
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a reader asks for. frames_hz: frames a second, 0 for none. sweeps: windows of cut sweeps. None: as before."""
+    """What a reader asks for. frames_hz: frames a second, 0 for none. sweeps: windows of cut
+    sweeps. None: as before."""
 
     frames_hz: float | None = None
     sweeps: bool | None = None
@@ -125,8 +133,15 @@ def encode(kind: str, content: Mapping[str, Any]) -> bytes:
 def _sweep_line(sweep: Sweep) -> bytes:
     """The line with a sweep's window; its data are copied as few times as possible."""
     taxels = sweep.frames.taxels
-    about = {"sweep": sweep.id, "start_ns": sweep.start_ns, "shape": taxels.shape, "dtype": str(taxels.dtype)}
-    data = b2a_base64(taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False).data, newline=False)
+    about = {
+        "sweep": sweep.id,
+        "start_ns": sweep.start_ns,
+        "shape": taxels.shape,
+        "dtype": str(taxels.dtype),
+    }
+    data = b2a_base64(
+        taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False).data, newline=False
+    )
     return b"".join((encode("sweep", about)[:-2], b', "data": "', data, b'"}\n'))
 
 
@@ -152,7 +167,9 @@ class Reader:
         self.due = False
         """It stands in the line of those that are written to."""
         self._queue: deque[bytes] = deque()
-        self._size = self._begun = self._lost = 0  # bytes that wait, bytes sent of the first line, lines dropped
+        self._size = self._begun = self._lost = (
+            0  # bytes that wait, bytes sent of the first line, lines dropped
+        )
         self._rest = b""
 
     @property
@@ -171,7 +188,8 @@ class Reader:
             self._lost += 1
 
     def put_or_miss(self, line: bytes | None) -> None:
-        """Queue a line where there is room, else count it as lost. None: there is no room for it with anybody."""
+        """Queue a line where there is room, else count it as lost. None: there is no room for it
+        with anybody."""
         if line is None or self._size + _weight(line) > QUEUE_BYTES:
             self._lost += 1
         else:
@@ -182,7 +200,8 @@ class Reader:
         return any(one is line for one in self._queue)
 
     def send(self) -> None:
-        """Send what the reader takes now; between two lines it first gets to know how many it has lost.
+        """Send what the reader takes now; between two lines it first gets to know how many it has
+        lost.
 
         Raises OSError where it is gone.
         """
@@ -203,7 +222,8 @@ class Reader:
             self._drop_first()
 
     def hear(self) -> list[Asked]:
-        """What it asks for now. Raises FormatError for what is no request, EOFError and OSError where it is gone."""
+        """What it asks for now. Raises FormatError for what is no request, EOFError and OSError
+        where it is gone."""
         try:
             data = self.connection.recv(HEARD_BYTES)
         except BlockingIOError:
@@ -214,7 +234,8 @@ class Reader:
         return found
 
     def close(self, why: str = "") -> None:
-        """Send what it takes at once, and why it is closed; a line that was begun is not cut by another."""
+        """Send what it takes at once, and why it is closed; a line that was begun is not cut by
+        another."""
         with suppress(OSError):
             while self.waits:
                 before = len(self._queue)
@@ -236,32 +257,58 @@ class Reader:
 class FeedServer(Observer):
     """Offers the feed at `path` to at most MOST_READERS programs of the socket's group.
 
-    fmt: of the sweeps. facts: what the first line says beside the format (PROTOCOL.md: source, bundle, labels, skin).
-    clock, more: as for Report. spent_ns: processor time that this thread has taken so far.
+    fmt: of the sweeps. facts: what the first line says beside the format (PROTOCOL.md: source,
+    bundle, labels, skin). clock, more: as for Report. spent_ns: processor time that this thread has
+    taken so far.
     """
 
     def __init__(
-        self, path: Path, fmt: SweepFormat, facts: Mapping[str, Any], clock: Clock,
-        more: Callable[[], Mapping[str, Any]] = dict, spent_ns: Callable[[], int] = time.thread_time_ns,
-    ) -> None:  # fmt: skip
-        self._path, self._clock, self._report, self._spent_ns = path, clock, Report(clock, more), spent_ns
+        self,
+        path: Path,
+        fmt: SweepFormat,
+        facts: Mapping[str, Any],
+        clock: Clock,
+        more: Callable[[], Mapping[str, Any]] = dict,
+        spent_ns: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        self._path, self._clock, self._report, self._spent_ns = (
+            path,
+            clock,
+            Report(clock, more),
+            spent_ns,
+        )
         self._most_hz = min(MOST_HZ, MOST_VALUES_S / fmt.channels)
-        self._hello = encode("hello", {
-            "schema": FEED_SCHEMA, "version": __version__, "pid": os.getpid(), **facts, "format": fmt.json(),
-            "window_s": fmt.window / fmt.rate_hz, "frames_hz": self._most_hz,
-        })  # fmt: skip
+        self._hello = encode(
+            "hello",
+            {
+                "schema": FEED_SCHEMA,
+                "version": __version__,
+                "pid": os.getpid(),
+                **facts,
+                "format": fmt.json(),
+                "window_s": fmt.window / fmt.rate_hz,
+                "frames_hz": self._most_hz,
+            },
+        )
         self._listener: socket.socket | None = None
         self._poll = select.epoll()
         self._readers: dict[int, Reader] = {}
-        self._due: deque[Reader] = deque()  # those with something to send, in the order in which they get their turn
+        self._due: deque[Reader] = (
+            deque()
+        )  # those with something to send, in the order in which they get their turn
         self._newest: Frames | None = None
-        self._large, self._large_ns = b"", 0  # the last line that was larger than a queue, and when it came
+        self._large, self._large_ns = (
+            b"",
+            0,
+        )  # the last line that was larger than a queue, and when it came
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
         self._health = b""  # the line of this second
         self._tick, self._fresh = 0, False
         self._state: tuple[object, ...] = ()
         self._log = TroubleLog(
-            f"feed: {path} cannot be offered", "classifying goes on; see feed.socket", end=f"feed: offered at {path}"
+            f"feed: {path} cannot be offered",
+            "classifying goes on; see feed.socket",
+            end=f"feed: offered at {path}",
         )
 
     def frames(self, frames: Frames) -> None:
@@ -275,13 +322,18 @@ class FeedServer(Observer):
             self._fresh = True
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Have the window of a sweep sent to those who asked for it; one for which there is no room is lost to them."""
+        """Have the window of a sweep sent to those who asked for it; one for which there is no room
+        is lost to them."""
         asked = [reader for reader in self._readers.values() if reader.sweeps]
         if not (asked and len(sweep.frames)):
             return
         size = sweep.frames.taxels.nbytes * 4 // 3 + HEAD_BYTES
         small, now_ns = size <= QUEUE_BYTES, self._clock.now_ns()
-        line = _sweep_line(sweep) if small or (size <= SWEEP_BYTES and self._last_is_taken(now_ns)) else None
+        line = (
+            _sweep_line(sweep)
+            if small or (size <= SWEEP_BYTES and self._last_is_taken(now_ns))
+            else None
+        )
         if line and not small:
             self._large, self._large_ns = line, now_ns
         for reader in asked:
@@ -291,7 +343,8 @@ class FeedServer(Observer):
             self._let_wait(reader)
 
     def turn(self, health: Health) -> None:
-        """Queue what is new; when it is time, take up connections and requests, and send to the next few readers."""
+        """Queue what is new; when it is time, take up connections and requests, and send to the
+        next few readers."""
         state = health.skin, health.trouble, health.sweeping, health.ready
         if state != self._state:
             self._state, self._fresh = state, True
@@ -315,7 +368,9 @@ class FeedServer(Observer):
         self._put_frame(now_ns)
         for number, events in self._poll.poll(0, HEARD):
             if number in self._readers:
-                self._hear(self._readers[number], gone=bool(events & (select.EPOLLHUP | select.EPOLLERR)))
+                self._hear(
+                    self._readers[number], gone=bool(events & (select.EPOLLHUP | select.EPOLLERR))
+                )
             else:
                 self._take_up(listener, health)
         self._send()
@@ -332,12 +387,15 @@ class FeedServer(Observer):
                 self._path.unlink()
 
     def _last_is_taken(self, now_ns: int) -> bool:
-        """Whether no reader takes the last large line any more; who has had its time for that is closed."""
+        """Whether no reader takes the last large line any more; who has had its time for that is
+        closed."""
         taking = [reader for reader in self._readers.values() if reader.takes(self._large)]
         if taking and now_ns < self._large_ns + TAKE_NS:
             return False
         for reader in taking:
-            self._close(reader, f"it has not taken a sweep within {TAKE_NS / 1e9:g} s; read without pause")
+            self._close(
+                reader, f"it has not taken a sweep within {TAKE_NS / 1e9:g} s; read without pause"
+            )
         self._large = b""
         return True
 
@@ -363,7 +421,8 @@ class FeedServer(Observer):
         self._listener = listener
 
     def _put_frame(self, now_ns: int) -> None:
-        """Queue the newest frame for those whose next one is due; made once, however many want it."""
+        """Queue the newest frame for those whose next one is due; made once, however many want
+        it."""
         tick = int(now_ns * self._most_hz) // 1_000_000_000
         before, self._tick = self._tick, tick
         if tick == before or self._newest is None:
@@ -372,7 +431,9 @@ class FeedServer(Observer):
         if not due:
             return
         frames, self._newest = self._newest, None  # one that has been sent is not sent again
-        line = encode("frame", {"time_ns": int(frames.t_ns[-1]), "taxels": frames.taxels[-1].tolist()})
+        line = encode(
+            "frame", {"time_ns": int(frames.t_ns[-1]), "taxels": frames.taxels[-1].tolist()}
+        )
         for reader in due:
             reader.put(line)
             self._let_wait(reader)
@@ -396,7 +457,8 @@ class FeedServer(Observer):
         self._let_wait(reader)
 
     def _health_line(self, health: Health) -> bytes:
-        """Made once a second at most: those who connect again and again would make it the costliest of all."""
+        """Made once a second at most: those who connect again and again would make it the costliest
+        of all."""
         self._health = self._health or encode("health", self._report(health))
         return self._health
 
@@ -452,12 +514,14 @@ class FeedServer(Observer):
 
 
 def _due(share: float, before: int, tick: int) -> bool:
-    """Whether a reader that wants this share of the ticks wants the one of those after `before` up to `tick`."""
+    """Whether a reader that wants this share of the ticks wants the one of those after `before` up
+    to `tick`."""
     return int(before * share) != int(tick * share)
 
 
 def _clear(path: Path) -> None:
-    """Remove the socket of a process that has died. Raises OSError where something else is there."""
+    """Remove the socket of a process that has died. Raises OSError where something else is
+    there."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise FileExistsError("what is there is not a socket; move it away")
@@ -471,7 +535,9 @@ def _clear(path: Path) -> None:
             return
         except BlockingIOError:  # somebody is there, and busy
             pass
-    raise OSError("another program offers its feed there; end it, or give this one a path of its own")
+    raise OSError(
+        "another program offers its feed there; end it, or give this one a path of its own"
+    )
 
 
 @contextmanager

@@ -1,6 +1,8 @@
-"""What `palpate status` shows. In: health each turn, verdicts. Out: both as one small JSON file, and this file in words.
+"""What `palpate status` shows. In: health each turn, verdicts. Out: both as one small JSON file,
+and this file in words.
 
-The file lies in memory (/run): it is written aside and renamed, so that a reader gets it whole, and never synced.
+The file lies in memory (/run): it is written aside and renamed, so that a reader gets it whole, and
+never synced.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ PERIOD_NS = 1_000_000_000
 SOON_NS = 100_000_000
 """A verdict, or another state of the skin, is written so soon after what was written before it."""
 STALE_NS = 10_000_000_000
-"""A file that has not changed for so long belongs to a program that hangs: it is the unit's watchdog time."""
+"""A file that has not changed for so long belongs to a program that hangs: it is the unit's
+watchdog time."""
 MOST_BYTES = 1 << 20
 _START = "systemctl start palpate, then see journalctl -u palpate"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
@@ -39,8 +42,8 @@ WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 class Report:
     """The state of the box as an object for JSON, in the status file and in the feed.
 
-    clock: the host's real one, which a reader in another process shares. more: further facts for JSON; a text among them
-    is a line of its own in words, unless it is empty.
+    clock: the host's real one, which a reader in another process shares. more: further facts for
+    JSON; a text among them is a line of its own in words, unless it is empty.
     """
 
     def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
@@ -50,18 +53,25 @@ class Report:
     def __call__(self, health: Health) -> dict[str, Any]:
         """The state now."""
         return {
-            **self._more(), **asdict(health), "time_ns": self._clock.now_ns(), "since_ns": self._since_ns,
-            "pid": os.getpid(), "version": __version__,
-        }  # fmt: skip
+            **self._more(),
+            **asdict(health),
+            "time_ns": self._clock.now_ns(),
+            "since_ns": self._since_ns,
+            "pid": os.getpid(),
+            "version": __version__,
+        }
 
 
 class StatusFile(Observer):
-    """Writes the state of the box and its latest answers; removed when the program has ended in order.
+    """Writes the state of the box and its latest answers; removed when the program has ended in
+    order.
 
     clock, more: as for Report.
     """
 
-    def __init__(self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
+    def __init__(
+        self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict
+    ) -> None:
         self._path, self._clock, self._report = path, clock, Report(clock, more)
         self._next_ns = clock.now_ns()
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
@@ -82,8 +92,11 @@ class StatusFile(Observer):
             return
         self._next_ns, self._fresh = now_ns + PERIOD_NS, False
         report = self._report(health) | {"schema": SCHEMA, "verdicts": list(self._verdicts)}
-        # every user of the box may ask; the file lies in memory (/run), and on a card one sync a second would wear it
-        self._log.attempt(lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644))
+        # every user of the box may ask; the file lies in memory (/run), and on a card one sync a
+        # second would wear it
+        self._log.attempt(
+            lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644)
+        )
 
     def stopping(self) -> None:
         """Remove the file: what it says no longer holds."""
@@ -91,9 +104,11 @@ class StatusFile(Observer):
 
 
 def read(path: Path, now_ns: int) -> dict[str, Any]:
-    """The content of the file, with `running`, and `why` where the service does not run. now_ns: of the clock that writes it.
+    """The content of the file, with `running`, and `why` where the service does not run. now_ns: of
+    the clock that writes it.
 
-    Raises FormatError where the file is not one of this version, ApplianceError where it may not be read.
+    Raises FormatError where the file is not one of this version, ApplianceError where it may not be
+    read.
     """
     try:
         with path.open("rb") as f:
@@ -104,13 +119,20 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
         report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
         Health(**{name: report[name] for name in Health.__slots__})
     except FileNotFoundError:
-        return {"running": False, "why": f"the service does not run, or has just started (no {path}); {_START}"}
+        return {
+            "running": False,
+            "why": f"the service does not run, or has just started (no {path}); {_START}",
+        }
     except OSError as e:
-        raise ApplianceError(f"{path} cannot be read: {e.strerror}; see store.status, or ask as root") from e
+        raise ApplianceError(
+            f"{path} cannot be read: {e.strerror}; see store.status, or ask as root"
+        ) from e
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
         raise FormatError(f"{path}: not a status of this version ({e}); restart the service") from e
     why = ""
-    if not _alive(pid) or age_ns < 0:  # a file of before the last boot can be ahead of this boot's clock
+    if (
+        not _alive(pid) or age_ns < 0
+    ):  # a file of before the last boot can be ahead of this boot's clock
         why = f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's watchdog restarts it"
@@ -135,18 +157,29 @@ def exit_code(report: Mapping[str, Any]) -> int:
 
 
 def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
-    """What `read` gave, in words: first the state and what to do, then the last verdicts, the newest first."""
+    """What `read` gave, in words: first the state and what to do, then the last verdicts, the
+    newest first."""
     if not report["running"]:
         return [f"not running: {report['why']}"]
     head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
     rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
-    facts = {"skin": _skin(report), "bundle": report["bundle"] or "none", "sweeps": f"{report['answered']} answered"}
+    facts = {
+        "skin": _skin(report),
+        "bundle": report["bundle"] or "none",
+        "sweeps": f"{report['answered']} answered",
+    }
     if edges := _trigger(report):
         facts["trigger"] = edges
     if report["dropped"]:
-        facts["serial"] = f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
+        facts["serial"] = (
+            f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
+        )
     shown = {"version", "why", *Health.__slots__}
-    facts |= {name: text for name, text in report.items() if name not in shown and isinstance(text, str) and text}
+    facts |= {
+        name: text
+        for name, text in report.items()
+        if name not in shown and isinstance(text, str) and text
+    }
     rows += [f"{name:<8} {text}" for name, text in facts.items()]
     rows += [verdict_line(v, now_ns) for v in reversed(report["verdicts"])]
     return ["".join(c if c.isprintable() else "?" for c in line) for line in rows]
@@ -183,7 +216,9 @@ def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
     if v["status"].classified:
         what = f"{v['label']:<24}  {100 * v['probability']:5.1f} %  {v['latency_ns'] / 1e6:6.1f} ms"
     what = "; ".join(filter(None, (what, v["detail"])))
-    return f"sweep {v['sweep']:>6}  {_span(now_ns - v['time_ns']):>11} ago  {v['status']:<11}  {what}"
+    return (
+        f"sweep {v['sweep']:>6}  {_span(now_ns - v['time_ns']):>11} ago  {v['status']:<11}  {what}"
+    )
 
 
 def _span(ns: int) -> str:

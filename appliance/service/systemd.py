@@ -1,5 +1,6 @@
-"""The box as a service of systemd. In: health each turn, verdicts. Out: READY, STATUS, WATCHDOG and STOPPING as datagrams
-(sd_notify) to the socket that systemd names in the environment, and a log line for each verdict.
+"""The box as a service of systemd. In: health each turn, verdicts. Out: READY, STATUS, WATCHDOG and
+STOPPING as datagrams (sd_notify) to the socket that systemd names in the environment, and a log
+line for each verdict.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from appliance.core.status import REASONS, Status
 from appliance.core.types import Verdict
 
 FEEDS = 10
-"""How often the watchdog is fed within its time, so that nearly all of it is left for one turn of the loop."""
+"""How often the watchdog is fed within its time, so that nearly all of it is left for one turn of
+the loop."""
 
 
 class Notifier(Observer):
-    """Sends systemd the state of the box. Never waits: what the socket does not accept is sent again next turn.
+    """Sends systemd the state of the box. Never waits: what the socket does not accept is sent
+    again next turn.
 
-    environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID as systemd sets them. clock: a real one; systemd's watchdog
-    does not wait for a simulated one. Raises ConfigError where WATCHDOG_USEC is no number.
+    environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID as systemd sets them. clock: a real one;
+    systemd's watchdog does not wait for a simulated one. Raises ConfigError where WATCHDOG_USEC is
+    no number.
     """
 
     def __init__(self, clock: Clock, environ: Mapping[str, str] = os.environ) -> None:
@@ -45,7 +49,9 @@ class Notifier(Observer):
         ready = ready or self._ready
         messages = []
         if status != self._status:
-            messages.append("STATUS=" + " ".join(status.splitlines()))  # a line of its own would be another message
+            messages.append(
+                "STATUS=" + " ".join(status.splitlines())
+            )  # a line of its own would be another message
         if ready and not self._ready:
             messages.append("READY=1")
         if due:
@@ -68,7 +74,9 @@ class Notifier(Observer):
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
                 manager.setblocking(False)
                 manager.sendto("\n".join(messages).encode(errors="replace"), self._address)
-        except OSError:  # gone, or full: a fault of the service manager must not become one of the robot's
+        except (
+            OSError
+        ):  # gone, or full: a fault of the service manager must not become one of the robot's
             return False
         return True
 
@@ -77,7 +85,9 @@ def _watchdog_us(environ: Mapping[str, str]) -> int:
     """Microseconds of this process's watchdog, 0 where there is none."""
     text, pid = environ.get("WATCHDOG_USEC", "0"), environ.get("WATCHDOG_PID")
     if not text.isdecimal():
-        raise ConfigError(f"WATCHDOG_USEC={text} is no number of microseconds; leave it to systemd, or unset it")
+        raise ConfigError(
+            f"WATCHDOG_USEC={text} is no number of microseconds; leave it to systemd, or unset it"
+        )
     return int(text) if pid in (None, str(os.getpid())) else 0
 
 
@@ -100,6 +110,7 @@ class VerdictLog(Observer):
     """Logs each verdict as one line."""
 
     def answered(self, verdict: Verdict) -> None:
-        """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a warning."""
+        """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a
+        warning."""
         fine = (verdict.status.classified or verdict.status is Status.ABORTED) and not verdict.moved
         log.log(INFO if fine else WARNING, words(verdict))

@@ -1,10 +1,11 @@
-"""Position of the contact on the skin. In: raw counts of a contact. Out: its centre, and its distance from the trained
-one.
+"""Position of the contact on the skin. In: raw counts of a contact. Out: its centre, and its
+distance from the trained one.
 
-Pure functions. The classifier calls them once per sweep, to detect that the skin has moved; `alignment` many times per
-second, to show it to a person. Taxels measure a contact only where they are: if it extends beyond the skin's edge, its
-centre is computed too close to the skin's middle. The distance is then too small but never has the wrong sign, so that
-a person who follows it and measures again arrives. Of a skin with several axes only the normal one counts.
+Pure functions. The classifier calls them once per sweep, to detect that the skin has moved;
+`alignment` many times per second, to show it to a person. Taxels measure a contact only where they
+are: if it extends beyond the skin's edge, its centre is computed too close to the skin's middle.
+The distance is then too small but never has the wrong sign, so that a person who follows it and
+measures again arrives. Of a skin with several axes only the normal one counts.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ from appliance.core.errors import BundleError
 from appliance.core.types import normal
 
 MOST_POSITIONS, MOST_MM = 1000, 1e6
-"""Largest number of positions in a bundle, since each sweep is compared with all of them; largest length, 1 km."""
+"""Largest number of positions in a bundle, since each sweep is compared with all of them; largest
+length, 1 km."""
 LEAST_PART = 0.25
-"""A direction with a smaller share of the distance is not named: it changes the distance by less than 3 %."""
+"""A direction with a smaller share of the distance is not named: it changes the distance by less
+than 3 %."""
 IN_PLACE = "in place"
 
 Point = tuple[float, float]
@@ -32,9 +35,9 @@ Point = tuple[float, float]
 class ContactPositions:
     """Positions of the contact's centre in training. Raises BundleError for a number out of range.
 
-    pitch_mm: distance between taxels. rows_mm, cols_mm: one entry per position, mm from the centre of taxel 1.1 (row 1,
-    column 1) towards higher rows and columns. limit_mm: a sweep whose centre is farther than this from the nearest
-    position counts as moved.
+    pitch_mm: distance between taxels. rows_mm, cols_mm: one entry per position, mm from the centre
+    of taxel 1.1 (row 1, column 1) towards higher rows and columns. limit_mm: a sweep whose centre
+    is farther than this from the nearest position counts as moved.
     """
 
     pitch_mm: float
@@ -46,11 +49,19 @@ class ContactPositions:
         for name in ("pitch_mm", "limit_mm"):
             value = getattr(self, name)
             if not _length(value) or value <= 0:
-                raise BundleError(f"place.{name} {value!r} must be mm above 0; export the bundle again")
+                raise BundleError(
+                    f"place.{name} {value!r} must be mm above 0; export the bundle again"
+                )
         for name in ("rows_mm", "cols_mm"):
             values = getattr(self, name)
-            if type(values) is not tuple or not 1 <= len(values) <= MOST_POSITIONS or not all(map(_length, values)):
-                raise BundleError(f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle again")
+            if (
+                type(values) is not tuple
+                or not 1 <= len(values) <= MOST_POSITIONS
+                or not all(map(_length, values))
+            ):
+                raise BundleError(
+                    f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle again"
+                )
         if len(self.rows_mm) != len(self.cols_mm):
             raise BundleError(
                 f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where each position has one "
@@ -58,8 +69,8 @@ class ContactPositions:
             )
 
     def offset(self, centre: Point) -> Point:
-        """Vector from the nearest trained position to `centre` (in taxels, as from `centre()`): mm along rows,
-        columns."""
+        """Vector from the nearest trained position to `centre` (in taxels, as from `centre()`): mm
+        along rows, columns."""
         rows = centre[0] * self.pitch_mm - np.array(self.rows_mm)
         cols = centre[1] * self.pitch_mm - np.array(self.cols_mm)
         nearest = np.hypot(rows, cols).argmin()
@@ -75,18 +86,21 @@ def _length(value: Any) -> bool:
 
 
 def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> Point | None:
-    """The contact's centre (row, column) in taxels, 0.0 at the centre of taxel 1.1; None without contact.
+    """The contact's centre (row, column) in taxels, 0.0 at the centre of taxel 1.1; None without
+    contact.
 
-    taxels: raw counts [T, R, C] or [T, R, C, A] of a window or of the latest frames. tare: mean counts [R, C] or
-    [R, C, A] of the unloaded skin.
-    contact: counts above the tare from which a taxel is loaded (the bundle's threshold).
-    The centre is the mean position of the loaded taxels, weighted by their mean load: the centre of pressure of the
-    part that the skin covers. A fit of the contact's shape would have no bias towards the skin's middle, but the gains
-    of taxels differ between attachments, and that causes larger errors in a fit. A saturated taxel counts at full
+    taxels: raw counts [T, R, C] or [T, R, C, A] of a window or of the latest frames. tare: mean
+    counts [R, C] or [R, C, A] of the unloaded skin. contact: counts above the tare from which a
+    taxel is loaded (the bundle's threshold). The centre is the mean position of the loaded taxels,
+    weighted by their mean load: the centre of pressure of the part that the skin covers. A fit of
+    the contact's shape would have no bias towards the skin's middle, but the gains of taxels differ
+    between attachments, and that causes larger errors in a fit. A saturated taxel counts at full
     scale.
     """
     taxels, tare = normal(taxels, 1), normal(tare, 0)
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)  # contiguous: twice as fast to reduce
+    series = np.ascontiguousarray(
+        taxels.reshape(len(taxels), -1).T
+    )  # contiguous: twice as fast to reduce
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
     load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
     total = load.sum()
@@ -97,24 +111,28 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
 
 
 def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`load` [R, C] in counts (0 and less: not loaded) with dead taxels filled in: a silent one between two loaded ones
-    of its row or column gets their mean. A contact has no hole, and a hole would shift its centre."""
+    """`load` [R, C] in counts (0 and less: not loaded) with dead taxels filled in: a silent one
+    between two loaded ones of its row or column gets their mean. A contact has no hole, and a hole
+    would shift its centre."""
     if (load > 0).all():
         return load
     padded = np.zeros((load.shape[0] + 2, load.shape[1] + 2))
     padded[1:-1, 1:-1] = load
-    sides = np.stack([
-        [padded[:-2, 1:-1], padded[2:, 1:-1]],
-        [padded[1:-1, :-2], padded[1:-1, 2:]],
-    ])  # fmt: skip
+    sides = np.stack(
+        [
+            [padded[:-2, 1:-1], padded[2:, 1:-1]],
+            [padded[1:-1, :-2], padded[1:-1, 2:]],
+        ]
+    )
     between = (sides > 0).all(axis=1)
     filled = (sides.mean(axis=1) * between).sum(axis=0) / np.maximum(between.sum(axis=0), 1)
     return np.where(load > 0, load, filled)
 
 
 def advice(offset: Point, shape: Sequence[int]) -> str:
-    """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape` [R, C], for example
-    "2.1 mm too far towards row 4". The larger direction comes first; one below LEAST_PART is left out."""
+    """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape`
+    [R, C], for example "2.1 mm too far towards row 4". The larger direction comes first; one below
+    LEAST_PART is left out."""
     least = LEAST_PART * np.hypot(*offset)
     parts = [
         (abs(mm), f"{name} {n if mm > 0 else 1}")
@@ -122,12 +140,16 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
         if abs(mm) >= least
     ]
     (most, where), *others = sorted(parts, reverse=True)
-    return f"{most:.1f} mm too far towards {where}" + "".join(f" and {mm:.1f} mm towards {to}" for mm, to in others)
+    return f"{most:.1f} mm too far towards {where}" + "".join(
+        f" and {mm:.1f} mm towards {to}" for mm, to in others
+    )
 
 
-def moved(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions) -> str:
-    """ "" if the contact of a sweep is at a trained position, otherwise for example "moved 2.1 mm too far towards row 4".
-    taxels, tare, contact: as for `centre`."""
+def moved(
+    taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions
+) -> str:
+    """ "" if the contact of a sweep is at a trained position, otherwise for example "moved 2.1 mm
+    too far towards row 4". taxels, tare, contact: as for `centre`."""
     found = centre(taxels, tare, contact)
     if found is None or positions.within(offset := positions.offset(found)):
         return ""

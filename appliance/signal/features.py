@@ -1,12 +1,14 @@
-"""Features of the paper's classical classifiers, its equations 1 to 5. In: raw counts of one window, frame rate. Out:
-taxel weights [M], L-features [3] and H-features [short windows x bands]. Pure functions of numpy arrays.
+"""Features of the paper's classical classifiers, its equations 1 to 5. In: raw counts of one
+window, frame rate. Out: taxel weights [M], L-features [3] and H-features [short windows x bands].
+Pure functions of numpy arrays.
 
-Raw counts are [T, R, C], or [T, R, C, A] where a taxel has several axes: each is then a time series of its own, and the
-taxel's weight comes from its normal axis.
+Raw counts are [T, R, C], or [T, R, C, A] where a taxel has several axes: each is then a time series
+of its own, and the taxel's weight comes from its normal axis.
 
-Any grid, rate and data type is possible. Where the paper's formulas leave a choice, the docstring says what was chosen.
-Two rules hold for every rate. A band ends at the Nyquist frequency if that is below its upper edge. A band without any
-bin of the spectrum gets the first bin above its lower edge, or the highest bin.
+Any grid, rate and data type is possible. Where the paper's formulas leave a choice, the docstring
+says what was chosen. Two rules hold for every rate. A band ends at the Nyquist frequency if that is
+below its upper edge. A band without any bin of the spectrum gets the first bin above its lower
+edge, or the highest bin.
 """
 
 from __future__ import annotations
@@ -36,11 +38,12 @@ SILENT = 1e-12
 
 
 def taxel_weights(taxels: NDArray[Any]) -> Array:
-    """Eq. 4: each taxel's share of the activation, [M] with M = R * C * A and sum 1. taxels: raw counts.
+    """Eq. 4: each taxel's share of the activation, [M] with M = R * C * A and sum 1. taxels: raw
+    counts.
 
-    A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so that no weight is
-    negative or grows without bound where means cancel. If no mean is positive all weights are 1 / M.
-    Raises FormatError for an array that is no sweep.
+    A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so
+    that no weight is negative or grows without bound where means cancel. If no mean is positive all
+    weights are 1 / M. Raises FormatError for an array that is no sweep.
     """
     return time_series.weights(time_series.of(taxels), axes(taxels))
 
@@ -51,12 +54,14 @@ def axes(taxels: NDArray[Any]) -> int:
 
 
 def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Eq. 1 to 3: [roughness in log(counts^2), c1 in Hz, c2 in Hz]. taxels: raw counts; rate_hz: frames per second.
+    """Eq. 1 to 3: [roughness in log(counts^2), c1 in Hz, c2 in Hz]. taxels: raw counts; rate_hz:
+    frames per second.
 
-    A linear trend is removed from each taxel, so that drift does not leak into the low bands. A centroid is the
-    power-weighted mean frequency of each taxel in the band, averaged with the weights of eq. 4. The mean power divides
-    by B - A, as printed. Every bin's power is at least FLOOR, so that a silent skin gives about log(M * FLOOR) and the
-    middle of each band. One frame is enough. Raises FormatError for an array that is no sweep or an invalid rate.
+    A linear trend is removed from each taxel, so that drift does not leak into the low bands. A
+    centroid is the power-weighted mean frequency of each taxel in the band, averaged with the
+    weights of eq. 4. The mean power divides by B - A, as printed. Every bin's power is at least
+    FLOOR, so that a silent skin gives about log(M * FLOOR) and the middle of each band. One frame
+    is enough. Raises FormatError for an array that is no sweep or an invalid rate.
     """
     x = time_series.of(taxels)
     time_series.check_rate(rate_hz)
@@ -70,27 +75,29 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def h_shape(frames: int, rate_hz: float) -> tuple[int, int]:
-    """Shape (short windows, bands) of the H-features of `frames` frames at `rate_hz`; (40, 19) for 1500 at 750 Hz.
+    """Shape (short windows, bands) of the H-features of `frames` frames at `rate_hz`; (40, 19) for
+    1500 at 750 Hz.
 
-    Short windows: floor(frames / (0.05 s * rate)), one for each whole step; the last one is cut off at the sweep's end.
-    A short window has W = round(0.1 s * rate) frames. Its bins are rate / W (10 Hz) apart and used up to 375 Hz or
-    Nyquist: K = min(floor(W / 2), floor(375 Hz * W / rate)). Two neighbouring bins make a band of 20 Hz, (0, 1), (2, 3)
-    and so on; bin 0 (DC) counts as zero and the last band may have one bin only: floor(K / 2) + 1 bands.
-    Raises FormatError if the sweep is shorter than one short window, or a step shorter than a frame (below 20 Hz).
+    Short windows: floor(frames / (0.05 s * rate)), one for each whole step; the last one is cut off
+    at the sweep's end. A short window has W = round(0.1 s * rate) frames. Its bins are rate / W (10
+    Hz) apart and used up to 375 Hz or Nyquist: K = min(floor(W / 2), floor(375 Hz * W / rate)). Two
+    neighbouring bins make a band of 20 Hz, (0, 1), (2, 3) and so on; bin 0 (DC) counts as zero and
+    the last band may have one bin only: floor(K / 2) + 1 bands. Raises FormatError if the sweep is
+    shorter than one short window, or a step shorter than a frame (below 20 Hz).
     """
     _, top = _short_window(frames, rate_hz)
     return math.floor(_clean(frames / (HOP_S * rate_hz))), top // 2 + 1
 
 
 def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Array:
-    """Eq. 5: power over time and frequency, float64 [l * q] for l short windows and q bands (`h_shape`), 0 to 1, no
-    unit.
+    """Eq. 5: power over time and frequency, float64 [l * q] for l short windows and q bands
+    (`h_shape`), 0 to 1, no unit.
 
-    taxels: raw counts; rate_hz: frames per second; window: "rect" is the paper's, "hann" leaks less.
-    Short window l starts with the first frame at or after l * 0.05 s. The mean of its frames is subtracted before the
-    window function is applied. Taxels are added with the weights of eq. 4, and each short window is divided by its sum
-    over q: it sums to 1, or is 0 if silent. Raises FormatError as `h_shape`, for an array that is no sweep, and for an
-    unknown window function.
+    taxels: raw counts; rate_hz: frames per second; window: "rect" is the paper's, "hann" leaks
+    less. Short window l starts with the first frame at or after l * 0.05 s. The mean of its frames
+    is subtracted before the window function is applied. Taxels are added with the weights of eq. 4,
+    and each short window is divided by its sum over q: it sums to 1, or is 0 if silent. Raises
+    FormatError as `h_shape`, for an array that is no sweep, and for an unknown window function.
     """
     x = time_series.of(taxels)
     frames = x.shape[1]
@@ -111,8 +118,11 @@ KINDS: Kinds = MappingProxyType({"L": l_features, "H": h_features})
 """Feature sets by their names in a bundle's manifest."""
 
 
-def compute(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[np.float32]:
-    """Feature set `kind` (of `kinds`) of raw counts at `rate_hz`: float32 [n]. Raises FormatError."""
+def compute(
+    kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS
+) -> NDArray[np.float32]:
+    """Feature set `kind` (of `kinds`) of raw counts at `rate_hz`: float32 [n]. Raises
+    FormatError."""
     if kind not in kinds:
         raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(kinds)}")
     return kinds[kind](taxels, rate_hz).astype(np.float32)
@@ -124,7 +134,8 @@ def given(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS)
 
 
 def _clean(bins: float) -> float:
-    """`bins` without rounding errors next to a whole number: 0.1 s at 30 Hz is 3 frames, not 3.0000000000000004."""
+    """`bins` without rounding errors next to a whole number: 0.1 s at 30 Hz is 3 frames, not
+    3.0000000000000004."""
     return float(round(bins)) if math.isclose(bins, round(bins), rel_tol=1e-9) else bins
 
 
@@ -135,7 +146,9 @@ def _bins(band: tuple[float, float], frames: int, rate_hz: float) -> tuple[int, 
     return first, max(first, math.floor(high))
 
 
-def _centroid(power: Array, weights: Array, band: tuple[float, float], frames: int, rate_hz: float) -> float:
+def _centroid(
+    power: Array, weights: Array, band: tuple[float, float], frames: int, rate_hz: float
+) -> float:
     """Eq. 3, as described in `l_features`: power [M, bins], weights [M] -> Hz."""
     first, last = _bins(band, frames, rate_hz)
     inside = power[:, first : last + 1]
@@ -148,14 +161,19 @@ def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
     time_series.check_rate(rate_hz)
     width = round(WINDOW_S * rate_hz)
     if HOP_S * rate_hz < 1:
-        raise FormatError(f"{rate_hz:g} Hz is too slow for H-features; use at least {1 / HOP_S:g} Hz, or L")
+        raise FormatError(
+            f"{rate_hz:g} Hz is too slow for H-features; use at least {1 / HOP_S:g} Hz, or L"
+        )
     if frames < width:
-        raise FormatError(f"{frames} frames are too few for H-features at {rate_hz:g} Hz; use at least {width}, or L")
+        raise FormatError(
+            f"{frames} frames are too few for H-features at {rate_hz:g} Hz; use at least {width}, or L"
+        )
     return width, min(width // 2, math.floor(_clean(HIGH_HZ[1] * width / rate_hz)))
 
 
 def _cuts(x: Array, count: int, width: int, hop: float) -> Array:
-    """`x` [M, T] as short windows [M, count, width], each minus its own mean; zero beyond the end of `x`."""
+    """`x` [M, T] as short windows [M, count, width], each minus its own mean; zero beyond the end
+    of `x`."""
     # rounded, since 3.0000000000000004 would be taken for 4
     starts = np.ceil(np.round(np.arange(count) * hop, 6)).astype(np.int64)
     at = starts[:, None] + np.arange(width)

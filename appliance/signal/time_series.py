@@ -1,6 +1,6 @@
-"""One window as time series, the basis of all features. In: raw counts [T, R, C] or [T, R, C, A]. Out: float64
-[M, T] with M = R * C * A, the axes of a taxel side by side; means, taxel weights, detrended series and power spectra. Pure
-functions of numpy arrays.
+"""One window as time series, the basis of all features. In: raw counts [T, R, C] or [T, R, C, A].
+Out: float64 [M, T] with M = R * C * A, the axes of a taxel side by side; means, taxel weights,
+detrended series and power spectra. Pure functions of numpy arrays.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from appliance.core.errors import FormatError
 Array = NDArray[np.float64]
 
 FLOOR = 1e-6
-"""Least power of a bin, or variance, in counts^2. With it a silent skin has a logarithm and a centroid; real readings
-are larger and do not change."""
+"""Least power of a bin, or variance, in counts^2. With it a silent skin has a logarithm and a
+centroid; real readings are larger and do not change."""
 ROUNDING = 1e-6
-"""A mean below this share of its taxel's largest count is a rounding error (float32 counts whose means were removed).
-Means of unsigned counts are this small only in windows of a million frames."""
+"""A mean below this share of its taxel's largest count is a rounding error (float32 counts whose
+means were removed). Means of unsigned counts are this small only in windows of a million frames."""
 
 
 def of(taxels: NDArray[Any]) -> Array:
-    """Raw counts [T, R, C] or [T, R, C, A] as one time series per taxel and axis, row by row: float64 [M, T]. Raises
-    FormatError for an array that is no sweep or not finite."""
+    """Raw counts [T, R, C] or [T, R, C, A] as one time series per taxel and axis, row by row:
+    float64 [M, T]. Raises FormatError for an array that is no sweep or not finite."""
     if taxels.ndim not in (3, 4) or taxels.size == 0:
         raise FormatError(
             f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns (x axes), none of them 0"
         )
     x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)
     if not np.isfinite(x).all():
-        raise FormatError("the sweep holds counts that are not a number or infinite; check how it was recorded")
+        raise FormatError(
+            "the sweep holds counts that are not a number or infinite; check how it was recorded"
+        )
     return x
 
 
@@ -50,8 +52,9 @@ def means(x: Array) -> Array:
 
 
 def weights(x: Array, axes: int = 1) -> Array:
-    """Eq. 4 for `x` [M, T]: weights [M] that sum to 1, see `features.taxel_weights`. Each of a taxel's `axes` gets the
-    same part of the taxel's weight, which is its share of the load along the normal."""
+    """Eq. 4 for `x` [M, T]: weights [M] that sum to 1, see `features.taxel_weights`. Each of a
+    taxel's `axes` gets the same part of the taxel's weight, which is its share of the load along
+    the normal."""
     mean = np.maximum(means(x[axes - 1 :: axes]), 0.0)
     total = mean.sum()
     share: Array = mean / total if total > 0 else np.full(len(mean), 1 / len(mean))
@@ -68,7 +71,8 @@ def detrended(x: Array) -> Array:
 
 
 def power(x: Array, frames: int) -> Array:
-    """Eq. 1, squared: |DFT|^2 / frames along the last axis, in counts^2; bins from DC to Nyquist."""
+    """Eq. 1, squared: |DFT|^2 / frames along the last axis, in counts^2; bins from DC to
+    Nyquist."""
     spectrum = np.fft.rfft(x)
     squared: Array = (spectrum.real**2 + spectrum.imag**2) / frames
     return squared

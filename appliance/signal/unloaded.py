@@ -1,6 +1,8 @@
-"""What the skin gives without contact, found while it streams. In: frames. Out: an UnloadedSkin, and whether it is certain.
+"""What the skin gives without contact, found while it streams. In: frames. Out: an UnloadedSkin,
+and whether it is certain.
 
-Nobody has to keep the finger off at a certain moment: an unloaded skin is quiet, and no quiet stretch is lower.
+Nobody has to keep the finger off at a certain moment: an unloaded skin is quiet, and no quiet
+stretch is lower.
 """
 
 from __future__ import annotations
@@ -14,9 +16,11 @@ from numpy.typing import NDArray
 from appliance.core.types import SweepFormat, normal
 
 BLOCK_S, LEAST_FRAMES = 0.1, 8
-"""Length of the stretches that are compared: a finger is lifted for longer than that between two sweeps."""
+"""Length of the stretches that are compared: a finger is lifted for longer than that between two
+sweeps."""
 NOISE = 5.0
-"""A mean over time is a load if it differs from the unloaded skin by as many standard deviations of one frame."""
+"""A mean over time is a load if it differs from the unloaded skin by as many standard deviations of
+one frame."""
 LEAST_COUNTS = 2.0
 """The same for whole counts, whose noise may lie below one count."""
 QUIET = 2.0
@@ -30,8 +34,9 @@ LEAST_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class UnloadedSkin:
-    """The skin without contact. level, noise: mean and standard deviation of the counts of each taxel, of the shape of a
-    frame. contact: least difference from `level`, in counts, that is a load."""
+    """The skin without contact. level, noise: mean and standard deviation of the counts of each
+    taxel, of the shape of a frame. contact: least difference from `level`, in counts, that is a
+    load."""
 
     level: NDArray[np.float64]
     noise: NDArray[np.float64]
@@ -40,17 +45,24 @@ class UnloadedSkin:
     @classmethod
     def measured(cls, taxels: NDArray[Any]) -> UnloadedSkin:
         """From frames of a skin that nothing touches, raw counts [n, R, C] or [n, R, C, A]."""
-        return cls.of(taxels.mean(axis=0, dtype=np.float64), taxels.std(axis=0, dtype=np.float64), taxels.dtype)
+        return cls.of(
+            taxels.mean(axis=0, dtype=np.float64),
+            taxels.std(axis=0, dtype=np.float64),
+            taxels.dtype,
+        )
 
     @classmethod
-    def of(cls, level: NDArray[np.float64], noise: NDArray[np.float64], counts: np.dtype[Any]) -> UnloadedSkin:
+    def of(
+        cls, level: NDArray[np.float64], noise: NDArray[np.float64], counts: np.dtype[Any]
+    ) -> UnloadedSkin:
         """From mean and standard deviation of each taxel. counts: the type of the raw counts."""
         contact = NOISE * _median(noise)
         return cls(level, noise, contact if counts.kind == "f" else max(contact, LEAST_COUNTS))
 
 
 class UnloadedTracker:
-    """Follows the stream. skin: the quietest, and of the quiet ones the lowest stretch so far; None before the first.
+    """Follows the stream. skin: the quietest, and of the quiet ones the lowest stretch so far; None
+    before the first.
 
     certain: whether the skin was also touched since then, so that it was not sliding all the time.
     """
@@ -85,14 +97,18 @@ class UnloadedTracker:
             self.skin, self.certain = block, False
             return
         away = normal(np.abs(block.level - self.skin.level), 0)
-        self.certain |= bool(away.max(initial=0, where=np.isfinite(away)) >= TOUCH * self.skin.contact)
+        self.certain |= bool(
+            away.max(initial=0, where=np.isfinite(away)) >= TOUCH * self.skin.contact
+        )
 
     @staticmethod
     def _less(block: UnloadedSkin, than: UnloadedSkin) -> bool:
         """Whether a stretch is less loaded than another: much quieter, or as quiet and lower."""
         if block.contact * QUIET < than.contact:
             return True
-        lower = float(np.nanmean(normal(block.level - than.level, 0))) < -LEAST_SHARE * block.contact
+        lower = (
+            float(np.nanmean(normal(block.level - than.level, 0))) < -LEAST_SHARE * block.contact
+        )
         return lower and block.contact <= QUIET * than.contact
 
 

@@ -1,7 +1,7 @@
 """Simulated devices for the real drivers. In: what the robot does (Acts). Out: SimDevices.
 
-Simulated are the robot, its lines (a double of gpiod) and the readout board (a pyusb backend). The drivers are the real
-ones.
+Simulated are the robot, its lines (a double of gpiod) and the readout board (a pyusb backend). The
+drivers are the real ones.
 """
 
 from __future__ import annotations
@@ -34,9 +34,14 @@ class RobotDevices(Devices):
         if trigger.by_lines:
             trigger = replace(trigger, mode="two-lines")
         output = replace(
-            settings.output, ready=READY, busy=BUSY, result_valid=RESULT_VALID, fault=FAULT, decided=DECIDED,
+            settings.output,
+            ready=READY,
+            busy=BUSY,
+            result_valid=RESULT_VALID,
+            fault=FAULT,
+            decided=DECIDED,
             class_bits=BITS,
-        )  # fmt: skip
+        )
         return replace(settings, trigger=trigger, output=output)
 
     def finished(self, answered: int) -> bool:
@@ -52,8 +57,16 @@ class SimDevices(RobotDevices):
 
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated lines and skin."""
-        ids = {"vendor_id": usb.VENDOR_ID, "product_id": usb.PRODUCT_ID, "serial": "", "skin": "palpate", "grid": ""}
-        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor")  # type: ignore[arg-type]
+        ids = {
+            "vendor_id": usb.VENDOR_ID,
+            "product_id": usb.PRODUCT_ID,
+            "serial": "",
+            "skin": "palpate",
+            "grid": "",
+        }
+        sensor = replace(
+            settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor"
+        )  # type: ignore[arg-type]
         return replace(RobotDevices.wire(self, settings), sensor=sensor)
 
 
@@ -62,22 +75,35 @@ def robot_on_lines(
 ) -> tuple[rig.Robot, gpio.SimGpio]:
     """A robot that plays `acts`, and the lines that it drives. stops, remember: see `build`."""
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
-    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember)
-    robot = rig.Robot(iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember)
+    lines = gpio.SimGpio(
+        clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember
+    )
+    robot = rig.Robot(
+        iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember
+    )
     if stops:
         lines.watchers[DECIDED] = robot.react
     return robot, lines
 
 
 def build(
-    fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *, acm: bool = False, stops: bool = True,
+    fmt: SweepFormat,
+    acts: Iterable[rig.Act],
+    clock: Clock,
+    source: str,
+    *,
+    acm: bool = False,
+    stops: bool = True,
     remember: bool = True,
-) -> SimDevices:  # fmt: skip
-    """Devices on which a robot plays `acts`. source: the name of the source in sentences. acm: the board is a CDC-ACM
-    device. stops: the robot ends its slide after DECIDED.
+) -> SimDevices:
+    """Devices on which a robot plays `acts`. source: the name of the source in sentences. acm: the
+    board is a CDC-ACM device. stops: the robot ends its slide after DECIDED.
 
-    remember: keep all acts and all output levels, to examine them later; without it memory does not grow.
+    remember: keep all acts and all output levels, to examine them later; without it memory does not
+    grow.
     """
     robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
     backend = usb.RigBackend(rig.Board(fmt, robot, clock), clock, acm=acm)
-    return SimDevices(clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=fmt)
+    return SimDevices(
+        clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=fmt
+    )

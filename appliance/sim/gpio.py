@@ -1,7 +1,9 @@
-"""Simulated GPIO: a double of the module gpiod (libgpiod v2) below the real trigger and output drivers.
+"""Simulated GPIO: a double of the module gpiod (libgpiod v2) below the real trigger and output
+drivers.
 
-In: levels of named inputs, each with its time. Out: edge events as the kernel queues and drops them, and a list of what
-was written to outputs. Simulated are chips, lines and requests; enums, settings, events and errors are gpiod's.
+In: levels of named inputs, each with its time. Out: edge events as the kernel queues and drops
+them, and a list of what was written to outputs. Simulated are chips, lines and requests; enums,
+settings, events and errors are gpiod's.
 """
 
 from __future__ import annotations
@@ -24,12 +26,13 @@ RequestConfig = Mapping[Iterable[int], gpiod.LineSettings]  # offsets on a chip 
 
 
 class SimGpio:
-    """Replaces the module gpiod. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for an unnamed line.
+    """Replaces the module gpiod. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for
+    an unnamed line.
 
-    written: (t_ns, name, level) of each level that was written to an output, in order; empty without `remember`.
-    requests: the present line requests.
-    watchers: output line -> function that is called with the time when the box raises the line.
-    refuse: path -> errno that a chip raises from now on: 13 permission denied, 19 unplugged.
+    written: (t_ns, name, level) of each level that was written to an output, in order; empty
+    without `remember`. requests: the present line requests. watchers: output line -> function that
+    is called with the time when the box raises the line. refuse: path -> errno that a chip raises
+    from now on: 13 permission denied, 19 unplugged.
     """
 
     __version__ = "sim"
@@ -37,7 +40,9 @@ class SimGpio:
     EdgeEvent = gpiod.EdgeEvent
     line = gpiod.line
 
-    def __init__(self, clock: Clock, chips: Mapping[str, Sequence[str]], *, remember: bool = True) -> None:
+    def __init__(
+        self, clock: Clock, chips: Mapping[str, Sequence[str]], *, remember: bool = True
+    ) -> None:
         self.written: MutableSequence[tuple[int, str, bool]] = [] if remember else deque(maxlen=0)
         self.requests: list[SimRequest] = []
         self.refuse: dict[str, int] = {}
@@ -47,7 +52,8 @@ class SimGpio:
         self._plan, self._order = list[tuple[int, int, str, bool]](), count()
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Schedule `level` of the input line `name` for `t_ns`, which is also the time stamp of the edge."""
+        """Schedule `level` of the input line `name` for `t_ns`, which is also the time stamp of the
+        edge."""
         if not any(name in names for names in self._chips.values()):
             raise ValueError(f"no simulated gpio line is named {name!r}; add it to chips")
         heapq.heappush(self._plan, (t_ns, next(self._order), name, bool(level)))
@@ -75,11 +81,18 @@ class SimGpio:
         """As in gpiod; lines are given by their offsets."""
         self.now_ns()
         self.check(path)
-        settings = {offset: line_settings for offsets, line_settings in config.items() for offset in offsets}
+        settings = {
+            offset: line_settings for offsets, line_settings in config.items() for offset in offsets
+        }
         names = {offset: self._chips[path][offset] for offset in settings}
-        if any(request.path == path and request.names.keys() & names.keys() for request in self.requests):
+        if any(
+            request.path == path and request.names.keys() & names.keys()
+            for request in self.requests
+        ):
             raise OSError(16, os.strerror(16))
-        levels = {o: self._driven.get(name, settings[o].bias is Bias.PULL_UP) for o, name in names.items()}
+        levels = {
+            o: self._driven.get(name, settings[o].bias is Bias.PULL_UP) for o, name in names.items()
+        }
         self.requests.append(SimRequest(self, path, names, settings, levels, event_buffer_size))
         return self.requests[-1]
 
@@ -100,14 +113,22 @@ class SimGpio:
 
 
 class SimRequest:
-    """As gpiod's LineRequest. queue: the kernel's event queue, which drops its oldest event when full."""
+    """As gpiod's LineRequest. queue: the kernel's event queue, which drops its oldest event when
+    full."""
 
     def __init__(
-        self, gpio: SimGpio, path: str, names: dict[int, str], settings: dict[int, gpiod.LineSettings],
-        levels: dict[int, bool], size: int,
-    ) -> None:  # fmt: skip
+        self,
+        gpio: SimGpio,
+        path: str,
+        names: dict[int, str],
+        settings: dict[int, gpiod.LineSettings],
+        levels: dict[int, bool],
+        size: int,
+    ) -> None:
         self.path, self.names, self.settings = path, names, settings
-        size = min(size or 16 * len(names), 1024)  # the kernel's limit; it rounds up to a power of two
+        size = min(
+            size or 16 * len(names), 1024
+        )  # the kernel's limit; it rounds up to a power of two
         self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=1 << (size - 1).bit_length())
         self._gpio, self._levels = gpio, levels
         self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}
@@ -117,7 +138,10 @@ class SimRequest:
         for offset in (o for o, n in self.names.items() if n == name and self._levels[o] != level):
             self._levels[offset] = level
             rise = level != self.settings[offset].active_low
-            if self.settings[offset].edge_detection in (Edge.BOTH, Edge.RISING if rise else Edge.FALLING):
+            if self.settings[offset].edge_detection in (
+                Edge.BOTH,
+                Edge.RISING if rise else Edge.FALLING,
+            ):
                 event_type = EventType.RISING_EDGE if rise else EventType.FALLING_EDGE
                 numbers = next(self._seqno), next(self._line_seqno[offset])
                 self.queue.append(gpiod.EdgeEvent(event_type.value, t_ns, offset, *numbers))
@@ -136,7 +160,10 @@ class SimRequest:
     def get_values(self, lines: Iterable[int]) -> list[Value]:
         """As in gpiod."""
         self._now_ns()
-        return [Value.ACTIVE if self._levels[o] != self.settings[o].active_low else Value.INACTIVE for o in lines]
+        return [
+            Value.ACTIVE if self._levels[o] != self.settings[o].active_low else Value.INACTIVE
+            for o in lines
+        ]
 
     def set_values(self, values: Mapping[int, Value]) -> None:
         """As in gpiod."""

@@ -1,5 +1,6 @@
-"""The simulated robot and readout board on one timeline, and clocks that can skip time. In: Acts (the frames of one
-sweep and the positions of its edges). Out: packets as in PROTOCOL.md and edges, each at its time.
+"""The simulated robot and readout board on one timeline, and clocks that can skip time. In: Acts
+(the frames of one sweep and the positions of its edges). Out: packets as in PROTOCOL.md and edges,
+each at its time.
 
 `usb` presents the board to pyusb, `gpio` the edges to the drivers.
 """
@@ -27,7 +28,8 @@ REACTION_NS = 20_000_000
 
 
 class VirtualClock:
-    """Time that passes only in `sleep_until`: minutes are simulated in a fraction of a second, reproducibly."""
+    """Time that passes only in `sleep_until`: minutes are simulated in a fraction of a second,
+    reproducibly."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
@@ -42,7 +44,8 @@ class VirtualClock:
 
 
 class SkippingClock:
-    """Real time without waiting: computing takes real time, sleeping none. For measuring the box's computing time."""
+    """Real time without waiting: computing takes real time, sleeping none. For measuring the box's
+    computing time."""
 
     def __init__(self) -> None:
         self._skipped_ns = 0
@@ -58,8 +61,8 @@ class SkippingClock:
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at which its edges come. label: the
-    material. new_object: NEW OBJECT comes with the first frame."""
+    """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at
+    which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame."""
 
     frames: NDArray[Any]
     start: int
@@ -81,16 +84,24 @@ class EdgeLines(Protocol):
 
 
 class Robot:
-    """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their frames.
+    """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their
+    frames.
 
-    acts: number that it has begun. played: the acts as they were played; without `remember` only the newest.
-    skipped: frame numbers [from, to) that were omitted because it stopped early; the board leaves them out.
+    acts: number that it has begun. played: the acts as they were played; without `remember` only
+    the newest. skipped: frame numbers [from, to) that were omitted because it stopped early; the
+    board leaves them out.
     """
 
     def __init__(
-        self, script: Iterator[Act], lines: EdgeLines, *, start: str, stop: str, new_object: str = "",
+        self,
+        script: Iterator[Act],
+        lines: EdgeLines,
+        *,
+        start: str,
+        stop: str,
+        new_object: str = "",
         remember: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.acts = 0
         self.played: MutableSequence[Act] = [] if remember else deque(maxlen=1)
         self.finished = False
@@ -100,7 +111,8 @@ class Robot:
         self._start, self._stop, self._new_object = start, stop, new_object
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
-        """Begin the next act with frame `first`, schedule its edges and return it; None when the script has ended.
+        """Begin the next act with frame `first`, schedule its edges and return it; None when the
+        script has ended.
 
         frame_ns: gives the host time at which a frame is taken.
         """
@@ -138,7 +150,9 @@ class Robot:
             self._lines.drive(self._start, False, stop_ns)
         self.skipped = first + at, first + act.stop
         if self.played:
-            self.played[-1] = replace(act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at)
+            self.played[-1] = replace(
+                act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at
+            )
 
     def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
         self._lines.drive(name, True, up_ns)
@@ -154,16 +168,25 @@ class Film:
         self._base = 0  # number of the first frame in _frames
 
     def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script [n, *shape], asked for in order; after its end all counts are 0.
+        """Frames `first` to `first + n` of the script [n, *shape], asked for in order; after its
+        end all counts are 0.
 
-        frame_ns: gives the host time at which a frame is taken; the edges of an act are driven by it.
+        frame_ns: gives the host time at which a frame is taken; the edges of an act are driven by
+        it.
         """
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
-            self._frames, self._robot.skipped = np.delete(self._frames, slice(begin, end), axis=0), None
+            self._frames, self._robot.skipped = (
+                np.delete(self._frames, slice(begin, end), axis=0),
+                None,
+            )
         while first + n > self._base + len(self._frames):
             act = self._robot.next_act(self._base + len(self._frames), frame_ns)
-            more = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype) if act is None else act.frames
+            more = (
+                np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype)
+                if act is None
+                else act.frames
+            )
             keep = max(0, min(first - self._base, len(self._frames)))
             self._frames = np.concatenate([self._frames[keep:], more])
             self._base += keep
@@ -171,18 +194,31 @@ class Film:
 
 
 class Board:
-    """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO, sends packets.
+    """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO,
+    sends packets.
 
-    packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal. latency: draws the time in
-    ns from a packet's last frame to its arrival. first_seq: number of its first frame.
+    packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal.
+    latency: draws the time in ns from a packet's last frame to its arrival. first_seq: number of
+    its first frame.
     """
 
     def __init__(
-        self, fmt: SweepFormat, robot: Robot, clock: Clock, *, packet_frames: int = 6, fifo_frames: int = 750,
-        ppm: float = 0.0, latency: Callable[[], int] = lambda: 150_000, serial: str = "SIM0001", first_seq: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        fmt: SweepFormat,
+        robot: Robot,
+        clock: Clock,
+        *,
+        packet_frames: int = 6,
+        fifo_frames: int = 750,
+        ppm: float = 0.0,
+        latency: Callable[[], int] = lambda: 150_000,
+        serial: str = "SIM0001",
+        first_seq: int = 0,
+    ) -> None:
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
-        self.skin = packets.SkinFormat(fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames, fmt.axes)
+        self.skin = packets.SkinFormat(
+            fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames, fmt.axes
+        )
         self.present = True
         self.running = False
         self._clock, self._latency = clock, latency
@@ -220,7 +256,9 @@ class Board:
         if not self.running:
             return None
         if self._arrival_ns is None:
-            self._arrival_ns = self.frame_ns(self._next + self.skin.packet_frames - 1) + self._latency()
+            self._arrival_ns = (
+                self.frame_ns(self._next + self.skin.packet_frames - 1) + self._latency()
+            )
         return self._arrival_ns
 
     def take(self) -> bytes:
@@ -232,4 +270,6 @@ class Board:
         self._next, self._arrival_ns = first + n, None
         device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
         flags = packets.Flag.OVERFLOW if late else 0
-        return packets.pack(self._first_seq + first, device_us, self._film.frames(first, n, self.frame_ns), flags)
+        return packets.pack(
+            self._first_seq + first, device_us, self._film.frames(first, n, self.frame_ns), flags
+        )

@@ -1,5 +1,6 @@
-"""Scripts for the simulated robot. In: the name after `--sim`. Out: Acts: sweeps over simulated tubes, a finger at
-rest, or the sweeps of a recorded set, whose windows are exactly the middle of the played sweeps.
+"""Scripts for the simulated robot. In: the name after `--sim`. Out: Acts: sweeps over simulated
+tubes, a finger at rest, or the sweeps of a recorded set, whose windows are exactly the middle of
+the played sweeps.
 """
 
 from __future__ import annotations
@@ -21,19 +22,22 @@ from appliance.sim.rig import Act
 
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14
-"""Time that the finger is off the tube before and after a sweep; drawn for each one, so that edges fall anywhere within
-packets."""
+"""Time that the finger is off the tube before and after a sweep; drawn for each one, so that edges
+fall anywhere within packets."""
 PAUSE_FRAMES = 12
 """Least frames for which it is off, so that a slow skin is seen unloaded, too."""
 SLIDE_S, REST_S = 3.0, 0.1
-"""Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after it."""
+"""Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
+it."""
 LEAD_S = 0.5
-"""Time from an edge to a recorded window, equal to `sweep.lead_ms`; the window's first and last frame are repeated for
-this time."""
+"""Time from an edge to a recorded window, equal to `sweep.lead_ms`; the window's first and last
+frame are repeated for this time."""
 LIFTED_SET_S = 0.4
-"""Time that the finger is lifted before a sweep of a set, which says nothing of the unloaded skin: all counts are 0."""
+"""Time that the finger is lifted before a sweep of a set, which says nothing of the unloaded skin:
+all counts are 0."""
 RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
-"""Positions of the skin while somebody aligns it, each better than the last: (along the finger, across)."""
+"""Positions of the skin while somebody aligns it, each better than the last: (along the finger,
+across)."""
 RESTS_FOR_S, LIFTED_S = 3.0, 1.0
 """Time that the finger then rests on the tube, and that it is lifted before."""
 MARGIN = 8
@@ -47,12 +51,19 @@ _NAME_BUNDLE = (
 
 
 def named(
-    name: str, fmt: SweepFormat | None, seed: int, *, spread: bool = False, seen: SeenTubes | None = None
+    name: str,
+    fmt: SweepFormat | None,
+    seed: int,
+    *,
+    spread: bool = False,
+    seen: SeenTubes | None = None,
 ) -> tuple[Iterator[Act], str, SweepFormat]:
-    """The script with this name after `--sim`, the name of the source in sentences, and the format of its sweeps.
+    """The script with this name after `--sim`, the name of the source in sentences, and the format
+    of its sweeps.
 
-    fmt: what the bundle wants, None without one. spread: play the sweeps of a set in an order that is drawn, the
-    materials in turn. seen: the skin on the finger, None for the simulator's own. Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    fmt: what the bundle wants, None without one. spread: play the sweeps of a set in an order that
+    is drawn, the materials in turn. seen: the skin on the finger, None for the simulator's own.
+    Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
@@ -68,16 +79,27 @@ def named(
             hint = _NAME_BUNDLE if seen else _NAME_SKIN
             raise FormatError(f"the simulated skin sends {sent}, {fmt} is wanted; {hint}")
         _, world, by = fits[0]
-        acts = rests(seed, world, by) if name == "rest" else tubes(seed, world=world, seen=by, only=only)
+        acts = (
+            rests(seed, world, by)
+            if name == "rest"
+            else tubes(seed, world=world, seen=by, only=only)
+        )
         return acts, "sim", fmt
     if name.startswith(SETS):
         sweeps = load(Path(name.removeprefix(SETS)), fmt)
-        return play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps))), "replay", sweeps.format
-    raise ConfigError(f"--sim {name} is unknown; use skin, skin:MATERIAL, rest, or replay:FILE with a sweep set")
+        return (
+            play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps))),
+            "replay",
+            sweeps.format,
+        )
+    raise ConfigError(
+        f"--sim {name} is unknown; use skin, skin:MATERIAL, rest, or replay:FILE with a sweep set"
+    )
 
 
 class SeenTubes(Protocol):
-    """What a skin on the finger sees: the module `skin`, or the view of another skin (`skins.sweeps`)."""
+    """What a skin on the finger sees: the module `skin`, or the view of another skin
+    (`skins.sweeps`)."""
 
     @property
     def FORMAT(self) -> SweepFormat:
@@ -89,31 +111,53 @@ class SeenTubes(Protocol):
         ...
 
     def sweep(
-        self, material: str, placement: skin.Placement, rng: Generator, world: skin.World, *,
-        rest_s: float, slide_s: float, after_s: float,
-    ) -> NDArray[Any]:  # fmt: skip
+        self,
+        material: str,
+        placement: skin.Placement,
+        rng: Generator,
+        world: skin.World,
+        *,
+        rest_s: float,
+        slide_s: float,
+        after_s: float,
+    ) -> NDArray[Any]:
         """A sweep over a tube."""
         ...
 
 
 def tubes(
-    seed: int, sweeps: int | None = None, places: Sequence[skin.Placement] = (), world: skin.World = skin.WORLD,
-    seen: SeenTubes = skin, only: str = "",
-) -> Iterator[Act]:  # fmt: skip
+    seed: int,
+    sweeps: int | None = None,
+    places: Sequence[skin.Placement] = (),
+    world: skin.World = skin.WORLD,
+    seen: SeenTubes = skin,
+    only: str = "",
+) -> Iterator[Act]:
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
-    sweeps: their number; None for no end. places: positions of the skin, the next one for each round of six tubes; by
-    default one that is drawn from `seed`. seen: through which skin. only: over this tube alone. Raises ConfigError for
-    an unknown one.
+    sweeps: their number; None for no end. places: positions of the skin, the next one for each
+    round of six tubes; by default one that is drawn from `seed`. seen: through which skin. only:
+    over this tube alone. Raises ConfigError for an unknown one.
     """
     materials = (world.tube(only).name,) if only else skin.MATERIALS
-    return _tubes(np.random.default_rng(seed), sweeps, places or skin.placements("T-LAB", seed), world, seen, materials)
+    return _tubes(
+        np.random.default_rng(seed),
+        sweeps,
+        places or skin.placements("T-LAB", seed),
+        world,
+        seen,
+        materials,
+    )
 
 
 def _tubes(
-    rng: Generator, sweeps: int | None, places: Sequence[skin.Placement], world: skin.World, seen: SeenTubes,
+    rng: Generator,
+    sweeps: int | None,
+    places: Sequence[skin.Placement],
+    world: skin.World,
+    seen: SeenTubes,
     materials: Sequence[str],
-) -> Iterator[Act]:  # fmt: skip
+) -> Iterator[Act]:
     rate = seen.FORMAT.rate_hz
     rounds = itertools.cycle(places)
     tubes_left: list[str] = []
@@ -128,7 +172,8 @@ def _tubes(
 
 
 def rests(seed: int, world: skin.World = skin.WORLD, seen: SeenTubes = skin) -> Iterator[Act]:
-    """A finger that is lifted and put on the wooden tube again, without end; the skin is moved between the touches."""
+    """A finger that is lifted and put on the wooden tube again, without end; the skin is moved
+    between the touches."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
@@ -149,9 +194,13 @@ def load(path: Path, fmt: SweepFormat | None) -> SweepSet:
 
 
 def in_turn(labels: NDArray[Any], seed: int) -> list[int]:
-    """An order of sweeps in which the materials come in turn, in each round in another order. labels: int [N]."""
+    """An order of sweeps in which the materials come in turn, in each round in another order.
+    labels: int [N]."""
     rng = np.random.default_rng(seed)
-    waiting = {label: rng.permutation(np.flatnonzero(labels == label)).tolist() for label in np.unique(labels).tolist()}
+    waiting = {
+        label: rng.permutation(np.flatnonzero(labels == label)).tolist()
+        for label in np.unique(labels).tolist()
+    }
     order = []
     while waiting:
         for label in rng.permutation(list(waiting)).tolist():
@@ -166,10 +215,20 @@ def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
     before = None
     lead, lifted = (round(s * sweeps.format.rate_hz) for s in (LEAD_S, LIFTED_SET_S))
     start = lifted + MARGIN
-    stop = start + 2 * lead + sweeps.format.window // 2 * 2  # even, so that a frame lies in the middle
+    stop = (
+        start + 2 * lead + sweeps.format.window // 2 * 2
+    )  # even, so that a frame lies in the middle
     for i in order:
         window, now = sweeps.samples[i], None if recording is None else recording[i]
         ahead, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
-        frames = np.concatenate([np.zeros((lifted, *window.shape[1:]), window.dtype), ahead, window, after])
-        yield Act(frames, start, stop, sweeps.materials[sweeps.labels[i]], now is not None and now != before)
+        frames = np.concatenate(
+            [np.zeros((lifted, *window.shape[1:]), window.dtype), ahead, window, after]
+        )
+        yield Act(
+            frames,
+            start,
+            stop,
+            sweeps.materials[sweeps.labels[i]],
+            now is not None and now != before,
+        )
         before = now

@@ -1,10 +1,11 @@
-"""Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. In: the name of a material, the
-placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4, 4] at 750 Hz; of a skin that feels
-shear, too, int16 [n, 4, 4, 3].
+"""Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. In: the name of a
+material, the placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4,
+4] at 750 Hz; of a skin that feels shear, too, int16 [n, 4, 4, 3].
 
-The finger's pad is a bed of springs that is pressed on the tube. Each further effect is one function, named in
-`EFFECTS`, with its own random stream, so that `World(off=...)` removes one and leaves the others unchanged. Rows are
-along the direction of sliding (x), columns across the tube (y); row 3 leads.
+The finger's pad is a bed of springs that is pressed on the tube. Each further effect is one
+function, named in `EFFECTS`, with its own random stream, so that `World(off=...)` removes one and
+leaves the others unchanged. Rows are along the direction of sliding (x), columns across the tube
+(y); row 3 leads.
 """
 
 from __future__ import annotations
@@ -28,18 +29,26 @@ SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
 SHEAR_FORMAT = replace(FORMAT, dtype="int16", axes=3)
-"""Of a skin with three axes: shear along the sliding, shear across it, pressure; counts of 12 bits with a sign."""
+"""Of a skin with three axes: shear along the sliding, shear across it, pressure; counts of 12 bits
+with a sign."""
 SHEAR_FULL = 2047
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
 STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
-FORCE_LIMIT = 0.2  # precision of the controller: largest error of the force, as a share of the desired one
-SETS = {"T-LAB": (1, 40), "T-REAL": (9, 10), "T-HARD": (1, 10)}  # positions, sweeps of each tube per position
+FORCE_LIMIT = (
+    0.2  # precision of the controller: largest error of the force, as a share of the desired one
+)
+SETS = {
+    "T-LAB": (1, 40),
+    "T-REAL": (9, 10),
+    "T-HARD": (1, 10),
+}  # positions, sweeps of each tube per position
 EFFECTS = ("position", "attachment", "drift", "spot", "texture", "vibration", "noise")
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A tube. pitch_mm and vibration_hz are centres of peaks in the spectrum, `_octaves` their standard deviations."""
+    """A tube. pitch_mm and vibration_hz are centres of peaks in the spectrum, `_octaves` their
+    standard deviations."""
 
     name: str
     softness_mm_per_kpa: float
@@ -64,16 +73,20 @@ MATERIALS = tuple(tube.name for tube in TUBES)
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Physical parameters of the simulation, without the skin's placement and random numbers. off: EFFECTS to omit.
+    """Physical parameters of the simulation, without the skin's placement and random numbers. off:
+    EFFECTS to omit.
 
-    A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were fitted as described in
-    docs/decisions/0003. Raises ConfigError if `off` names an unknown effect.
+    A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were
+    fitted as described in docs/decisions/0003. Raises ConfigError if `off` names an unknown effect.
     """
 
     off: frozenset[str] = frozenset()
     rows: int = FORMAT.rows
     cols: int = FORMAT.cols
-    pitch_mm: tuple[float, float] = (PITCH_MM, PITCH_MM)  # from taxel to taxel, along sliding and across
+    pitch_mm: tuple[float, float] = (
+        PITCH_MM,
+        PITCH_MM,
+    )  # from taxel to taxel, along sliding and across
     tubes: tuple[Material, ...] = TUBES
     speed: float = 1.0  # of sliding, relative to 3 cm/s; friction vibrations keep their frequency
     force_n: float = 1.0
@@ -84,7 +97,9 @@ class World:
     noise_counts: float = 0.36
     gain_spread: float = 0.17  # per attachment, one draw for all taxels and one for each
     bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
-    colour_spread: float = 0.49  # of the transmission of vibrations by tape and glove, per attachment and octave
+    colour_spread: float = (
+        0.49  # of the transmission of vibrations by tape and glove, per attachment and octave
+    )
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
     damping_octaves_per_mm: float = -0.60  # which is lower the closer the skin is to the fingertip;
     relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
@@ -95,7 +110,9 @@ class World:
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):
-            raise ConfigError(f"effect {min(unknown)!r} cannot be switched off; use some of {', '.join(EFFECTS)}")
+            raise ConfigError(
+                f"effect {min(unknown)!r} cannot be switched off; use some of {', '.join(EFFECTS)}"
+            )
 
     def tube(self, name: str) -> Material:
         """The tube of this name. Raises ConfigError for an unknown name."""
@@ -120,7 +137,8 @@ WORLD = World()
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Position of the skin's centre on the pad, along sliding and across, and its rotation. seed: of its attachment."""
+    """Position of the skin's centre on the pad, along sliding and across, and its rotation. seed:
+    of its attachment."""
 
     dx_mm: float = 0.0
     dy_mm: float = 0.0
@@ -129,12 +147,19 @@ class Placement:
 
 
 def band(
-    n: int, tracks: int, centre: float, octaves: float, rate: float, rng: Generator, passed: Array | float = 1.0
+    n: int,
+    tracks: int,
+    centre: float,
+    octaves: float,
+    rate: float,
+    rng: Generator,
+    passed: Array | float = 1.0,
 ) -> Array:
-    """Noise [tracks, n] whose amplitude spectrum is a Gaussian over log frequency, with rms 1 before the gain `passed`.
+    """Noise [tracks, n] whose amplitude spectrum is a Gaussian over log frequency, with rms 1
+    before the gain `passed`.
 
-    centre, rate (sampling): both per second or both per mm. octaves: standard deviation. passed: gain [n // 2 + 1] of
-    the bins of rfft.
+    centre, rate (sampling): both per second or both per mm. octaves: standard deviation. passed:
+    gain [n // 2 + 1] of the bins of rfft.
     """
     amplitude = np.exp(-0.5 * (np.log2(np.fft.rfftfreq(n, 1 / rate)[1:] / centre) / octaves) ** 2)
     amplitude *= n / 2 / np.sqrt(np.sum(amplitude**2))
@@ -144,17 +169,22 @@ def band(
 
 
 def position(placement: Placement, world: World) -> tuple[Array, Array]:
-    """Effect: positions of the taxels' centres on the pad, x and y [R, C] in mm; without it the skin is centred."""
+    """Effect: positions of the taxels' centres on the pad, x and y [R, C] in mm; without it the
+    skin is centred."""
     sits = Placement() if "position" in world.off else placement
     along, across = (
-        (np.arange(n) - (n - 1) / 2) * pitch for n, pitch in zip((world.rows, world.cols), world.pitch_mm, strict=True)
+        (np.arange(n) - (n - 1) / 2) * pitch
+        for n, pitch in zip((world.rows, world.cols), world.pitch_mm, strict=True)
     )
-    place = complex(sits.dx_mm, sits.dy_mm) + (along[:, None] + 1j * across) * np.exp(1j * np.deg2rad(sits.turn_deg))
+    place = complex(sits.dx_mm, sits.dy_mm) + (along[:, None] + 1j * across) * np.exp(
+        1j * np.deg2rad(sits.turn_deg)
+    )
     return place.real, place.imag
 
 
 def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
-    """Effect: influence of the attachment: gains [R, C], bedding height [R, C] in mm, colour of vibrations [7].
+    """Effect: influence of the attachment: gains [R, C], bedding height [R, C] in mm, colour of
+    vibrations [7].
 
     The colour is the logarithm of the gain at 6 Hz and at each octave above it, up to 375 Hz.
     """
@@ -163,11 +193,16 @@ def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]
         return np.ones(grid), np.zeros(grid), np.zeros(7)
     rng = np.random.default_rng(placement.seed)
     gain = np.exp(world.gain_spread * (rng.standard_normal() + rng.standard_normal(grid)))
-    return gain, world.bedding_mm * rng.standard_normal(grid), world.colour_spread * rng.standard_normal(7)
+    return (
+        gain,
+        world.bedding_mm * rng.standard_normal(grid),
+        world.colour_spread * rng.standard_normal(7),
+    )
 
 
 def drift(n: int, rng: Generator, world: World) -> Array:
-    """Effect: contact force [n] in N; half of the controller's error is constant in a sweep, half varies at 0.5 Hz."""
+    """Effect: contact force [n] in N; half of the controller's error is constant in a sweep, half
+    varies at 0.5 Hz."""
     if "drift" in world.off:
         return np.full(n, world.force_n)
     wander = band(max(n, FORMAT.window), 1, 0.5, 1.0, FORMAT.rate_hz, rng)[0, :n]
@@ -176,7 +211,8 @@ def drift(n: int, rng: Generator, world: World) -> Array:
 
 
 def spot(tube: Material, rng: Generator, world: World) -> Material:
-    """Effect: the tube was turned, and its texture and vibrations differ a little from one spot to another."""
+    """Effect: the tube was turned, and its texture and vibrations differ a little from one spot to
+    another."""
     if "spot" in world.off:
         return tube
     height, squeak = np.exp(world.spot_spread * rng.standard_normal(2))
@@ -191,63 +227,86 @@ def spot(tube: Material, rng: Generator, world: World) -> Material:
 
 
 def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
-    """Effect: height [n, R, C] in mm under the taxels, averaged over their length. slid: int64 [n], path in frames.
+    """Effect: height [n, R, C] in mm under the taxels, averaged over their length. slid: int64 [n],
+    path in frames.
 
-    Each column moves over its own track, on which the rows follow one another at the speed of sliding. A skin that
-    extends beyond the pad is not pressed down there: the further forward it is, the more it follows the relief.
+    Each column moves over its own track, on which the rows follow one another at the speed of
+    sliding. A skin that extends beyond the pad is not pressed down there: the further forward it
+    is, the more it follows the relief.
     """
     if "texture" in world.off:
         return np.zeros((1, 1, 1))
     lead = np.rint((x - x.min()) / STEP_MM).astype(np.int64)
     n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length for which the FFT is fast
     blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
-    track = tube.texture_mm * band(n, world.cols, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur)
-    height: Array = np.exp(world.relief_per_mm * x.mean()) * track[np.arange(world.cols), slid[:, None, None] + lead]
+    track = tube.texture_mm * band(
+        n, world.cols, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur
+    )
+    height: Array = (
+        np.exp(world.relief_per_mm * x.mean())
+        * track[np.arange(world.cols), slid[:, None, None] + lead]
+    )
     return height
 
 
-def vibration(tube: Material, x: Array, colour: Array, moving: Flags, rng: Generator, world: World) -> Array:
-    """Effect: friction vibrations of all taxels in phase, [n, 1, 1] as a share of the pressure, while `moving` [n]."""
+def vibration(
+    tube: Material, x: Array, colour: Array, moving: Flags, rng: Generator, world: World
+) -> Array:
+    """Effect: friction vibrations of all taxels in phase, [n, 1, 1] as a share of the pressure,
+    while `moving` [n]."""
     if "vibration" in world.off:
         return np.zeros((1, 1, 1))
     n = len(moving)
     hz = np.fft.rfftfreq(n, 1 / FORMAT.rate_hz)
     octave = np.log2(np.maximum(hz, 1) * 2 / FORMAT.rate_hz) + len(colour) - 1
-    damping = np.hypot(1, hz / (world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean())))
+    damping = np.hypot(
+        1, hz / (world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean()))
+    )
     passed = np.exp(np.interp(octave, np.arange(len(colour)), colour)) / damping
-    shake = tube.vibration * band(n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed)
+    shake = tube.vibration * band(
+        n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed
+    )
     return (shake * moving).reshape(n, 1, 1)
 
 
 def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World) -> Array:
-    """Shear along the rows, shear across, pressure: [n, R, C, 3] in the unit of `pressure` [n, R, C].
+    """Shear along the rows, shear across, pressure: [n, R, C, 3] in the unit of `pressure` [n, R,
+    C].
 
-    Pressure is normal to the surface, which is tilted along the rows by the slope of the relief (`height` [n, R, C] in mm)
-    and across by y / radius (`y` [R, C] in mm from the tube's crest). While the finger is `moving` [n], friction adds
-    its share of the pressure, vibrations included, against the motion; at rest there is none.
+    Pressure is normal to the surface, which is tilted along the rows by the slope of the relief
+    (`height` [n, R, C] in mm) and across by y / radius (`y` [R, C] in mm from the tube's crest).
+    While the finger is `moving` [n], friction adds its share of the pressure, vibrations included,
+    against the motion; at rest there is none.
     """
-    slope = np.diff(height, axis=0, prepend=height[:1]) / (STEP_MM * world.speed)  # 0 where the finger rests
+    slope = np.diff(height, axis=0, prepend=height[:1]) / (
+        STEP_MM * world.speed
+    )  # 0 where the finger rests
     along = -pressure * (slope + world.friction * moving.reshape(-1, 1, 1))
     return np.stack([along, pressure * (y / TUBE_RADIUS_MM), pressure], axis=-1)
 
 
 def noise(n: int, rng: Generator, world: World) -> Array:
     """Effect: white noise of the readout, [n, R, C] or [n, R, C, 3] in counts."""
-    return rng.standard_normal((n, *world.shape)) * (0.0 if "noise" in world.off else world.noise_counts)
+    return rng.standard_normal((n, *world.shape)) * (
+        0.0 if "noise" in world.off else world.noise_counts
+    )
 
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
-    """Distance in mm between the unloaded pad and a tube that it just touches: the tube's curvature across, the pad's
-    end along."""
+    """Distance in mm between the unloaded pad and a tube that it just touches: the tube's curvature
+    across, the pad's end along."""
     return np.square(y) / (2 * TUBE_RADIUS_MM) + (x / world.pad_half_mm) ** 6
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
-    """Indentation [n] in mm of the pad by `force_n` [n] in N, which the springs of the whole contact area carry."""
+    """Indentation [n] in mm of the pad by `force_n` [n] in N, which the springs of the whole
+    contact area carry."""
     x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
     depth = np.linspace(0, 8, 161)
     pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
-    across = 4 / 3 * np.sqrt(2 * TUBE_RADIUS_MM * pressed) * pressed  # the springs of one x, integrated over y
+    across = (
+        4 / 3 * np.sqrt(2 * TUBE_RADIUS_MM * pressed) * pressed
+    )  # the springs of one x, integrated over y
     newton = kpa_per_mm * across.sum(axis=1) * (x[1] - x[0]) / 1000
     return np.interp(force_n, newton, depth)
 
@@ -258,8 +317,11 @@ def digitize(signal: Array, world: World) -> Counts:
     return np.clip(np.rint(signal), least, most).astype(world.format.numpy_type)
 
 
-def loaded(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Array:
-    """The readout's signal [n, R, C] or [n, R, C, 3] in counts of a finger in contact, before its noise and its converter.
+def loaded(
+    tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags
+) -> Array:
+    """The readout's signal [n, R, C] or [n, R, C, 3] in counts of a finger in contact, before its
+    noise and its converter.
 
     slid: path along the tube in frames [n]. moving: [n].
     """
@@ -269,15 +331,20 @@ def loaded(tube: Material, placement: Placement, rng: Generator, world: World, s
     tube = spot(tube, of_spot, world)
     kpa_per_mm = 1 / (1 / world.pad_kpa_per_mm + tube.softness_mm_per_kpa)
     depth = indentation(drift(len(slid), of_drift, world), kpa_per_mm, world)[:, None, None]
-    height = bedding + texture(tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world)
+    height = bedding + texture(
+        tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world
+    )
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
     signal: Array = world.counts_per_kpa * gain * pressure_kpa
     return shear(signal, height, y, moving, world) if world.shear else signal
 
 
-def _touch(tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags) -> Counts:
-    """Raw counts [n, R, C] or [n, R, C, 3] of a finger in contact. slid: path on the tube in frames [n]. moving: [n]."""
+def _touch(
+    tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags
+) -> Counts:
+    """Raw counts [n, R, C] or [n, R, C, 3] of a finger in contact. slid: path on the tube in frames
+    [n]. moving: [n]."""
     signal = loaded(tube, placement, rng, world, slid, moving)
     return digitize(signal + noise(len(slid), rng.spawn(1)[0], world), world)
 
@@ -299,17 +366,26 @@ def sweep(
     slide_s: float = 3.0,
     after_s: float = 0.3,
 ) -> Counts:
-    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger that rests on the tube, slides along it and rests again.
+    """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger that rests on the tube, slides along it and
+    rests again.
 
-    The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an unknown material.
+    The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an
+    unknown material.
     """
     return _touch(world.tube(material), placement, rng, world, *slide(rest_s, slide_s, after_s))
 
 
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Counts:
-    """The middle two seconds of a slide, raw counts [1500, 4, 4] or [1500, 4, 4, 3]. Raises ConfigError for an unknown
-    material."""
-    return _touch(world.tube(material), placement, rng, world, np.arange(FORMAT.window), np.ones(FORMAT.window, bool))
+    """The middle two seconds of a slide, raw counts [1500, 4, 4] or [1500, 4, 4, 3]. Raises
+    ConfigError for an unknown material."""
+    return _touch(
+        world.tube(material),
+        placement,
+        rng,
+        world,
+        np.arange(FORMAT.window),
+        np.ones(FORMAT.window, bool),
+    )
 
 
 def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
@@ -318,36 +394,46 @@ def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
 
 
 def _set_rng(name: SetName, seed: int) -> Generator:
-    """Random generator of a set; sets with the same seed are independent. Raises ConfigError for an unknown set."""
+    """Random generator of a set; sets with the same seed are independent. Raises ConfigError for an
+    unknown set."""
     if name not in SETS:
         raise ConfigError(f"sweep set {name!r} is unknown; use one of {', '.join(SETS)}")
     return np.random.default_rng([seed, *name.encode()])
 
 
 def placements(name: SetName, seed: int) -> list[Placement]:
-    """Placements of a set: within 1 mm of the middle, in T-HARD one row (4 mm) forward; rotated by 2 degrees rms.
+    """Placements of a set: within 1 mm of the middle, in T-HARD one row (4 mm) forward; rotated by
+    2 degrees rms.
 
     Raises ConfigError for an unknown set.
     """
     rng = _set_rng(name, seed)
     places = []
     for _ in range(SETS[name][0]):
-        aside = np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())  # uniform on a disc of 1 mm radius
+        aside = np.sqrt(rng.random()) * np.exp(
+            2j * np.pi * rng.random()
+        )  # uniform on a disc of 1 mm radius
         dx_mm = PITCH_MM if name == "T-HARD" else float(aside.real)
-        places.append(Placement(dx_mm, float(aside.imag), 2 * rng.standard_normal(), int(rng.integers(2**32))))
+        places.append(
+            Placement(dx_mm, float(aside.imag), 2 * rng.standard_normal(), int(rng.integers(2**32)))
+        )
     return places
 
 
-def sweep_set(name: SetName, seed: int, per_material: int | None = None, world: World = WORLD) -> LabelledWindows:
-    """A set of the paper: windows [N, 1500, 4, 4] or [N, 1500, 4, 4, 3], labels int64 [N] into MATERIALS, positions
-    int64 [N].
+def sweep_set(
+    name: SetName, seed: int, per_material: int | None = None, world: World = WORLD
+) -> LabelledWindows:
+    """A set of the paper: windows [N, 1500, 4, 4] or [N, 1500, 4, 4, 3], labels int64 [N] into
+    MATERIALS, positions int64 [N].
 
-    per_material: windows of each tube at each position (default: as in the paper). Raises ConfigError for an unknown
-    set.
+    per_material: windows of each tube at each position (default: as in the paper). Raises
+    ConfigError for an unknown set.
     """
     places = placements(name, seed)
     each = SETS[name][1] if per_material is None else per_material
-    position_of, label_of = np.divmod(np.arange(len(places) * len(MATERIALS) * each) // each, len(MATERIALS))
+    position_of, label_of = np.divmod(
+        np.arange(len(places) * len(MATERIALS) * each) // each, len(MATERIALS)
+    )
     samples = np.empty((len(label_of), FORMAT.window, *world.format.shape), world.format.numpy_type)
     for i, rng in enumerate(_set_rng(name, seed).spawn(len(samples))):
         samples[i] = window(MATERIALS[label_of[i]], places[position_of[i]], rng, world)

@@ -1,7 +1,8 @@
-"""A simulated USB bus: a pyusb backend with one readout board. In: a Board, and faults to simulate. Out: descriptors,
-replies, transfers, and the errnos of libusb.
+"""A simulated USB bus: a pyusb backend with one readout board. In: a Board, and faults to simulate.
+Out: descriptors, replies, transfers, and the errnos of libusb.
 
-Simulated is libusb with everything below it; usb.core, usb.util and the drivers above are the real ones.
+Simulated is libusb with everything below it; usb.core, usb.util and the drivers above are the real
+ones.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ SPEED_FULL = 2
 class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     """A pyusb backend with one board on it.
 
-    errors: errno that all calls of a kind raise, by name ("claim", "open", "read" and so on). mangle: changes the bytes
-    of a transfer, as a bad cable. halted: the bulk endpoint stalls until it is cleared. kernel_driver: cdc_acm holds
-    the board. dtr: the host has said that it reads (CDC-ACM).
+    errors: errno that all calls of a kind raise, by name ("claim", "open", "read" and so on).
+    mangle: changes the bytes of a transfer, as a bad cable. halted: the bulk endpoint stalls until
+    it is cleared. kernel_driver: cdc_acm holds the board. dtr: the host has said that it reads
+    (CDC-ACM).
     """
 
     def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
@@ -64,7 +66,9 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
             code = self.errors[what]
             raise usb.core.USBError("simulated failure", -1, code)
         if not self.board.present:
-            raise usb.core.USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
+            raise usb.core.USBError(
+                "No such device (it may have been disconnected)", -4, errno.ENODEV
+            )
 
     def _wait(self, t_ns: int) -> None:
         """Sleep until `t_ns` or until the next scheduled action."""
@@ -81,37 +85,77 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     def get_device_descriptor(self, dev: str) -> SimpleNamespace:
         """pyusb: the device descriptor."""
         return SimpleNamespace(
-            bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0xEF if self.acm else 0, bDeviceSubClass=0,
-            bDeviceProtocol=0, bMaxPacketSize0=64, idVendor=VENDOR_ID, idProduct=PRODUCT_ID, bcdDevice=0x100,
-            iManufacturer=1, iProduct=2, iSerialNumber=3, bNumConfigurations=1, bus=1, address=1, port_number=1,
-            port_numbers=(1,), speed=SPEED_FULL,
-        )  # fmt: skip
+            bLength=18,
+            bDescriptorType=1,
+            bcdUSB=0x200,
+            bDeviceClass=0xEF if self.acm else 0,
+            bDeviceSubClass=0,
+            bDeviceProtocol=0,
+            bMaxPacketSize0=64,
+            idVendor=VENDOR_ID,
+            idProduct=PRODUCT_ID,
+            bcdDevice=0x100,
+            iManufacturer=1,
+            iProduct=2,
+            iSerialNumber=3,
+            bNumConfigurations=1,
+            bus=1,
+            address=1,
+            port_number=1,
+            port_numbers=(1,),
+            speed=SPEED_FULL,
+        )
 
     def get_configuration_descriptor(self, dev: str, config: int) -> SimpleNamespace:
         """pyusb: the one configuration."""
         return SimpleNamespace(
-            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1 + self.acm, bConfigurationValue=1,
-            iConfiguration=0, bmAttributes=0x80, bMaxPower=50, extra_descriptors=[],
-        )  # fmt: skip
+            bLength=9,
+            bDescriptorType=2,
+            wTotalLength=32,
+            bNumInterfaces=1 + self.acm,
+            bConfigurationValue=1,
+            iConfiguration=0,
+            bmAttributes=0x80,
+            bMaxPower=50,
+            extra_descriptors=[],
+        )
 
-    def get_interface_descriptor(self, dev: str, intf: int, alt: int, config: int) -> SimpleNamespace:
+    def get_interface_descriptor(
+        self, dev: str, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
         """pyusb: vendor class, or the two interfaces of CDC-ACM."""
         classes = (2, 10) if self.acm else (255,)
         if intf >= len(classes) or alt:
             raise IndexError
         return SimpleNamespace(
-            bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
-            bNumEndpoints={2: 0, 10: 2, 255: 1}[classes[intf]], bInterfaceClass=classes[intf], bInterfaceSubClass=0,
-            bInterfaceProtocol=0, iInterface=0, extra_descriptors=[],
-        )  # fmt: skip
+            bLength=9,
+            bDescriptorType=4,
+            bInterfaceNumber=intf,
+            bAlternateSetting=0,
+            bNumEndpoints={2: 0, 10: 2, 255: 1}[classes[intf]],
+            bInterfaceClass=classes[intf],
+            bInterfaceSubClass=0,
+            bInterfaceProtocol=0,
+            iInterface=0,
+            extra_descriptors=[],
+        )
 
-    def get_endpoint_descriptor(self, dev: str, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+    def get_endpoint_descriptor(
+        self, dev: str, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
         """pyusb: bulk IN 0x81, and bulk OUT 0x02 of CDC-ACM."""
         addresses = (0x81, 0x02) if self.acm and intf else () if self.acm else (0x81,)
         return SimpleNamespace(
-            bLength=7, bDescriptorType=5, bEndpointAddress=addresses[ep], bmAttributes=2, wMaxPacketSize=MAX_PACKET,
-            bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
-        )  # fmt: skip
+            bLength=7,
+            bDescriptorType=5,
+            bEndpointAddress=addresses[ep],
+            bmAttributes=2,
+            wMaxPacketSize=MAX_PACKET,
+            bInterval=0,
+            bRefresh=0,
+            bSynchAddress=0,
+            extra_descriptors=[],
+        )
 
     def open_device(self, dev: str) -> str:
         """pyusb: open the board."""
@@ -151,7 +195,14 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.halted = False
 
     def ctrl_transfer(
-        self, handle: str, kind: int, request: int, value: int, index: int, data: array[int], ms: int
+        self,
+        handle: str,
+        kind: int,
+        request: int,
+        value: int,
+        index: int,
+        data: array[int],
+        ms: int,
     ) -> int:
         """pyusb: standard string descriptors and the requests of PROTOCOL.md."""
         self._touch("control")
@@ -159,7 +210,9 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
             self.dtr = bool(value & 1)
             return 0
         if kind == 0x80 and request == 6 and value >> 8 == 3:
-            text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[value & 0xFF]
+            text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[
+                value & 0xFF
+            ]
             body = b"\x09\x04" if value & 0xFF == 0 else text.encode("utf-16-le")
             reply: bytes | None = bytes([len(body) + 2, 3]) + body
         else:

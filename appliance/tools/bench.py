@@ -1,7 +1,9 @@
-"""`palpate bench`: latency, inference, memory, start and processor share of this machine, with the simulated skin.
+"""`palpate bench`: latency, inference, memory, start and processor share of this machine, with the
+simulated skin.
 
-In: a way to build a box on simulated devices. Out: a line for each figure, and all of them as JSON with plain keys.
-Memory, start and processor share are measured in separate processes, so that nothing of the bench is in them.
+In: a way to build a box on simulated devices. Out: a line for each figure, and all of them as JSON
+with plain keys. Memory, start and processor share are measured in separate processes, so that
+nothing of the bench is in them.
 """
 
 from __future__ import annotations
@@ -39,14 +41,21 @@ from appliance.tools.bench_process import Build, drain
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
-def run(bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
+def run(
+    bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]
+) -> dict[str, Any]:
     """All figures; `report` gets a line for each as soon as it is there.
 
-    references: folder of the models that are timed beside the bundle, made if it is not there. seed: of the simulated
-    sweeps. Raises BundleError where the references cannot be made.
+    references: folder of the models that are timed beside the bundle, made if it is not there.
+    seed: of the simulated sweeps. Raises BundleError where the references cannot be made.
     """
     load_before = os.getloadavg()
-    figures: dict[str, Any] = {"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id}
+    figures: dict[str, Any] = {
+        "commit": commit(),
+        "seed": seed,
+        "machine": _machine(),
+        "bundle": bundle.id,
+    }
 
     def add(more: dict[str, Any]) -> None:
         figures.update(more)
@@ -57,7 +66,9 @@ def run(bundle: Bundle, build: Build, references: Path, seed: int, report: Calla
     add(_whole_way(bundle.format, build, seed))
     add({"inference_ms": _inference(bundle, references, seed)})
     if "fp32" not in figures["inference_ms"]:
-        report("fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)")
+        report(
+            "fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)"
+        )
     for name in bench_process.NAMES:
         add(_child(name, seed))
     add(_cold_start())
@@ -79,11 +90,14 @@ def _size_kb(bundle: Bundle) -> dict[str, float]:
 
 
 def _percentiles(values: list[float]) -> dict[str, float]:
-    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {"n": len(values)}
+    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {
+        "n": len(values)
+    }
 
 
 class _Watch(Observer):
-    """Measures how late answers are: when it gets a verdict, the sentence has been written to the serial port."""
+    """Measures how late answers are: when it gets a verdict, the sentence has been written to the
+    serial port."""
 
     def __init__(self, clock: Clock) -> None:
         self.verdicts: list[Verdict] = []
@@ -101,16 +115,18 @@ class _Watch(Observer):
 
 
 def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set has. Computing takes
-    its real time, waiting is skipped.
+    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set
+    has. Computing takes its real time, waiting is skipped.
 
-    edge_to_sentence_ms: from the moment when stop edge and last frame of the window have been read to the sentence at
-    the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that moment (glitch filter, rest of a
-    packet).
+    edge_to_sentence_ms: from the moment when stop edge and last frame of the window have been read
+    to the sentence at the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that
+    moment (glitch filter, rest of a packet).
     """
     clock = rig.SkippingClock()
     watch = _Watch(clock)
-    simulated = devices.build(fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim")
+    simulated = devices.build(
+        fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
+    )
     with ExitStack() as stack:
         box, far_end = build(simulated, stack, [watch])
         while not simulated.finished(box.answered):
@@ -120,7 +136,11 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     return {
-        "accuracy": {"right": right, "total": SWEEPS, "interval": [round(v, 4) for v in wilson(right, SWEEPS)]},
+        "accuracy": {
+            "right": right,
+            "total": SWEEPS,
+            "interval": [round(v, 4) for v in wilson(right, SWEEPS)],
+        },
         "frames_lost": lost,
         "edge_to_sentence_ms": _percentiles(watch.answered_ms),
         "edge_seen_ms": _percentiles(watch.seen_ms),
@@ -128,7 +148,8 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
 
 
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
-    """Times of the bundle, of the same network in float and of the paper's network in int8, measured in turns."""
+    """Times of the bundle, of the same network in float and of the paper's network in int8,
+    measured in turns."""
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
     calls: dict[str, Callable[[], object]] = {}
@@ -150,11 +171,14 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
 
 
 def _make_references(folder: Path) -> None:
-    """Let the desktop's tools write the reference models, where they are installed beside this program."""
+    """Let the desktop's tools write the reference models, where they are installed beside this
+    program."""
     tool = Path(sys.executable).with_name("palpate-train")
     if folder.is_dir() or not tool.exists():
         return
-    done = subprocess.run([tool, "references", "--out", str(folder)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [tool, "references", "--out", str(folder)], capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise BundleError(f"palpate-train references failed: {done.stderr.strip()[-300:]}")
 
@@ -171,7 +195,8 @@ def _child(name: str, seed: int) -> dict[str, Any]:
 
 
 def _cold_start() -> dict[str, Any]:
-    """Seconds from the start of the process to READY with a streaming skin, as the first state sentence reports it."""
+    """Seconds from the start of the process to READY with a streaming skin, as the first state
+    sentence reports it."""
     took = []
     command = [sys.executable, "-m", "appliance", "run", "--sim", "skin"]
     for _ in range(STARTS):
@@ -182,11 +207,18 @@ def _cold_start() -> dict[str, Any]:
                 pass
             took.append(time.monotonic() - start)
             box.terminate()
-    return {"cold_start_s": round(statistics.median(took), 3), "cold_start_worst_s": round(max(took), 3)}
+    return {
+        "cold_start_s": round(statistics.median(took), 3),
+        "cold_start_worst_s": round(max(took), 3),
+    }
 
 
 def _machine() -> dict[str, Any]:
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
+    versions = {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "onnxruntime": ort.__version__,
+    }
     machine = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
     return machine | versions | {"processor": _processor()}
 
@@ -197,4 +229,6 @@ def _processor() -> str:
     if board.is_file():
         return board.read_text().strip("\0\n ")
     lines = names.read_text().splitlines() if names.is_file() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), ""
+    )

@@ -1,7 +1,8 @@
 """The figures of the bench that are measured in a process of their own: memory and processor share.
 
-In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here: it is no part of the
-box. Nor is the simulated board, but it must be: it is loaded last, so that what it takes is measured.
+In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here:
+it is no part of the box. Nor is the simulated board, but it must be: it is loaded last, so that
+what it takes is measured.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ NAMES = ("memory", "stream")
 
 
 class Build(Protocol):
-    """Builds a box on simulated devices, which `stack` closes. Out: the box, and the robot's end of its serial line."""
+    """Builds a box on simulated devices, which `stack` closes. Out: the box, and the robot's end of
+    its serial line."""
 
     def __call__(
         self,
@@ -50,7 +52,8 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 
 def measure(name: str, fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """The part `name` of NAMES, measured in this process while the acts in `path` are played again and again."""
+    """The part `name` of NAMES, measured in this process while the acts in `path` are played again
+    and again."""
     return {"memory": _memory, "stream": _stream}[name](fmt, build, path)
 
 
@@ -73,8 +76,9 @@ def drain(far_end: int) -> None:
 def _memory(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
 
-    without_board: less what loading the simulated board and its acts took. What the board takes while it plays is still
-    in it. growth_last_900: since a tenth of them, with what the allocator takes at first. growth_next_900: from then on.
+    without_board: less what loading the simulated board and its acts took. What the board takes
+    while it plays is still in it. growth_last_900: since a tenth of them, with what the allocator
+    takes at first. growth_next_900: from then on.
     """
     n, rss_mb = MEMORY_SWEEPS, {}
     board = -_rss_mb()
@@ -88,9 +92,11 @@ def _memory(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
             drain(far_end)
     first, after, later = rss_mb.values()
     figures = {
-        "after_1000": after, "without_board": after - board,
-        "growth_last_900": after - first, "growth_next_900": later - after,
-    }  # fmt: skip
+        "after_1000": after,
+        "without_board": after - board,
+        "growth_last_900": after - first,
+        "growth_next_900": later - after,
+    }
     return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}
 
 
@@ -100,7 +106,8 @@ def _rss_mb() -> float:
 
 
 def _stream(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """Share of one core while the skin streams in real time, without and with the simulated readout board."""
+    """Share of one core while the skin streams in real time, without and with the simulated readout
+    board."""
     simulated = _board(fmt, path, SystemClock())
     board_ns = 0
     real_read = simulated.backend.bulk_read

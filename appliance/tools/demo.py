@@ -1,6 +1,8 @@
-"""`palpate demo`: the skin live in the terminal during a sweep, then the verdict with its sentence, at the end a table.
+"""`palpate demo`: the skin live in the terminal during a sweep, then the verdict with its sentence,
+at the end a table.
 
-In: a box on simulated devices and the robot's end of its serial line. Out: pictures on a terminal, else plain lines.
+In: a box on simulated devices and the robot's end of its serial line. Out: pictures on a terminal,
+else plain lines.
 """
 
 from __future__ import annotations
@@ -36,25 +38,40 @@ def bar(probability: float) -> str:
 
 
 def picture(frame: NDArray[Any]) -> list[str]:
-    """A frame [R, C] or [R, C, A] of raw counts, the normal axis alone, as shaded cells with their numbers, two lines a row."""
+    """A frame [R, C] or [R, C, A] of raw counts, the normal axis alone, as shaded cells with their
+    numbers, two lines a row."""
     lines = []
     for row in normal(frame, 0).astype(int):
         level = [min(23, max(0, count) * 24 // BRIGHT) for count in row]
         shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
         lines.append("  " + "".join(f"{colour}{'':6}\033[0m" for colour in shade))
-        lines.append("  " + "".join(f"{colour}{count:^6}\033[0m" for colour, count in zip(shade, row, strict=True)))
+        lines.append(
+            "  "
+            + "".join(
+                f"{colour}{count:^6}\033[0m" for colour, count in zip(shade, row, strict=True)
+            )
+        )
     return lines
 
 
 class Demo:
-    """Steps a box until enough answers have come to the robot's end of its serial line, and shows what happens.
+    """Steps a box until enough answers have come to the robot's end of its serial line, and shows
+    what happens.
 
-    played: the acts of the simulated robot, which hold the true materials. far_end: non-blocking file descriptor of the
-    robot's end. labels: that the bundle knows. raw: print the sentences alone.
+    played: the acts of the simulated robot, which hold the true materials. far_end: non-blocking
+    file descriptor of the robot's end. labels: that the bundle knows. raw: print the sentences
+    alone.
     """
 
     def __init__(
-        self, played: Sequence[Act], far_end: int, clock: Clock, out: IO[str], labels: Collection[str], *, raw: bool
+        self,
+        played: Sequence[Act],
+        far_end: int,
+        clock: Clock,
+        out: IO[str],
+        labels: Collection[str],
+        *,
+        raw: bool,
     ) -> None:
         self.score = AnswerScore(frozenset(labels))
         self._played, self._clock, self._out = played, clock, out
@@ -70,18 +87,37 @@ class Demo:
         while self.score.answers < sweeps and not stopped():
             sent += len(box.step())
             self._read(sent, sweeps)
-            if self._live and self._clock.now_ns() >= self._next_ns and (frame := box.newest_frame()) is not None:
+            if (
+                self._live
+                and self._clock.now_ns() >= self._next_ns
+                and (frame := box.newest_frame()) is not None
+            ):
                 self._next_ns = self._clock.now_ns() + FRAME_NS
-                self._draw(["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""])
+                self._draw(
+                    ["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""]
+                )
         if not self._raw and self.score.answers:
             lost = f"  frames lost     {box.counters.lost_frames} of {box.counters.frames + box.counters.lost_frames}"
-            touch = [f"  touch time      {self.score.touch(box.format.rate_hz)}"] if self.score.early else []
-            self._print("", *self.score.table(), "", lost, f"  latency         {self.score.latency()}", *touch)
+            touch = (
+                [f"  touch time      {self.score.touch(box.format.rate_hz)}"]
+                if self.score.early
+                else []
+            )
+            self._print(
+                "",
+                *self.score.table(),
+                "",
+                lost,
+                f"  latency         {self.score.latency()}",
+                *touch,
+            )
 
     def _read(self, sent: int, wanted: int) -> None:
-        """Read what has come to the robot's end; wait for answers that were sent and have not come; stop at
-        `wanted`."""
-        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.answers < sent else 0)[0]:
+        """Read what has come to the robot's end; wait for answers that were sent and have not come;
+        stop at `wanted`."""
+        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.answers < sent else 0)[
+            0
+        ]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:
                 self._show(line.decode("ascii"))
@@ -96,7 +132,11 @@ class Demo:
             return
         act = self._played[answer.sweep - 1]
         right = self.score.add(act, answer)
-        mark = ("right" if right else "wrong") if act.label in self.score.labels else "not in the bundle"
+        mark = (
+            ("right" if right else "wrong")
+            if act.label in self.score.labels
+            else "not in the bundle"
+        )
         if not self._raw:
             named = answer.label or answer.status
             used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""

@@ -1,4 +1,5 @@
-"""The robot's end of the serial line: a pseudo-terminal. Out: a non-blocking descriptor and the name the box opens."""
+"""The robot's end of the serial line: a pseudo-terminal. Out: a non-blocking descriptor and the
+name the box opens."""
 
 from __future__ import annotations
 

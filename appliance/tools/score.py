@@ -1,4 +1,5 @@
-"""Compares the answers that the robot read with what it did. In: sentences, acts. Out: counts and intervals."""
+"""Compares the answers that the robot read with what it did. In: sentences, acts. Out: counts and
+intervals."""
 
 from __future__ import annotations
 
@@ -16,10 +17,10 @@ from appliance.sim.rig import Act
 class AnswerScore:
     """Counts of the answers so far.
 
-    labels: that the bundle knows. right, total: by material; a material that the bundle does not know is `unknown` at best.
-    objects: whether the last answer for each object was right, where NEW OBJECT was
-    signalled. early: answers that did not need the whole window. slide_frames: frames from START to STOP, of all
-    sweeps.
+    labels: that the bundle knows. right, total: by material; a material that the bundle does not
+    know is `unknown` at best. objects: whether the last answer for each object was right, where NEW
+    OBJECT was signalled. early: answers that did not need the whole window. slide_frames: frames
+    from START to STOP, of all sweeps.
     """
 
     labels: frozenset[str]
@@ -31,10 +32,14 @@ class AnswerScore:
     slide_frames: int = 0
 
     def add(self, act: Act, answer: Answer) -> bool:
-        """Count an answer; True where it names the material of `act`, or says of one that the bundle does not know that it is
-        unknown."""
+        """Count an answer; True where it names the material of `act`, or says of one that the
+        bundle does not know that it is unknown."""
         known = act.label in self.labels
-        right = answer.label == act.label and answer.status == Status.OK if known else answer.status == Status.UNKNOWN
+        right = (
+            answer.label == act.label and answer.status == Status.OK
+            if known
+            else answer.status == Status.UNKNOWN
+        )
         self.total[act.label] += 1
         self.right[act.label] += right
         self.latency_ms.append(answer.latency_ms)
@@ -54,10 +59,18 @@ class AnswerScore:
         return self.total.total()
 
     def table(self) -> list[str]:
-        """Lines with right answers and their number: by material, of all sweeps, of all objects, all of materials that the bundle
-        knows; then how many sweeps of other materials were called unknown."""
-        rows = [(name, self.right[name], self.total[name]) for name in sorted(self.total.keys() & self.labels)]
-        sums = [("all sweeps", sum(right for _, right, _ in rows), sum(n for *_, n in rows))] if rows else []
+        """Lines with right answers and their number: by material, of all sweeps, of all objects,
+        all of materials that the bundle knows; then how many sweeps of other materials were called
+        unknown."""
+        rows = [
+            (name, self.right[name], self.total[name])
+            for name in sorted(self.total.keys() & self.labels)
+        ]
+        sums = (
+            [("all sweeps", sum(right for _, right, _ in rows), sum(n for *_, n in rows))]
+            if rows
+            else []
+        )
         if self.objects:
             sums.append(("all objects", sum(self.objects), len(self.objects)))
         lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
@@ -67,16 +80,20 @@ class AnswerScore:
             lines.append(f"  {name:<16}{right:>5} / {n:<5} {percent}")
         if others := sorted(self.total.keys() - self.labels):
             right, n = (sum(counts[name] for name in others) for counts in (self.right, self.total))
-            lines.append(f"  not in the bundle: {right} of {n} sweeps called unknown ({', '.join(others)})")
+            lines.append(
+                f"  not in the bundle: {right} of {n} sweeps called unknown ({', '.join(others)})"
+            )
         return ["  material        right / all", *lines]
 
     def touch(self, rate_hz: float) -> str:
-        """Mean touch time, from the start edge to the stop edge, and how many answers came before it."""
+        """Mean touch time, from the start edge to the stop edge, and how many answers came before
+        it."""
         n = self.answers
         return f"{self.slide_frames / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
 
     def latency(self) -> str:
-        """Median and worst latency; by a clock that waits for nothing no time passes, and none was measured."""
+        """Median and worst latency; by a clock that waits for nothing no time passes, and none was
+        measured."""
         if not any(self.latency_ms):
             return "not measured: --virtual lets no time pass"
         return f"{statistics.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms worst"

@@ -1,7 +1,8 @@
-"""Whether a readout board does what PROTOCOL.md, part 1, asks for: the check behind `palpate skin check`.
+"""Whether a readout board does what PROTOCOL.md, part 1, asks for: the check behind `palpate skin
+check`.
 
-In: an opened link and a clock. Out: one finding for each part, with what to do where it fails. What cannot be decided over
-this link, or in this time, is unknown, and said to be so.
+In: an opened link and a clock. Out: one finding for each part, with what to do where it fails. What
+cannot be decided over this link, or in this time, is unknown, and said to be so.
 """
 
 from __future__ import annotations
@@ -32,14 +33,16 @@ QUIET_S = 0.3
 """No frame may come for so long; one packet may be under way before."""
 LONGEST_PAUSE_S = 20.0
 PORT_BYTES = 140_000
-"""What the kernel may keep for a serial port that nobody reads: twice its buffers of 64 kB, and a little."""
+"""What the kernel may keep for a serial port that nobody reads: twice its buffers of 64 kB, and a
+little."""
 SAMPLE_BYTES = 1 << 16
 UNKNOWN_REQUEST = 0x51
 
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """The result for one part of the protocol. detail: what was seen, and what to do where it is no `ok`."""
+    """The result for one part of the protocol. detail: what was seen, and what to do where it is no
+    `ok`."""
 
     part: str
     verdict: Literal["ok", "FAIL", "unknown"]
@@ -48,7 +51,8 @@ class PartResult:
 
 @dataclass(slots=True)
 class Reception:
-    """What came in one stretch of listening. packets: with the host time at which they had arrived."""
+    """What came in one stretch of listening. packets: with the host time at which they had
+    arrived."""
 
     packets: list[tuple[int, Packet]] = field(default_factory=list)
     transfers: list[tuple[int, bytes]] = field(default_factory=list)
@@ -62,8 +66,11 @@ class Reception:
         return sum(len(p.taxels) for _, p in self.packets)
 
     def followed(self) -> tuple[list[tuple[int, int, Packet]], int, int, int]:
-        """(arrival, unwrapped number, packet) of fresh packets; frames lost and stale; restarts of the count."""
-        fresh, position, lost, stale = packets.follow([p for _, p in self.packets], packets.StreamPosition(0))
+        """(arrival, unwrapped number, packet) of fresh packets; frames lost and stale; restarts of
+        the count."""
+        fresh, position, lost, stale = packets.follow(
+            [p for _, p in self.packets], packets.StreamPosition(0)
+        )
         arrivals = {id(p): t_ns for t_ns, p in self.packets}
         return [(arrivals[id(p)], number, p) for number, p in fresh], lost, stale, position.epoch
 
@@ -108,7 +115,8 @@ class Listener:
 
 
 def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterator[PartResult]:
-    """One finding after the other. seconds: how long frames are listened to. port: a serial port, whose buffers are large.
+    """One finding after the other. seconds: how long frames are listened to. port: a serial port,
+    whose buffers are large.
 
     Raises SensorError if the link itself fails.
     """
@@ -127,7 +135,9 @@ def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterat
     yield _crc(heard)
     if form is None or not heard.packets:
         yield PartResult(
-            "packets", "unknown", "nothing more can be judged without FORMAT and whole packets; mend these first"
+            "packets",
+            "unknown",
+            "nothing more can be judged without FORMAT and whole packets; mend these first",
         )
         return
     yield from _stream(heard, form)
@@ -142,11 +152,17 @@ def _identity(link: SkinLink) -> PartResult:
     except (SensorMismatch, FormatError) as e:
         return PartResult("identity", "FAIL", f"{e}; PROTOCOL.md, IDENTITY, has its 36 bytes")
     if who.protocol != packets.VERSION:
-        return PartResult("identity", "FAIL", f"protocol version {who.protocol}; byte 0 must be {packets.VERSION}")
+        return PartResult(
+            "identity", "FAIL", f"protocol version {who.protocol}; byte 0 must be {packets.VERSION}"
+        )
     if not who.board:
-        return PartResult("identity", "FAIL", "the board's name is empty; write it to bytes 4 to 19")
+        return PartResult(
+            "identity", "FAIL", "the board's name is empty; write it to bytes 4 to 19"
+        )
     number = who.serial or "no serial number: two such boards look the same"
-    return PartResult("identity", "ok", f"{who.board}, firmware {'.'.join(map(str, who.firmware))}, {number}")
+    return PartResult(
+        "identity", "ok", f"{who.board}, firmware {'.'.join(map(str, who.firmware))}, {number}"
+    )
 
 
 def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
@@ -160,7 +176,9 @@ def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
     fifo_s, packet_s = form.fifo_frames / form.rate_hz, form.packet_frames / form.rate_hz
     text = f"{form.rows}x{form.cols} {form.dtype} at {form.rate_hz:g} Hz, FIFO {fifo_s:.2f} s, {form.packet_frames} a packet"
     if not (1 <= form.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):
-        return form, PartResult("format", "FAIL", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}")
+        return form, PartResult(
+            "format", "FAIL", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}"
+        )
     if fifo_s < LEAST_FIFO_S:
         return form, PartResult("format", "FAIL", f"{text}; the FIFO must hold {LEAST_FIFO_S} s")
     if packet_s > LONGEST_PACKET_S and form.packet_frames > 1:
@@ -174,19 +192,31 @@ def _sweep_format(form: SkinFormat) -> SweepFormat:
 
 def _start(silent: bool, first: Reception, listener: Listener) -> PartResult:
     if not silent:
-        return PartResult("start", "FAIL", "it sends before START; begin with request 3, end with request 4")
+        return PartResult(
+            "start", "FAIL", "it sends before START; begin with request 3, end with request 4"
+        )
     if not first.size:
-        return PartResult("start", "FAIL", f"no byte within {ANSWER_S:g} s of START; send frames after request 3")
+        return PartResult(
+            "start", "FAIL", f"no byte within {ANSWER_S:g} s of START; send frames after request 3"
+        )
     listener.link.request(Request.START, 0)
     again = listener.listen(QUIET_S)
     _, _, stale, restarts = Reception(first.packets + again.packets).followed()
     if not first.packets:
-        return PartResult("start", "unknown", f"{first.size} bytes came after it, and no whole packet; mend that first")
+        return PartResult(
+            "start",
+            "unknown",
+            f"{first.size} bytes came after it, and no whole packet; mend that first",
+        )
     if stale or restarts or not again.packets:
         return PartResult(
-            "start", "FAIL", "a second START disturbs the stream; it must have no effect while frames are sent"
+            "start",
+            "FAIL",
+            "a second START disturbs the stream; it must have no effect while frames are sent",
         )
-    return PartResult("start", "ok", "silent before it, frames after it, a second one changes nothing")
+    return PartResult(
+        "start", "ok", "silent before it, frames after it, a second one changes nothing"
+    )
 
 
 def _crc(heard: Reception) -> PartResult:
@@ -200,14 +230,13 @@ def _crc(heard: Reception) -> PartResult:
     if not heard.packets:
         hint = "each packet begins with 50 C1 01 00, its length in bytes 4 and 5"
     else:
-        hint = (
-            "bytes were lost or added on the way: check cable and baud rate, and that nothing else prints to this port"
-        )
+        hint = "bytes were lost or added on the way: check cable and baud rate, and that nothing else prints to this port"
     return PartResult("crc", "FAIL", f"{share}; {hint}")
 
 
 def _crc_fault(sample: bytes) -> str:
-    """What was done in place of the CRC that PROTOCOL.md asks for; "" if no usual mistake is seen."""
+    """What was done in place of the CRC that PROTOCOL.md asks for; "" if no usual mistake is
+    seen."""
     at = sample.find(packets.MAGIC)
     while 0 <= at <= len(sample) - packets.HEADER.size:
         length = int.from_bytes(sample[at + 4 : at + 6], "little")
@@ -216,9 +245,9 @@ def _crc_fault(sample: bytes) -> str:
             right, got = zlib.crc32(sample[at:end]), sample[end : end + 4]
             mistakes = {
                 "the CRC is big-endian; send its lowest byte first": right.to_bytes(4, "big"),
-                "the CRC lacks the inversion at its end; xor it with 0xFFFFFFFF": (right ^ 0xFFFFFFFF).to_bytes(
-                    4, "little"
-                ),
+                "the CRC lacks the inversion at its end; xor it with 0xFFFFFFFF": (
+                    right ^ 0xFFFFFFFF
+                ).to_bytes(4, "little"),
                 "the CRC is that of the payload; begin with byte 0 of the header": zlib.crc32(
                     sample[at + packets.HEADER.size : end]
                 ).to_bytes(4, "little"),
@@ -239,7 +268,9 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
     if lost:
         flags = sum(bool(p.flags & packets.Flag.OVERFLOW) for _, p in heard.packets)
         why = (
-            f"{flags} packets tell of an overflow" if flags else "no packet tells of an overflow: they were never taken"
+            f"{flags} packets tell of an overflow"
+            if flags
+            else "no packet tells of an overflow: they were never taken"
         )
         detail = f"{lost} of {heard.frames + lost} frames are missing, {why}; lower the rate"
         yield PartResult("loss", "FAIL", detail)
@@ -249,7 +280,11 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
     by_count = [(round(number * period_ns), arrival) for arrival, number, _ in fresh]
     by_clock = [(device.unwrap(p.t_us) * 1000, arrival) for arrival, _, p in fresh]
     rate = _compared(
-        "rate", by_count, RATE_TOLERANCE, f"FORMAT says {form.rate_hz:g} Hz", "announce the rate that it has"
+        "rate",
+        by_count,
+        RATE_TOLERANCE,
+        f"FORMAT says {form.rate_hz:g} Hz",
+        "announce the rate that it has",
     )
     yield rate
     clock = _compared("clock", by_clock, CLOCK_TOLERANCE, "bytes 16 to 19", "count microseconds")
@@ -263,12 +298,16 @@ def _packets(heard: Reception, form: SkinFormat) -> PartResult:
         if p.taxels.shape[1:] != form.shape or p.taxels.dtype != _sweep_format(form).numpy_type:
             sent = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
             return PartResult(
-                "packets", "FAIL", f"it sends {sent}, FORMAT says otherwise; bytes 8 to 11 must be those of FORMAT"
+                "packets",
+                "FAIL",
+                f"it sends {sent}, FORMAT says otherwise; bytes 8 to 11 must be those of FORMAT",
             )
     sizes = [len(p.taxels) for _, p in heard.packets]
     if max(sizes) > form.packet_frames:
         return PartResult(
-            "packets", "FAIL", f"{max(sizes)} frames in a packet, FORMAT says {form.packet_frames}; correct it"
+            "packets",
+            "FAIL",
+            f"{max(sizes)} frames in a packet, FORMAT says {form.packet_frames}; correct it",
         )
     return PartResult("packets", "ok", f"{len(sizes)} packets of {median(sizes):g} frames")
 
@@ -278,26 +317,43 @@ def _sequence(heard: Reception, stale: int, restarts: int) -> PartResult:
     steps = {(b.seq - a.seq) % (1 << 32) for a, b in pairwise(runs)}
     if steps == {1} and max(len(p.taxels) for p in runs) > 1:
         return PartResult(
-            "sequence", "FAIL", "it counts packets; bytes 12 to 15 are the number of the first frame, count frames"
+            "sequence",
+            "FAIL",
+            "it counts packets; bytes 12 to 15 are the number of the first frame, count frames",
         )
     if steps == {0}:
-        return PartResult("sequence", "FAIL", "the number never changes; count every frame that is taken")
+        return PartResult(
+            "sequence", "FAIL", "the number never changes; count every frame that is taken"
+        )
     if restarts or stale:
         text = f"{restarts} restarts of the count, {stale} frames repeated or out of order"
-        return PartResult("sequence", "FAIL", f"{text}; count on, whatever is sent, and wrap at 2^32")
+        return PartResult(
+            "sequence", "FAIL", f"{text}; count on, whatever is sent, and wrap at 2^32"
+        )
     return PartResult(
-        "sequence", "ok", f"from {runs[0].seq} to {runs[-1].seq + len(runs[-1].taxels) - 1}, always forwards"
+        "sequence",
+        "ok",
+        f"from {runs[0].seq} to {runs[-1].seq + len(runs[-1].taxels) - 1}, always forwards",
     )
 
 
-def _compared(part: str, points: Sequence[tuple[int, int]], tolerance: float, what: str, hint: str) -> PartResult:
-    """Compare a board's times with the host's. points: (board ns, arrival ns). tolerance: relative."""
+def _compared(
+    part: str, points: Sequence[tuple[int, int]], tolerance: float, what: str, hint: str
+) -> PartResult:
+    """Compare a board's times with the host's. points: (board ns, arrival ns). tolerance:
+    relative."""
     third = len(points) // 3
     if third < 3:
-        return PartResult(part, "unknown", f"only {len(points)} packets; listen longer with --seconds")
-    # a packet may be late, never early, so the promptest of the first and of the last third are compared
+        return PartResult(
+            part, "unknown", f"only {len(points)} packets; listen longer with --seconds"
+        )
+    # a packet may be late, never early, so the promptest of the first and of the last third are
+    # compared
     late = [arrival - at for at, arrival in points]
-    first, last = min(range(third), key=late.__getitem__), min(range(2 * third, len(points)), key=late.__getitem__)
+    first, last = (
+        min(range(third), key=late.__getitem__),
+        min(range(2 * third, len(points)), key=late.__getitem__),
+    )
     span = points[last][1] - points[first][1]
     off = (points[last][0] - points[first][0]) / span - 1
     # how late the others of a third are says how far its promptest can be trusted
@@ -316,7 +372,8 @@ def _compared(part: str, points: Sequence[tuple[int, int]], tolerance: float, wh
 
 
 def _refused(heard: Reception, form: SkinFormat) -> str:
-    """Why the box would restart this board: its clock disagrees with its frame count. "" if it would not."""
+    """Why the box would restart this board: its clock disagrees with its frame count. "" if it
+    would not."""
     stream = Stream(_sweep_format(form), SensorCounters())
     stream.restart()
     try:
@@ -336,13 +393,19 @@ def _requests(listener: Listener) -> PartResult:
         for request in (Request.IDENTITY, Request.FORMAT):
             listener.link.request(request, 64)
     except SensorMismatch as e:
-        return PartResult("requests", "FAIL", f"while frames are sent: {e}; put the reply between two packets")
+        return PartResult(
+            "requests", "FAIL", f"while frames are sent: {e}; put the reply between two packets"
+        )
     heard = listener.listen(QUIET_S)
     if not heard.packets:
         return PartResult(
-            "requests", "FAIL", "no frames after requests; go on sending, and leave unknown requests alone"
+            "requests",
+            "FAIL",
+            "no frames after requests; go on sending, and leave unknown requests alone",
         )
-    return PartResult("requests", "ok", "answered while frames are sent; an unknown one changes nothing")
+    return PartResult(
+        "requests", "ok", "answered while frames are sent; an unknown one changes nothing"
+    )
 
 
 def _overflow(listener: Listener, form: SkinFormat, before: Reception, *, port: bool) -> PartResult:
@@ -350,14 +413,18 @@ def _overflow(listener: Listener, form: SkinFormat, before: Reception, *, port: 
     flag = packets.Flag.OVERFLOW
     if any(p.flags & flag for _, p in before.packets) and not before.followed()[1]:
         return PartResult(
-            "overflow", "FAIL", "bit 1 of byte 6 is set while no frame is missing; clear it after one packet"
+            "overflow",
+            "FAIL",
+            "bit 1 of byte 6 is set while no frame is missing; clear it after one packet",
         )
     fifo_s = form.fifo_frames / form.rate_hz
     rate = before.size / max(1e-9, (before.transfers[-1][0] - before.transfers[0][0]) / 1e9)
     pause_s = 1.5 * fifo_s + (PORT_BYTES / rate if port else 0.1)
     if pause_s > LONGEST_PAUSE_S:
         return PartResult(
-            "overflow", "unknown", f"the port keeps {PORT_BYTES / rate:.0f} s of this stream; not waited for"
+            "overflow",
+            "unknown",
+            f"the port keeps {PORT_BYTES / rate:.0f} s of this stream; not waited for",
         )
     start = listener.listen(QUIET_S)
     listener.clock.sleep_until(listener.clock.now_ns() + round(pause_s * 1e9))
@@ -374,18 +441,25 @@ def _overflow(listener: Listener, form: SkinFormat, before: Reception, *, port: 
             f"{why} in a pause of {pause_s:.1f} s; drop the oldest frames of a full FIFO, then set bit 1",
         )
     if not flagged:
-        return PartResult("overflow", "FAIL", f"{lost} frames were dropped; set bit 1 of byte 6 in the next packet")
+        return PartResult(
+            "overflow",
+            "FAIL",
+            f"{lost} frames were dropped; set bit 1 of byte 6 in the next packet",
+        )
     kept_s = _age_s(before, flagged[0], resumed_ns)
     if kept_s < 0.8 * fifo_s:
         text = f"{kept_s:.2f} s were kept, FORMAT says {fifo_s:.2f} s"
         return PartResult("overflow", "FAIL", f"{text}; drop the oldest frames, not the newest")
     return PartResult(
-        "overflow", "ok", f"{lost} frames dropped in a pause of {pause_s:.1f} s, flagged, {kept_s:.2f} s kept"
+        "overflow",
+        "ok",
+        f"{lost} frames dropped in a pause of {pause_s:.1f} s, flagged, {kept_s:.2f} s kept",
     )
 
 
 def _age_s(before: Reception, packet: Packet, now_ns: int) -> float:
-    """Age of a packet's first frame, by what arrived promptly before. Behind a gap: how much the FIFO had kept."""
+    """Age of a packet's first frame, by what arrived promptly before. Behind a gap: how much the
+    FIFO had kept."""
     device = DeviceClock()
     offset_ns = min(t_ns - device.unwrap(p.t_us) * 1000 for t_ns, p in before.packets)
     return (now_ns - device.unwrap(packet.t_us) * 1000 - offset_ns) / 1e9
@@ -395,11 +469,15 @@ def _stop(listener: Listener) -> PartResult:
     listener.link.request(Request.STOP, 0)
     if not listener.quiet():
         return PartResult(
-            "stop", "FAIL", "frames come after STOP; end with request 4, once the packet under way is complete"
+            "stop",
+            "FAIL",
+            "frames come after STOP; end with request 4, once the packet under way is complete",
         )
     listener.link.request(Request.START, 0)
     again = listener.listen(ANSWER_S)
     listener.link.request(Request.STOP, 0)
     if not again.packets:
-        return PartResult("stop", "FAIL", "no frames after STOP and another START; it must begin again")
+        return PartResult(
+            "stop", "FAIL", "no frames after STOP and another START; it must begin again"
+        )
     return PartResult("stop", "ok", "silent after it, frames after another START")

@@ -1,7 +1,8 @@
-"""Which skins are plugged in (`palpate skin detect`), and all profiles in lines (`palpate skin list`).
+"""Which skins are plugged in (`palpate skin detect`), and all profiles in lines (`palpate skin
+list`).
 
-In: ports, profiles. Out: what was found on each port: ids first, then by listening. Nothing is written to a port that was
-not named for it.
+In: ports, profiles. Out: what was found on each port: ids first, then by listening. Nothing is
+written to a port that was not named for it.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ OpenPort = Callable[[str, int], BytePort]
 
 @dataclass(frozen=True, slots=True)
 class PortFinding:
-    """What is on a port. profile: its name, "" where none fits. detail: how that is known, and what to set or do."""
+    """What is on a port. profile: its name, "" where none fits. detail: how that is known, and what
+    to set or do."""
 
     port: PortInfo
     profile: str
@@ -56,7 +58,8 @@ class HeardBytes:
 
 
 def listed(name: str, profile: SkinProfile) -> str:
-    """A profile in a line: what it is, what it lacks, whether anybody has compared it with a device."""
+    """A profile in a line: what it is, what it lacks, whether anybody has compared it with a
+    device."""
     form = "as its board says" if profile.codec == DEFAULT else form_of(profile.format)
     lacks = f"lacks {', '.join(profile.lacks)}" if profile.lacks else "lacks nothing"
     measured = f"measured: {profile.measured}" if profile.measured else "not measured on a device"
@@ -69,10 +72,16 @@ def form_of(fmt: SweepFormat) -> str:
 
 
 def detect(
-    ports: Iterable[PortInfo], profiles: Mapping[str, SkinProfile], open_port: OpenPort, clock: Clock, *,
-    write: bool = False, seconds: float = LISTEN_S,
-) -> Iterator[PortFinding]:  # fmt: skip
-    """What is on each of the ports. profiles: as the settings have them. write: also ask, and send start commands."""
+    ports: Iterable[PortInfo],
+    profiles: Mapping[str, SkinProfile],
+    open_port: OpenPort,
+    clock: Clock,
+    *,
+    write: bool = False,
+    seconds: float = LISTEN_S,
+) -> Iterator[PortFinding]:
+    """What is on each of the ports. profiles: as the settings have them. write: also ask, and send
+    start commands."""
     for port in ports:
         try:
             yield from _on_port(port, profiles, open_port, clock, write, seconds)
@@ -81,37 +90,62 @@ def detect(
 
 
 def _on_port(
-    port: PortInfo, profiles: Mapping[str, SkinProfile], open_port: OpenPort, clock: Clock, write: bool, seconds: float
+    port: PortInfo,
+    profiles: Mapping[str, SkinProfile],
+    open_port: OpenPort,
+    clock: Clock,
+    write: bool,
+    seconds: float,
 ) -> Iterator[PortFinding]:
     by_ids = [name for name, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
     known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
     others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
     heard: dict[int, HeardBytes] = {}
     # those with its ids first; one speed after the other, each for all profiles that have it
-    for baud in dict.fromkeys(others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)):
+    for baud in dict.fromkeys(
+        others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)
+    ):
         these = {name: p for name, p in others.items() if p.baud == baud}
         for starter in [None, *(n for n in these if write and these[n].start)]:
-            heard[baud] = listen(port.path, baud, these[starter] if starter else None, open_port, clock, seconds)
+            heard[baud] = listen(
+                port.path, baud, these[starter] if starter else None, open_port, clock, seconds
+            )
             fitting = [n for n in these if fits(these[n], heard[baud])]
             if fitting:
-                yield PortFinding(port, fitting[0], known + _settings(port, fitting, these, heard[baud]))
+                yield PortFinding(
+                    port, fitting[0], known + _settings(port, fitting, these, heard[baud])
+                )
                 return
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
             grid = f"the marks of {name}, but {taxels} taxels a frame; set sensor.grid to their rows x columns"
             own = "if it is another skin, describe it with `palpate skin new`"
-            yield PortFinding(port, name, f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"; {own}')
+            yield PortFinding(
+                port,
+                name,
+                f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"; {own}',
+            )
             return
     if write and (who := _asked(port.path, open_port, clock)):
-        yield PortFinding(port, DEFAULT, f'{known}{who}; set sensor.link = "serial", sensor.port = "{port.path}"')
+        yield PortFinding(
+            port, DEFAULT, f'{known}{who}; set sensor.link = "serial", sensor.port = "{port.path}"'
+        )
         return
-    yield PortFinding(port, "", known + _nothing(max(len(one.data) for one in heard.values()), others, write))
+    yield PortFinding(
+        port, "", known + _nothing(max(len(one.data) for one in heard.values()), others, write)
+    )
 
 
 def listen(
-    path: str, baud: int, starter: SkinProfile | None, open_port: OpenPort, clock: Clock, seconds: float
+    path: str,
+    baud: int,
+    starter: SkinProfile | None,
+    open_port: OpenPort,
+    clock: Clock,
+    seconds: float,
 ) -> HeardBytes:
-    """What comes from a port at this speed. starter: whose start and stop commands are written. Raises SensorError."""
+    """What comes from a port at this speed. starter: whose start and stop commands are written.
+    Raises SensorError."""
     port = open_port(path, baud)
     reads: list[tuple[bytes, int]] = []
     try:
@@ -127,7 +161,8 @@ def listen(
 
 
 def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, int]]:
-    """What comes from an open port within `seconds`: each read, and when it ended. Raises SensorError."""
+    """What comes from an open port within `seconds`: each read, and when it ended. Raises
+    SensorError."""
     reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
     while (left_ns := until_ns - clock.now_ns()) > 0:
         if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
@@ -144,7 +179,8 @@ def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
 
 
 def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
-    """Frames per second of what was heard, from the arrivals of the first and the last frame; 0 for fewer than two."""
+    """Frames per second of what was heard, from the arrivals of the first and the last frame; 0 for
+    fewer than two."""
     codec, rest, seen = skin_codecs.codec(profile), Rest(), []
     for data, t_ns in heard.reads:
         found = codec(rest, data)
@@ -156,7 +192,9 @@ def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
     return sum(n for n, _ in seen[1:]) * 1e9 / (seen[-1][1] - seen[0][1])
 
 
-def _settings(port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes) -> str:
+def _settings(
+    port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes
+) -> str:
     """What was measured, and what to set."""
     profile = profiles[fitting[0]]
     hz = measured_hz(profile, heard)
@@ -184,9 +222,7 @@ def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
 def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
     """Why no profile fits, and what to do."""
     if heard:
-        return (
-            f"sends {heard} bytes, but no frames of a profile; try sensor.grid, or describe it with `palpate skin new`"
-        )
+        return f"sends {heard} bytes, but no frames of a profile; try sensor.grid, or describe it with `palpate skin new`"
     if write:
         return "sends nothing and answers nothing"
     asking = ", ".join(name for name, p in profiles.items() if p.start)
@@ -194,15 +230,23 @@ def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> st
 
 
 def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
-    """Taxels in a frame of a profile with marks, as the distance between marks in what was heard tells; 0 if it does not."""
+    """Taxels in a frame of a profile with marks, as the distance between marks in what was heard
+    tells; 0 if it does not."""
     mark, data = profile.trailer + profile.marker, heard.data
     places = [at for at in range(len(data)) if mark and data.startswith(mark, at)]
     steps = Counter(later - at for at, later in pairwise(places))
     if not steps:
         return 0
-    (step, times), size = steps.most_common(1)[0], SweepFormat(1, 1, 1, 1, profile.number).numpy_type.itemsize
+    (step, times), size = (
+        steps.most_common(1)[0],
+        SweepFormat(1, 1, 1, 1, profile.number).numpy_type.itemsize,
+    )
     each = size * profile.values
-    whole = times >= FEWEST and times * step >= FITS * (len(data) - 2 * step) and (step - len(mark)) % each == 0
+    whole = (
+        times >= FEWEST
+        and times * step >= FITS * (len(data) - 2 * step)
+        and (step - len(mark)) % each == 0
+    )
     return (step - len(mark)) // each if whole else 0
 
 
@@ -216,5 +260,6 @@ def on_usb(config: SensorConfig) -> list[str]:
         return []
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     return [
-        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of sensor.vendor_id and product_id" for d in found
+        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of sensor.vendor_id and product_id"
+        for d in found
     ]

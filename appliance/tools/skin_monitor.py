@@ -1,6 +1,8 @@
-"""How a skin is, for `palpate skin show`. In: its Frames, as they come. Out: LiveViews: load, rate, noise and faults.
+"""How a skin is, for `palpate skin show`. In: its Frames, as they come. Out: LiveViews: load, rate,
+noise and faults.
 
-Nothing here needs a bundle: the format is the skin's own, and the faults are those that a signal shows by itself.
+Nothing here needs a bundle: the format is the skin's own, and the faults are those that a signal
+shows by itself.
 """
 
 from __future__ import annotations
@@ -18,22 +20,26 @@ SPAN_S = 2.0
 SHOWN_S = 0.1
 """Latest signal that is averaged into the load shown."""
 STUCK_S = 5.0
-"""A taxel that has given one value for so long is stuck, unless all have: then nothing says which."""
+"""A taxel that has given one value for so long is stuck, unless all have: then nothing says
+which."""
 MOVED = 10.0
 """The skin was touched once half of its taxels have moved this many times their noise."""
 DEAD = 0.1
-"""A taxel is dead if it has moved less than this share of the median, after the skin was touched."""
+"""A taxel is dead if it has moved less than this share of the median, after the skin was
+touched."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveView:
     """A skin at one moment.
 
-    number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: profile and form. state: of the
-    sensor (PROTOCOL.md); trouble: why it does not stream and what to do. shape: rows, columns, axes. load: mean of the
-    last SHOWN_S above the lowest since the start, [axes][rows][columns] raw counts; empty before there is any. full:
-    load that is shown as the strongest. rate_hz: measured, None before there are frames. noise: [axes][rows][columns],
-    raw counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost None where it cannot be known.
+    number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: profile and
+    form. state: of the sensor (PROTOCOL.md); trouble: why it does not stream and what to do. shape:
+    rows, columns, axes. load: mean of the last SHOWN_S above the lowest since the start,
+    [axes][rows][columns] raw counts; empty before there is any. full: load that is shown as the
+    strongest. rate_hz: measured, None before there are frames. noise: [axes][rows][columns], raw
+    counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost None where
+    it cannot be known.
     """
 
     number: int
@@ -66,7 +72,8 @@ class SkinDisplay(Protocol):
 
 
 class SkinMonitor:
-    """Collects what a skin of format `fmt` sends. All times are those of the frames, so no clock is needed."""
+    """Collects what a skin of format `fmt` sends. All times are those of the frames, so no clock is
+    needed."""
 
     def __init__(self, fmt: SweepFormat) -> None:
         self._grid = fmt.rows, fmt.cols, fmt.axes
@@ -93,7 +100,10 @@ class SkinMonitor:
         self._changed_ns[changed] = frames.t_ns[-1]
         self._t_ns = np.concatenate([self._t_ns, frames.t_ns])[-self._span :]
         self._taxels = np.concatenate([self._taxels, new])[-self._span :]
-        self._lowest, self._highest = np.fmin(self._lowest, new.min(axis=0)), np.fmax(self._highest, new.max(axis=0))
+        self._lowest, self._highest = (
+            np.fmin(self._lowest, new.min(axis=0)),
+            np.fmax(self._highest, new.max(axis=0)),
+        )
 
     def measured(self) -> dict[str, Any]:
         """The fields of a LiveView that the signal gives; none before the second frame."""
@@ -106,14 +116,18 @@ class SkinMonitor:
         noise = self._noise()
         stuck, dead = self._stuck(), self._dead(noise)
         return {
-            "load": _nested(load), "full": self._full, "noise": _nested(noise),
+            "load": _nested(load),
+            "full": self._full,
+            "noise": _nested(noise),
             "rate_hz": (len(self._t_ns) - 1) * 1e9 / passed_ns if passed_ns > 0 else None,
-            "stuck": self._names(stuck), "dead": self._names(dead & ~stuck), "saturated": self._names(self._saturated()),
-        }  # fmt: skip
+            "stuck": self._names(stuck),
+            "dead": self._names(dead & ~stuck),
+            "saturated": self._names(self._saturated()),
+        }
 
     def _noise(self) -> NDArray[np.float64]:
-        """Standard deviation [R, C, A] of the signal's fast part: half the mean square of neighbours' differences (von
-        Neumann 1941), which a slow touch does not raise."""
+        """Standard deviation [R, C, A] of the signal's fast part: half the mean square of
+        neighbours' differences (von Neumann 1941), which a slow touch does not raise."""
         return np.asarray(np.sqrt((np.diff(self._taxels, axis=0) ** 2).mean(axis=0) / 2))
 
     def _stuck(self) -> NDArray[np.bool_]:
@@ -122,20 +136,28 @@ class SkinMonitor:
 
     def _dead(self, noise: NDArray[np.float64]) -> NDArray[np.bool_]:
         moved = self._highest - self._lowest
-        touched = np.median(moved, axis=(0, 1)) > MOVED * np.maximum(1e-12, np.median(noise, axis=(0, 1)))
+        touched = np.median(moved, axis=(0, 1)) > MOVED * np.maximum(
+            1e-12, np.median(noise, axis=(0, 1))
+        )
         return np.asarray(touched & (moved < DEAD * np.median(moved, axis=(0, 1))))
 
     def _saturated(self) -> NDArray[np.bool_]:
-        """Taxels at the end of the type's range in the newest frame; never for floating-point counts."""
+        """Taxels at the end of the type's range in the newest frame; never for floating-point
+        counts."""
         newest = self._taxels[-1]
         if self._limits is None:
             return np.zeros(self._grid, bool)
-        return np.asarray((newest >= self._limits.max) | ((newest <= self._limits.min) & (self._limits.min < 0)))
+        return np.asarray(
+            (newest >= self._limits.max) | ((newest <= self._limits.min) & (self._limits.min < 0))
+        )
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         """Names of taxels, counted from 1: "2.3", or "2.3 axis 1" where there are several axes."""
         several = self._grid[2] > 1
-        return tuple(f"{r + 1}.{c + 1}" + f" axis {a + 1}" * several for r, c, a in np.argwhere(which).tolist())
+        return tuple(
+            f"{r + 1}.{c + 1}" + f" axis {a + 1}" * several
+            for r, c, a in np.argwhere(which).tolist()
+        )
 
 
 def _nested(values: NDArray[np.float64]) -> tuple[tuple[tuple[float, ...], ...], ...]:

@@ -1,5 +1,5 @@
-"""A profile for a skin that nobody has described, for `palpate skin new`. In: what its port sends. Out: proposals in
-words, and the text of the profile.
+"""A profile for a skin that nobody has described, for `palpate skin new`. In: what its port sends.
+Out: proposals in words, and the text of the profile.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from appliance.tools.skin_detect import collect
 from appliance.tools.stream_analysis import Grid, Proposal, Read, analyse
 
 BAUDS = 115_200, 2_000_000, 921_600, 1_000_000, 460_800, 230_400
-"""Speeds that makers use, the most frequent first; over a port that is USB down to the microcontroller any of them does."""
+"""Speeds that makers use, the most frequent first; over a port that is USB down to the
+microcontroller any of them does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +32,14 @@ class PortSample:
     proposals: Sequence[Proposal]
 
 
-def listen(open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: float, clock: Clock) -> PortSample:
-    """What comes within `seconds` at the first of the `bauds` at which there is a pattern; nothing is written.
+def listen(
+    open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: float, clock: Clock
+) -> PortSample:
+    """What comes within `seconds` at the first of the `bauds` at which there is a pattern; nothing
+    is written.
 
-    open_port: opens the port at a speed. Raises SensorError: SensorSilent where nothing comes, SensorMismatch where no
-    speed shows a pattern.
+    open_port: opens the port at a speed. Raises SensorError: SensorSilent where nothing comes,
+    SensorMismatch where no speed shows a pattern.
     """
     count, tried = 0, ", ".join(map(str, bauds))
     for baud in bauds:
@@ -80,7 +84,8 @@ def grid_text(grid: Grid) -> str:
 
 
 def choose(heard: PortSample, text: str, number: int) -> tuple[Proposal, Grid]:
-    """The proposal `number`, from 1, with the grid that `text` names; the first that has as many values for 0.
+    """The proposal `number`, from 1, with the grid that `text` names; the first that has as many
+    values for 0.
 
     Raises ConfigError where there is none.
     """
@@ -93,7 +98,10 @@ def choose(heard: PortSample, text: str, number: int) -> tuple[Proposal, Grid]:
         for proposal in offered:
             if rows * cols * axes == proposal.values:
                 return proposal, (rows, cols, axes)
-    fits = ", ".join(grid_text(grid) for proposal in offered for grid in proposal.grids) or "rows x columns"
+    fits = (
+        ", ".join(grid_text(grid) for proposal in offered for grid in proposal.grids)
+        or "rows x columns"
+    )
     raise ConfigError(f"--grid {text} has as many values as no proposal; use one such as {fits}")
 
 
@@ -114,17 +122,25 @@ def profile(proposal: Proposal, grid: Grid, baud: int, port: PortInfo) -> str:
         values[proposal.framing] = proposal.mark.hex(" ")
     if proposal.sequence:
         values["sequence"] = proposal.sequence
-    values |= {"number": proposal.dtype, "rows": rows, "cols": cols, "rate_hz": float(f"{proposal.rate_hz:.3g}")}
+    values |= {
+        "number": proposal.dtype,
+        "rows": rows,
+        "cols": cols,
+        "rate_hz": float(f"{proposal.rate_hz:.3g}"),
+    }
     if proposal.big_endian:
         values["byte_order"] = "big"
     if axes > 1:
         values |= {"values": axes, "take": list(range(axes))}
     head = "# Written by `palpate skin new`. Compare it with what the maker says; matrix.toml explains each key.\n"
-    return head + "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in values.items())
+    return head + "".join(
+        f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in values.items()
+    )
 
 
 def decoded(text: str, reads: Sequence[Read]) -> tuple[int, int]:
-    """(frames, bytes in no frame) of `reads`, read as the profile `text` says. Raises ConfigError where it cannot be."""
+    """(frames, bytes in no frame) of `reads`, read as the profile `text` says. Raises ConfigError
+    where it cannot be."""
     codec = skin_codecs.codec(skin_profile.from_json(tomllib.loads(text), "the new profile"))
     found = codec(skin_codecs.Rest(), b"".join(read.data for read in reads))
     return len(found), found.garbage

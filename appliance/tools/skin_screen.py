@@ -1,5 +1,5 @@
-"""Shows a skin in a terminal, for `palpate skin show`. In: LiveViews. Out: heat maps that are drawn again and again, or
-plain lines.
+"""Shows a skin in a terminal, for `palpate skin show`. In: LiveViews. Out: heat maps that are drawn
+again and again, or plain lines.
 
 Where the output is no terminal, or a dumb one, it gets one line a second.
 """
@@ -31,7 +31,9 @@ def figures(view: LiveView) -> str:
     rate = "" if view.rate_hz is None else f"{view.rate_hz:.1f} Hz, "
     lost = "loss cannot be known" if view.lost is None else f"{view.lost:,} lost"
     noise = sorted(value for axis in view.noise for row in axis for value in row)
-    middle = f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} raw counts" if noise else ""
+    middle = (
+        f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} raw counts" if noise else ""
+    )
     return f"{rate}{view.frames:,} frames, {lost}{middle}"
 
 
@@ -53,11 +55,15 @@ def line(view: LiveView) -> str:
     return f"{'SIMULATED  ' * (view.source == 'sim')}{view.skin}  {view.state}: {text}"
 
 
-def picture(view: LiveView, width: int, colours: bool, signs: str = BLOCKS, address: str = "") -> Iterator[str]:
+def picture(
+    view: LiveView, width: int, colours: bool, signs: str = BLOCKS, address: str = ""
+) -> Iterator[str]:
     """A LiveView line by line, no wider than `width`. signs: see alignment.terminal."""
     simulated = "   SIMULATED" * (view.source == "sim")
     yield f" palpate skin show   {view.skin}{simulated}"[:width]
-    yield f" {BOLD}{view.state}{PLAIN}  {view.trouble or figures(view)}"[: width + len(BOLD + PLAIN)]
+    yield f" {BOLD}{view.state}{PLAIN}  {view.trouble or figures(view)}"[
+        : width + len(BOLD + PLAIN)
+    ]
     yield f" {faults(view) or ('no fault seen' if view.load else '')}"[:width]
     yield ""
     for maps in side_by_side(view.load, view.full, width, signs):

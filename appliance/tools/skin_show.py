@@ -1,4 +1,5 @@
-"""`palpate skin show`: a skin live, in the terminal and on a page. In: a Sensor. Out: LiveViews, five times a second."""
+"""`palpate skin show`: a skin live, in the terminal and on a page. In: a Sensor. Out: LiveViews,
+five times a second."""
 
 from __future__ import annotations
 
@@ -12,9 +13,14 @@ from appliance.tools.skin_monitor import LiveView, SkinDisplay, SkinMonitor
 
 
 def run(
-    sensor: Sensor, fmt: SweepFormat, name: str, source: str, clock: Clock, displays: Iterable[SkinDisplay],
+    sensor: Sensor,
+    fmt: SweepFormat,
+    name: str,
+    source: str,
+    clock: Clock,
+    displays: Iterable[SkinDisplay],
     stopped: Callable[[], bool],
-) -> None:  # fmt: skip
+) -> None:
     """Show on `displays` what `sensor` sends, until `stopped()`. name: of the skin's profile."""
     shown_on, monitor, number = tuple(displays), SkinMonitor(fmt), 0
     enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
@@ -28,8 +34,15 @@ def run(
             next_ns, number = now + VIEW_NS, number + 1
             counters = sensor.counters
             view = LiveView(
-                number, source, f"{name} {fmt}", sensor.state, str(sensor.trouble or ""), (fmt.rows, fmt.cols, fmt.axes),
-                frames=counters.frames, lost=counters.lost_frames if sensor.loss_known else None, **monitor.measured(),
-            )  # fmt: skip
+                number,
+                source,
+                f"{name} {fmt}",
+                sensor.state,
+                str(sensor.trouble or ""),
+                (fmt.rows, fmt.cols, fmt.axes),
+                frames=counters.frames,
+                lost=counters.lost_frames if sensor.loss_known else None,
+                **monitor.measured(),
+            )
             for display in shown_on:
                 display.show(view)

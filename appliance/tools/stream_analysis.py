@@ -1,7 +1,8 @@
-"""What an unknown skin sends, found in its bytes alone, for `palpate skin new`. In: reads with their times. Out:
-Proposals, the most likely first.
+"""What an unknown skin sends, found in its bytes alone, for `palpate skin new`. In: reads with
+their times. Out: Proposals, the most likely first.
 
-Nothing is decided here: a person confirms the grid, which no stream can tell (16 values may be 4 x 4 or 2 x 8).
+Nothing is decided here: a person confirms the grid, which no stream can tell (16 values may be 4 x
+4 or 2 x 8).
 """
 
 from __future__ import annotations
@@ -20,17 +21,21 @@ from appliance.io.skin_codecs.frames import MOST_PACKET
 LEAST_FRAMES = 8
 """Frames that must follow one another before a pattern counts."""
 SHARE = 0.8
-"""Least share of the bytes that the frames of a proposal explain. A wrong baud rate explains none."""
+"""Least share of the bytes that the frames of a proposal explain. A wrong baud rate explains
+none."""
 CONSTANT = 0.99
 """A byte of a frame is constant if it has one value in this share of the frames."""
 MOST_MARK = 4
 """Longest marker or trailer that is proposed; the makers known to us use two or four bytes."""
 FLOATS = 1e-6, 1e7
-"""Magnitudes of sensible numbers; other bytes read as float32 seldom lie within (nor does a zero count against it)."""
+"""Magnitudes of sensible numbers; other bytes read as float32 seldom lie within (nor does a zero
+count against it)."""
 CONTRAST = 4.0
-"""How many more values one byte of a pair must take than the other, for the two to be one number."""
+"""How many more values one byte of a pair must take than the other, for the two to be one
+number."""
 AGAIN = 0.01
-"""Where as many bytes, less this share, come again after a shorter distance, it is the frame and the longer is two."""
+"""Where as many bytes, less this share, come again after a shorter distance, it is the frame and
+the longer is two."""
 COUNTS = 0.95
 """A number counts the frames if it grows by one in this share of them; the rest were lost."""
 LONGEST = 4
@@ -54,10 +59,11 @@ class Read:
 class Proposal:
     """One way to understand a stream.
 
-    framing: what shows where a frame is: a `mark` before it, a `mark` behind it, or lines of text. length: bytes of a
-    frame with its mark; for text, lines. sequence: type of a count of the frames behind the marker, "" for none.
-    dtype, big_endian: type of a value on the wire. values: in a frame. grids: that have as many values, the squarest
-    first. rate_hz: frames by their times of arrival. share: of all bytes that these frames explain, 0 to 1.
+    framing: what shows where a frame is: a `mark` before it, a `mark` behind it, or lines of text.
+    length: bytes of a frame with its mark; for text, lines. sequence: type of a count of the frames
+    behind the marker, "" for none. dtype, big_endian: type of a value on the wire. values: in a
+    frame. grids: that have as many values, the squarest first. rate_hz: frames by their times of
+    arrival. share: of all bytes that these frames explain, 0 to 1.
     """
 
     framing: Literal["marker", "trailer", "text"]
@@ -73,7 +79,8 @@ class Proposal:
 
 
 def analyse(reads: Sequence[Read]) -> list[Proposal]:
-    """All ways in which `reads` can be understood, the most likely first; empty if there is no pattern in them."""
+    """All ways in which `reads` can be understood, the most likely first; empty if there is no
+    pattern in them."""
     data = b"".join(read.data for read in reads)
     if not data:
         return []
@@ -84,19 +91,24 @@ def analyse(reads: Sequence[Read]) -> list[Proposal]:
 
 
 def grids(values: int) -> tuple[Grid, ...]:
-    """Up to six grids of `values` numbers: one axis, then three where it divides by three; the squarest first."""
+    """Up to six grids of `values` numbers: one axis, then three where it divides by three; the
+    squarest first."""
     found = []
     for axes in (1, 3):
         if values % axes == 0 and values >= axes:
             taxels = values // axes
-            pairs = [(r, taxels // r, axes) for r in range(1, int(taxels**0.5) + 1) if taxels % r == 0]
+            pairs = [
+                (r, taxels // r, axes) for r in range(1, int(taxels**0.5) + 1) if taxels % r == 0
+            ]
             found += [pair for pair in pairs[::-1] if max(pair) <= 255][:3]
     return tuple(found)
 
 
 def _text(data: bytes, seconds: float) -> list[Proposal]:
     """Lines of numbers: each a frame, or so many to one, with a shorter line behind them."""
-    lines = [_NUMBER.findall(line) for line in data.split(b"\n")[1:-1]]  # the first and the last may be cut
+    lines = [
+        _NUMBER.findall(line) for line in data.split(b"\n")[1:-1]
+    ]  # the first and the last may be cut
     counts = [len(line) for line in lines]
     if len(counts) < LEAST_FRAMES or not max(counts):
         return []
@@ -113,7 +125,11 @@ def _text(data: bytes, seconds: float) -> list[Proposal]:
     values = height * usual
     known = ((height, usual, 1),) if height > 1 else ()
     fits = known + tuple(grid for grid in grids(values) if grid not in known)
-    return [Proposal("text", b"", height, "", _text_type(words), False, values, fits, frames / seconds, share)]
+    return [
+        Proposal(
+            "text", b"", height, "", _text_type(words), False, values, fits, frames / seconds, share
+        )
+    ]
 
 
 def _text_type(words: Sequence[bytes]) -> str:
@@ -124,7 +140,8 @@ def _text_type(words: Sequence[bytes]) -> str:
 
 
 def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[Proposal]:
-    """Frames of one length with the same bytes at their begin or end. boundaries: offsets at which reads began."""
+    """Frames of one length with the same bytes at their begin or end. boundaries: offsets at which
+    reads began."""
     stream = np.frombuffer(data, np.uint8)
     found = _period(stream)
     if found is None:
@@ -148,22 +165,36 @@ def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[
             for dtype, big_endian in _types(behind):
                 values = behind.shape[1] // np.dtype(dtype).itemsize
                 proposals.append(
-                    Proposal(framing, mark, length, sequence, dtype, big_endian, values, grids(values), rate, share)
+                    Proposal(
+                        framing,
+                        mark,
+                        length,
+                        sequence,
+                        dtype,
+                        big_endian,
+                        values,
+                        grids(values),
+                        rate,
+                        share,
+                    )
                 )
     return sorted(proposals, key=_unlikely)
 
 
 def _unlikely(proposal: Proposal) -> tuple[bool, int]:
-    """What speaks against a proposal: a grid much longer than wide; small numbers, as which anything can be read."""
+    """What speaks against a proposal: a grid much longer than wide; small numbers, as which
+    anything can be read."""
     flat = not proposal.grids or max(proposal.grids[0][:2]) > LONGEST * min(proposal.grids[0][:2])
     return flat, -np.dtype(proposal.dtype).itemsize
 
 
 def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] | None:
-    """(bytes of a frame, offsets of one constant place in the frames, share of the stream that they explain).
+    """(bytes of a frame, offsets of one constant place in the frames, share of the stream that they
+    explain).
 
-    Candidates are the distances at which a byte, or a pair of bytes, comes again and again. The frame is the one at which
-    most bytes of the stream come again: numbers change little from one frame to the next.
+    Candidates are the distances at which a byte, or a pair of bytes, comes again and again. The
+    frame is the one at which most bytes of the stream come again: numbers change little from one
+    frame to the next.
     """
     found: dict[int, tuple[NDArray[np.int64], float, float]] = {}
     for words in ((stream[:-1].astype(np.int32) << 8) + stream[1:], stream.astype(np.int32)):
@@ -187,7 +218,8 @@ def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] |
 
 
 def _begin(boundaries: NDArray[np.int64], start: int, length: int) -> int | None:
-    """Where frames begin after `start`, if reads begin there more often than elsewhere: a board sends frames whole."""
+    """Where frames begin after `start`, if reads begin there more often than elsewhere: a board
+    sends frames whole."""
     if not len(boundaries):
         return None
     phases = np.bincount((boundaries - start) % length, minlength=length)
@@ -197,10 +229,12 @@ def _begin(boundaries: NDArray[np.int64], start: int, length: int) -> int | None
 def _marks(
     constant: NDArray[np.bool_], usual: NDArray[np.uint8], begin: int | None
 ) -> Iterator[tuple[Literal["marker", "trailer"], int, int]]:
-    """(framing, first byte, bytes) of each run of constant bytes that can mark a frame, the most likely first.
+    """(framing, first byte, bytes) of each run of constant bytes that can mark a frame, the most
+    likely first.
 
-    A run at the begin of a frame is a marker, one at its end a trailer; where reads do not tell, all are markers. Zeros
-    are left out at the side of the values: taxels that nobody touches are zero, too.
+    A run at the begin of a frame is a marker, one at its end a trailer; where reads do not tell,
+    all are markers. Zeros are left out at the side of the values: taxels that nobody touches are
+    zero, too.
     """
     length = len(constant)
     runs = []
@@ -220,15 +254,16 @@ def _marks(
 
 
 def _sizes(run: NDArray[np.uint8]) -> list[int]:
-    """Bytes that a mark can have in a run whose last byte is the mark's outer one: all, two as most have, or three. The
-    bytes of numbers that do not change can lie beside it."""
+    """Bytes that a mark can have in a run whose last byte is the mark's outer one: all, two as most
+    have, or three. The bytes of numbers that do not change can lie beside it."""
     beside = np.flatnonzero(run)
     most = min(MOST_MARK, len(run) - int(beside[0])) if len(beside) else 0
     return [most, *(size for size in (2, 3) if size < most)] if most else []
 
 
 def _types(payload: NDArray[np.uint8]) -> Iterator[tuple[str, bool]]:
-    """(type, big-endian) that the bytes [frames, bytes] of the values can have, the most likely first."""
+    """(type, big-endian) that the bytes [frames, bytes] of the values can have, the most likely
+    first."""
     raw = np.ascontiguousarray(payload)
     size = raw.shape[1]
     if size % 4 == 0:
@@ -255,18 +290,24 @@ def _crosses_zero(numbers: NDArray[Any]) -> bool:
 
 
 def _sequences(payload: NDArray[np.uint8]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """(type of the count of frames in front, the bytes behind it), the most likely first; "" where nothing counts.
+    """(type of the count of frames in front, the bytes behind it), the most likely first; "" where
+    nothing counts.
 
-    The lowest byte grows by one from frame to frame; further bytes belong to the count if they carry.
+    The lowest byte grows by one from frame to frame; further bytes belong to the count if they
+    carry.
     """
     counting = (np.diff(payload.astype(np.int16), axis=0) % 256 == 1).mean(axis=0) >= COUNTS
-    if payload.shape[1] > 4 and counting[0] and counting.mean() < 0.5:  # taxels of a test pattern may all count
+    if (
+        payload.shape[1] > 4 and counting[0] and counting.mean() < 0.5
+    ):  # taxels of a test pattern may all count
         for size in (4, 2):
             number = payload[:, :size].copy().view(f"<u{size}")[:, 0].astype(np.int64)
             carried = (np.diff(number) == 1)[
                 number[:-1] % 256 == 255
             ]  # else the next byte is a taxel that stays at zero
-            if (np.diff(number) == 1).mean() >= COUNTS and (not len(carried) or carried.mean() >= COUNTS):
+            if (np.diff(number) == 1).mean() >= COUNTS and (
+                not len(carried) or carried.mean() >= COUNTS
+            ):
                 yield f"uint{8 * size}", payload[:, size:]
         yield "uint8", payload[:, 1:]
     yield "", payload

@@ -1,5 +1,5 @@
-"""Who may see a page: its address, the names by which browsers may ask for it, token and certificate. In: settings. Out:
-an Access."""
+"""Who may see a page: its address, the names by which browsers may ask for it, token and
+certificate. In: settings. Out: an Access."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from appliance.core.errors import ConfigError
 
 HERE = "127.0.0.1"
 NAMES = ("localhost", HERE, "[::1]")
-"""Names by which a browser may ask for this machine. Another name belongs to another site that points here (DNS
-rebinding)."""
+"""Names by which a browser may ask for this machine. Another name belongs to another site that
+points here (DNS rebinding)."""
 LEAST_TOKEN, MOST_TOKEN = 16, 256
 """Characters of a token."""
 
@@ -25,8 +25,8 @@ LEAST_TOKEN, MOST_TOKEN = 16, 256
 class Access:
     """Where a page is served, and to whom.
 
-    port: 0 for any that is free. names: further host names that browsers may use. token: what a browser has to know, ""
-    for nothing. certificate, key: PEM files of TLS; None serves without it.
+    port: 0 for any that is free. names: further host names that browsers may use. token: what a
+    browser has to know, "" for nothing. certificate, key: PEM files of TLS; None serves without it.
     """
 
     port: int
@@ -52,9 +52,13 @@ class Access:
             return cls(port, settings.address)
         folder = Path(settings.folder)
         return cls(
-            port, settings.address, (*_own_names(), *settings.names.lower().split()), _token(folder / "token"),
-            folder / "certificate.pem", folder / "key.pem",
-        )  # fmt: skip
+            port,
+            settings.address,
+            (*_own_names(), *settings.names.lower().split()),
+            _token(folder / "token"),
+            folder / "certificate.pem",
+            folder / "key.pem",
+        )
 
     def tls(self) -> ssl.SSLContext | None:
         """The context of TLS. Raises ConfigError where certificate or key cannot be used."""
@@ -73,12 +77,19 @@ class Access:
     def url(self, port: int) -> str:
         """The page's address for a person; port: the one that is listened on."""
         name = self.address if not self.certificate else self.names[0] if self.names else HERE
-        return f"http{'s' if self.certificate else ''}://{f'[{name}]' if ':' in name else name}:{port}"
+        return (
+            f"http{'s' if self.certificate else ''}://{f'[{name}]' if ':' in name else name}:{port}"
+        )
 
     def is_host(self, host: str, own: str) -> bool:
-        """Whether the Host of a request names this machine. own: the address that the request came to."""
+        """Whether the Host of a request names this machine. own: the address that the request came
+        to."""
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-        return bool(name) and name.lower() in (*NAMES, *self.names, f"[{own}]" if ":" in own else own)
+        return bool(name) and name.lower() in (
+            *NAMES,
+            *self.names,
+            f"[{own}]" if ":" in own else own,
+        )
 
     def admits(self, given: str) -> bool:
         """Whether `given` is the token, or none is needed. Takes as long for every wrong one."""
@@ -98,9 +109,15 @@ def _token(path: Path) -> str:
         token = path.read_text("ascii").strip()
     except PermissionError as e:
         join = f"let it into its group with usermod -aG GROUP USER (ls -ld {path.parent} shows it)"
-        raise ConfigError(f"{path} may not be read by this user; {join}, or set watch.address to {HERE}") from e
+        raise ConfigError(
+            f"{path} may not be read by this user; {join}, or set watch.address to {HERE}"
+        ) from e
     except (OSError, ValueError) as e:
-        raise ConfigError(f"{path} cannot be read: {getattr(e, 'strerror', None) or e}; {advice}") from e
+        raise ConfigError(
+            f"{path} cannot be read: {getattr(e, 'strerror', None) or e}; {advice}"
+        ) from e
     if not LEAST_TOKEN <= len(token) <= MOST_TOKEN or not token.isalnum():
-        raise ConfigError(f"{path} is not a token of {LEAST_TOKEN} to {MOST_TOKEN} letters and digits; {advice}")
+        raise ConfigError(
+            f"{path} is not a token of {LEAST_TOKEN} to {MOST_TOKEN} letters and digits; {advice}"
+        )
     return token

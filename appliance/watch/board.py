@@ -1,4 +1,5 @@
-"""What `palpate watch --web` shows. In: lines of the feed. Out: events of the page, and on request the picture of a sweep.
+"""What `palpate watch --web` shows. In: lines of the feed. Out: events of the page, and on request
+the picture of a sweep.
 
 Nothing is written to a disk: what the page knows of the shift is what this program has seen.
 """
@@ -26,8 +27,21 @@ SWEEPS = 20
 MINUTE_NS = 60_000_000_000
 KEPT = {"hello": 8, "verdict": SHIFT, "minute": 1440, "signal": SWEEPS, "note": 200}
 """Events that stay for browsers that come later; of all others the newest one."""
-FIELDS = ("sweep", "time_ns", "status", "label", "probability", "margin", "fused", "lost", "latency_ns", "bundle", "detail",
-          "share", "moved")  # fmt: skip
+FIELDS = (
+    "sweep",
+    "time_ns",
+    "status",
+    "label",
+    "probability",
+    "margin",
+    "fused",
+    "lost",
+    "latency_ns",
+    "bundle",
+    "detail",
+    "share",
+    "moved",
+)
 """Of a verdict."""
 
 Publish = Callable[[str, object], None]
@@ -36,9 +50,10 @@ Publish = Callable[[str, object], None]
 class PageBoard:
     """Turns lines of the feed into events, by their type.
 
-    hello, health, state: as they come. box: whether there is a feed. verdict: with rounded `scores` and the `reason` of
-    a sweep without a label. minute: frames and lost frames of the last minute. signal: that a sweep's window is here.
-    view: see alignment.view. note: another bundle or program.
+    hello, health, state: as they come. box: whether there is a feed. verdict: with rounded `scores`
+    and the `reason` of a sweep without a label. minute: frames and lost frames of the last minute.
+    signal: that a sweep's window is here. view: see alignment.view. note: another bundle or
+    program.
     """
 
     def __init__(self, publish: Publish) -> None:
@@ -49,13 +64,15 @@ class PageBoard:
         self._tracker: ContactTracker | None = None
         self._enumerations = 0
         self._view_ns = -VIEW_NS
-        self._minute: tuple[int, int, int] | None = None  # time, frames and lost frames at its begin
+        self._minute: tuple[int, int, int] | None = (
+            None  # time, frames and lost frames at its begin
+        )
         self._windows: OrderedDict[int, Window] = OrderedDict()
         self._taken = 0
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take one line. One of an unknown type is for a later version. Raises FormatError for one that is not as it
-        must be."""
+        """Take one line. One of an unknown type is for a later version. Raises FormatError for one
+        that is not as it must be."""
         act = _LINES.get(str(line.get("type")))
         if not act:
             return
@@ -91,7 +108,9 @@ class PageBoard:
     def _take_health(self, line: Mapping[str, Any]) -> None:
         self._take_state(line)
         if self._before and self._before["pid"] != self._hello["pid"]:
-            self._publish("note", {"time_ns": line["time_ns"], "text": _restarted(self._before, self._hello)})
+            self._publish(
+                "note", {"time_ns": line["time_ns"], "text": _restarted(self._before, self._hello)}
+            )
         self._before = {}
         now = int(line["time_ns"]), int(line["frames"]), int(line["lost_frames"])
         if int(line["enumerations"]) != self._enumerations:
@@ -100,7 +119,10 @@ class PageBoard:
                 self._tracker.reset()
         first = self._minute or now
         if now[0] - first[0] >= MINUTE_NS:
-            self._publish("minute", {"time_ns": now[0], "frames": now[1] - first[1], "lost": now[2] - first[2]})
+            self._publish(
+                "minute",
+                {"time_ns": now[0], "frames": now[1] - first[1], "lost": now[2] - first[2]},
+            )
             first = now
         self._minute = first
         self._publish("health", {name: value for name, value in line.items() if name != "type"})
@@ -114,8 +136,13 @@ class PageBoard:
             self._publish("view", self._tracker.view(self._skin, self._trouble).json())
 
     def _take_verdict(self, line: Mapping[str, Any]) -> None:
-        shown = {name: line[name] for name in FIELDS} | {"scores": [round(float(p), 4) for p in line["scores"]]}
-        self._publish("verdict", shown | {"reason": REASONS.get(line["status"], ""), "pid": self._hello.get("pid")})
+        shown = {name: line[name] for name in FIELDS} | {
+            "scores": [round(float(p), 4) for p in line["scores"]]
+        }
+        self._publish(
+            "verdict",
+            shown | {"reason": REASONS.get(line["status"], ""), "pid": self._hello.get("pid")},
+        )
 
     def _take_frame(self, line: Mapping[str, Any]) -> None:
         if not self._tracker:
@@ -136,7 +163,9 @@ class PageBoard:
         self._windows[self._taken] = kept
         while len(self._windows) > SWEEPS:
             self._windows.popitem(last=False)
-        self._publish("signal", {"number": self._taken, "sweep": line["sweep"], "pid": self._hello["pid"]})
+        self._publish(
+            "signal", {"number": self._taken, "sweep": line["sweep"], "pid": self._hello["pid"]}
+        )
 
 
 def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

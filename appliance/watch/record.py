@@ -1,5 +1,6 @@
-"""The page of `palpate record --web`. In: what happens in the loop; orders of the page. Out: events of the page, and commands
-that the loop carries out between two turns, as it does those of the serial line.
+"""The page of `palpate record --web`. In: what happens in the loop; orders of the page. Out: events
+of the page, and commands that the loop carries out between two turns, as it does those of the
+serial line.
 
 The loop hands over numbers and takes up one command a turn; nothing of a browser is waited for.
 """
@@ -44,29 +45,38 @@ Obey = Callable[[Command], list[object]]
 
 
 def order(body: bytes, allowed: Sequence[str]) -> Command:
-    """The command in what a page has sent: `{"command": "MATERIAL", "text": "wood"}`. allowed: names of commands.
+    """The command in what a page has sent: `{"command": "MATERIAL", "text": "wood"}`. allowed:
+    names of commands.
 
-    Raises FormatError where it is none; ConfigError, as the command itself would, for a label that cannot be used.
+    Raises FormatError where it is none; ConfigError, as the command itself would, for a label that
+    cannot be used.
     """
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError) as e:
-        raise FormatError('an order is not json; send {"command": "MATERIAL", "text": "wood"}') from e
+        raise FormatError(
+            'an order is not json; send {"command": "MATERIAL", "text": "wood"}'
+        ) from e
     if not isinstance(asked, dict) or not asked.keys() <= {"command", "text"}:
         raise FormatError('an order holds "command" and "text" and nothing else')
     name, text = str(asked.get("command")), asked.get("text", "")
     if name not in allowed or not isinstance(text, str):
-        raise FormatError(f"no order that the page has; its commands are {' '.join(allowed)}, each with a text or none")
+        raise FormatError(
+            f"no order that the page has; its commands are {' '.join(allowed)}, each with a text or none"
+        )
     text = text.strip()
     if name in LABELS:
         Labels(**{name.lower(): text})  # before a capture notes it
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
-        raise FormatError(f"{name} takes no text, but for DISCARD the number of a sweep; leave it out")
+        raise FormatError(
+            f"{name} takes no text, but for DISCARD the number of a sweep; leave it out"
+        )
     return Command(name, text)
 
 
 class CommandQueue:
-    """Commands on their way from the server's thread to the loop, and their answers on the way back."""
+    """Commands on their way from the server's thread to the loop, and their answers on the way
+    back."""
 
     def __init__(self) -> None:
         self._waiting: Queue[tuple[Command, Future[list[object]]]] = Queue(MOST_WAITING)
@@ -77,11 +87,14 @@ class CommandQueue:
         try:
             self._waiting.put_nowait((command, answer))
         except Full:
-            raise NoAnswer(f"{MOST_WAITING} commands wait already; try again when they are carried out") from None
+            raise NoAnswer(
+                f"{MOST_WAITING} commands wait already; try again when they are carried out"
+            ) from None
         return answer
 
     def carry_out(self, obey: Obey) -> bool:
-        """Carry out the next command that is still wanted, in the loop's thread; whether there was one."""
+        """Carry out the next command that is still wanted, in the loop's thread; whether there was
+        one."""
         try:
             while not (waiting := self._waiting.get_nowait())[1].set_running_or_notify_cancel():
                 pass
@@ -107,29 +120,45 @@ def _ended(_: Command) -> list[object]:
 class RecordPage(Observer):
     """The page of a recording at `access`; it is served while this is entered.
 
-    fmt: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps. about: see
-    RecordingSession.about. obey: carries out what the page orders, in the loop's thread. clock: the host's real one.
-    Raises ConfigError where the address cannot be used.
+    fmt: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps.
+    about: see RecordingSession.about. obey: carries out what the page orders, in the loop's thread.
+    clock: the host's real one. Raises ConfigError where the address cannot be used.
     """
 
     def __init__(
-        self, access: Access, fmt: SweepFormat, source: str, trigger: TriggerConfig, about: Callable[[], Mapping[str, Any]],
-        obey: Obey, clock: Clock,
-    ) -> None:  # fmt: skip
+        self,
+        access: Access,
+        fmt: SweepFormat,
+        source: str,
+        trigger: TriggerConfig,
+        about: Callable[[], Mapping[str, Any]],
+        obey: Obey,
+        clock: Clock,
+    ) -> None:
         self._about, self._obey, self._clock = about, obey, clock
         self._tracker = ContactTracker(Expected(fmt), source)
         self._rate_hz = fmt.rate_hz
-        self._commands = (*LABELS, "NEXT", "DISCARD", *(("START", "STOP") if trigger.mode == "serial" else ()))
+        self._commands = (
+            *LABELS,
+            "NEXT",
+            "DISCARD",
+            *(("START", "STOP") if trigger.mode == "serial" else ()),
+        )
         self._known = {
-            "source": source, "form": str(fmt), "trigger": trigger_words(trigger), "commands": self._commands,
-        }  # fmt: skip
+            "source": source,
+            "form": str(fmt),
+            "trigger": trigger_words(trigger),
+            "commands": self._commands,
+        }
         self._queue = CommandQueue()
         self._window: Window | None = None
         self._drawn: tuple[Window, dict[str, Any]] | None = None
         self._enumerations = 0
         self._state: tuple[object, ...] = ()
         self._state_ns = self._view_ns = clock.now_ns()
-        self.server = PageServer("record.html", access, clock.now_ns, {}, {"sweep": self._shown}, self._ordered)
+        self.server = PageServer(
+            "record.html", access, clock.now_ns, {}, {"sweep": self._shown}, self._ordered
+        )
 
     def __enter__(self) -> Self:
         self.server.__enter__()
@@ -146,11 +175,22 @@ class RecordPage(Observer):
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Show what a sweep has given. It comes after the recording has stored it."""
-        self._window = Window(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
-        self.server.publish("sweep", {
-            "sweep": sweep.id, "time_ns": self._clock.now_ns(), "status": verdict.status, "signal": bool(self._window),
-            "reason": REASONS.get(verdict.status, ""), "detail": verdict.detail, "lost": verdict.lost, "faulty": verdict.status.faulty,
-        })  # fmt: skip
+        self._window = (
+            Window(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
+        )
+        self.server.publish(
+            "sweep",
+            {
+                "sweep": sweep.id,
+                "time_ns": self._clock.now_ns(),
+                "status": verdict.status,
+                "signal": bool(self._window),
+                "reason": REASONS.get(verdict.status, ""),
+                "detail": verdict.detail,
+                "lost": verdict.lost,
+                "faulty": verdict.status.faulty,
+            },
+        )
         self._state = ()
 
     def turn(self, health: Health) -> None:
@@ -164,11 +204,20 @@ class RecordPage(Observer):
         state = health.skin, health.trouble, health.sweeping, health.ready
         if state != self._state or now_ns - self._state_ns >= PERIOD_NS:
             self._state, self._state_ns = state, now_ns
-            self.server.publish("recording", {
-                **self._known, **self._about(), "time_ns": now_ns, "skin": health.skin, "trouble": health.trouble,
-                "sweeping": health.sweeping, "ready": health.ready, "frames": health.frames,
-                "lost_frames": health.lost_frames if health.loss_known else None,
-            })  # fmt: skip
+            self.server.publish(
+                "recording",
+                {
+                    **self._known,
+                    **self._about(),
+                    "time_ns": now_ns,
+                    "skin": health.skin,
+                    "trouble": health.trouble,
+                    "sweeping": health.sweeping,
+                    "ready": health.ready,
+                    "frames": health.frames,
+                    "lost_frames": health.lost_frames if health.loss_known else None,
+                },
+            )
         if self.server.watched and now_ns - self._view_ns >= VIEW_NS:
             self._view_ns = now_ns
             self.server.show(self._tracker.view(health.skin, health.trouble))
@@ -177,7 +226,8 @@ class RecordPage(Observer):
         return self._queue.put(order(body, self._commands))
 
     def _shown(self, which: str) -> dict[str, Any] | None:
-        """The picture of the last sweep, where it is this one; computed once, whoever asks and however often."""
+        """The picture of the last sweep, where it is this one; computed once, whoever asks and
+        however often."""
         window = self._window
         if not window or window.sweep != int(which):
             return None

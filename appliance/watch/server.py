@@ -1,10 +1,11 @@
-"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both, to browsers; orders of its
-page, where the program takes any.
+"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both,
+to browsers; orders of its page, where the program takes any.
 
-The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET of the paths it was
-given; of a request nothing beyond the head is read. A browser that connects gets the events that are kept, then the new
-ones (server-sent events); one that comes back gets what it has missed. What a program takes orders for, it alone decides:
-without any there is no way in (docs/decisions/0016-labels-from-the-page.md).
+The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET
+of the paths it was given; of a request nothing beyond the head is read. A browser that connects
+gets the events that are kept, then the new ones (server-sent events); one that comes back gets what
+it has missed. What a program takes orders for, it alone decides: without any there is no way in
+(docs/decisions/0016-labels-from-the-page.md).
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ try:
     from tornado.netutil import bind_sockets
     from tornado.web import Application, HTTPError, RequestHandler
 except ImportError as e:
-    raise ConfigError("--web needs tornado, which is not installed; pip install 'palpate[page]'") from e
+    raise ConfigError(
+        "--web needs tornado, which is not installed; pip install 'palpate[page]'"
+    ) from e
 
 FOLDER = Path(__file__).with_name("page")
 KINDS = {
@@ -53,15 +56,18 @@ HEADERS = {
 }
 """What every answer says a browser may do, errors too."""
 HEAD_S = 5.0
-"""Limit for a request's head, with the handshake of TLS before it, and for a connection without a request."""
+"""Limit for a request's head, with the handshake of TLS before it, and for a connection without a
+request."""
 TAKEN_S = 30
 """Limit for taking what was sent: who reads nothing for so long is gone."""
 MOST_HEAD = 8192
 """Most bytes of a request that are read."""
 MOST_OPEN, MOST_OF_ONE = 64, 24
-"""Most connections at a time, and of one address; a further one is closed at once. A browser opens up to six."""
+"""Most connections at a time, and of one address; a further one is closed at once. A browser opens
+up to six."""
 MOST_WAITING = 100
-"""Events that wait for one browser. Who is further behind is cut off, and gets what is kept when it comes back."""
+"""Events that wait for one browser. Who is further behind is cut off, and gets what is kept when it
+comes back."""
 MOST_ORDER = 1024
 """Bytes of an order."""
 DONE_S = 3.0
@@ -76,7 +82,8 @@ DAY = 86_400
 Answer = Callable[[str], object | None]
 """Content for JSON, by the last part of a path; None where there is none."""
 Orders = Callable[[bytes], Future[Any]]
-"""Takes what a page has sent, without waiting; gives what becomes of it, for JSON, or an ApplianceError where it is refused."""
+"""Takes what a page has sent, without waiting; gives what becomes of it, for JSON, or an
+ApplianceError where it is refused."""
 
 
 class State(Protocol):
@@ -88,7 +95,8 @@ class State(Protocol):
 
 
 class EventLog:
-    """The events of one program. Each has a number; of each name the newest `kept[name]` stay, one where it has none.
+    """The events of one program. Each has a number; of each name the newest `kept[name]` stay, one
+    where it has none.
 
     run: tells the browsers of one server from those of the next, whose numbers begin anew.
     """
@@ -104,11 +112,14 @@ class EventLog:
         self._number += 1
         data = json.dumps(content, allow_nan=False, separators=(",", ":"))
         event = f"id: {self.run}-{self._number}\nevent: {name}\ndata: {data}\n\n".encode()
-        self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1))).append((self._number, event))
+        self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1))).append(
+            (self._number, event)
+        )
         return event
 
     def since(self, last: str) -> list[bytes]:
-        """What a browser has to get that has got everything up to the event `last` ("": nothing), in order."""
+        """What a browser has to get that has got everything up to the event `last` ("": nothing),
+        in order."""
         run, _, number = last.partition("-")
         after = int(number) if run == self.run and number.isdecimal() and len(number) < 20 else 0
         first = [] if after else [f"event: begin\ndata: {json.dumps(self.run)}\n\n".encode()]
@@ -116,17 +127,23 @@ class EventLog:
 
 
 class PageServer:
-    """Serves the page `name` of FOLDER and the other files there, at `access`. kept: as for EventLog.
+    """Serves the page `name` of FOLDER and the other files there, at `access`. kept: as for
+    EventLog.
 
-    now_ns: the clock by which events are stamped. answers: what is computed on request, by the first part of its path.
-    orders: takes what the page POSTs to /order; None: the page is read-only. Raises ConfigError where the address cannot be
-    used.
+    now_ns: the clock by which events are stamped. answers: what is computed on request, by the
+    first part of its path. orders: takes what the page POSTs to /order; None: the page is
+    read-only. Raises ConfigError where the address cannot be used.
     """
 
     def __init__(
-        self, name: str, access: Access, now_ns: Callable[[], int], kept: Mapping[str, int] | None = None,
-        answers: Mapping[str, Answer] | None = None, orders: Orders | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        access: Access,
+        now_ns: Callable[[], int],
+        kept: Mapping[str, int] | None = None,
+        answers: Mapping[str, Answer] | None = None,
+        orders: Orders | None = None,
+    ) -> None:
         self.access, self.now_ns, self.answers, self.orders = access, now_ns, answers or {}, orders
         self.events, self.key = EventLog(kept or {}), secrets.token_urlsafe()
         if orders:
@@ -134,12 +151,18 @@ class PageServer:
         self.queues: set[asyncio.Queue[bytes]] = set()
         self.answering: set[asyncio.Task[Any]] = set()
         self.wrong = TroubleLog("page")
-        self.files = {f"/{f.name}": (KINDS[f.suffix], f.read_bytes()) for f in FOLDER.iterdir() if f.suffix in KINDS}
+        self.files = {
+            f"/{f.name}": (KINDS[f.suffix], f.read_bytes())
+            for f in FOLDER.iterdir()
+            if f.suffix in KINDS
+        }
         self.files["/"] = self.files[f"/{name}"]
         self._stop = asyncio.Event()
         try:
             self._tls = access.tls()
-            self._sockets = bind_sockets(_checked(access.port), access.address, backlog=2 * MOST_OPEN)
+            self._sockets = bind_sockets(
+                _checked(access.port), access.address, backlog=2 * MOST_OPEN
+            )
         except (OSError, ValueError) as e:
             where = f"port {access.port} of {access.address}"
             raise ConfigError(f"{where} cannot be used: {e}; name another with --web PORT") from e
@@ -150,7 +173,9 @@ class PageServer:
         logging.getLogger("tornado").addHandler(logging.NullHandler())
         logging.getLogger("tornado").propagate = False
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),), daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop.run_until_complete, args=(self._serve(),), daemon=True
+        )
         self._thread.start()
         return self
 
@@ -165,8 +190,11 @@ class PageServer:
         return bool(self.queues)
 
     def publish(self, name: str, content: object) -> None:
-        """Send an event to all browsers, and keep it. Never waits. Raises ValueError for a number that JSON lacks."""
-        json.dumps(content, allow_nan=False)  # an error belongs to the caller, not into the server's thread
+        """Send an event to all browsers, and keep it. Never waits. Raises ValueError for a number
+        that JSON lacks."""
+        json.dumps(
+            content, allow_nan=False
+        )  # an error belongs to the caller, not into the server's thread
         self._loop.call_soon_threadsafe(self._spread, name, content)
 
     def show(self, view: State) -> None:
@@ -186,12 +214,20 @@ class PageServer:
         routes += [(r"/order", OrderHandler)] if self.orders else []
         application = Application(
             [(path, handler, {"page": self}) for path, handler in routes],
-            default_handler_class=FileHandler, default_handler_args={"page": self}, log_function=lambda handler: None,
-        )  # fmt: skip
+            default_handler_class=FileHandler,
+            default_handler_args={"page": self},
+            log_function=lambda handler: None,
+        )
         server = LimitedServer(
-            application, ssl_options=self._tls, max_header_size=MOST_HEAD, max_body_size=MOST_ORDER if self.orders else 0,
-            max_buffer_size=1 << 16, idle_connection_timeout=HEAD_S, body_timeout=HEAD_S, chunk_size=MOST_HEAD,
-        )  # fmt: skip
+            application,
+            ssl_options=self._tls,
+            max_header_size=MOST_HEAD,
+            max_body_size=MOST_ORDER if self.orders else 0,
+            max_buffer_size=1 << 16,
+            idle_connection_timeout=HEAD_S,
+            body_timeout=HEAD_S,
+            chunk_size=MOST_HEAD,
+        )
         server.add_sockets(self._sockets)
         tick = PeriodicCallback(server.drop_those_who_take_nothing, 1000)
         tick.start()
@@ -205,7 +241,8 @@ class PageServer:
 
 
 def _checked(port: int) -> int:
-    """Raises ValueError for a number that is no port, which the resolver would take modulo 65536."""
+    """Raises ValueError for a number that is no port, which the resolver would take modulo
+    65536."""
     if not 0 <= port <= 65535:
         raise ValueError("ports are numbers from 0 to 65535")
     return port
@@ -223,14 +260,18 @@ class LimitedServer(HTTPServer):
     def handle_stream(self, stream: Any, address: Any) -> None:
         """Take up a connection where there is room."""
         self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
-        if len(self._open) >= MOST_OPEN or sum(ip == address[0] for ip in self._open.values()) >= MOST_OF_ONE:
+        if (
+            len(self._open) >= MOST_OPEN
+            or sum(ip == address[0] for ip in self._open.values()) >= MOST_OF_ONE
+        ):
             stream.close()
             return
         self._open[stream] = address[0]
         super().handle_stream(stream, address)
 
     def drop_those_who_take_nothing(self) -> None:
-        """Close connections whose other side has taken nothing for TAKEN_S; called once a second."""
+        """Close connections whose other side has taken nothing for TAKEN_S; called once a
+        second."""
         self._since = Counter({one: self._since[one] + 1 for one in self._open if one.writing()})
         for stream, seconds in self._since.items():
             if seconds >= TAKEN_S:
@@ -264,7 +305,8 @@ class _Handler(RequestHandler):
             return
         if given:
             self.page.wrong.update(
-                "a wrong token", f"page: wrong token from {request.remote_ip}; further ones are not logged"
+                "a wrong token",
+                f"page: wrong token from {request.remote_ip}; further ones are not logged",
             )
             await asyncio.sleep(WRONG_S)
             self.clear_cookie(COOKIE, path="/", secure=True)
@@ -298,7 +340,8 @@ class FileHandler(_Handler):
         self._send(self.request.path)
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Who asks for the page without a token gets to enter it; the style and script of this are no secret."""
+        """Who asks for the page without a token gets to enter it; the style and script of this are
+        no secret."""
         path = "/enter.html" if self.request.path == "/" else self.request.path
         if status_code == 401 and path in ("/enter.html", "/enter.js", "/page.css"):
             self.set_status(401 if path == "/enter.html" else 200)
@@ -332,9 +375,13 @@ class OrderHandler(_Handler):
     SUPPORTED_METHODS = ("POST",)
 
     async def prepare(self) -> None:
-        """Refuse what the page itself did not send: another site has not its origin, and cannot read its key."""
+        """Refuse what the page itself did not send: another site has not its origin, and cannot
+        read its key."""
         await super().prepare()
-        headers, own = self.request.headers, f"{self.request.protocol}://{self.request.headers['Host']}"
+        headers, own = (
+            self.request.headers,
+            f"{self.request.protocol}://{self.request.headers['Host']}",
+        )
         if headers.get("Origin") != own or not hmac.compare_digest(
             headers.get(KEY, "").encode(), self.page.key.encode()
         ):
@@ -353,19 +400,24 @@ class OrderHandler(_Handler):
             self.set_header("Content-Type", "application/json")
             self.finish(content)
         except ApplianceError as e:
-            self.set_status(400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409)
+            self.set_status(
+                400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409
+            )
             self.set_header("Content-Type", "text/plain; charset=utf-8")
             self.finish(str(e))
 
     async def _done(self) -> Any:
-        """What has become of the order. Raises ApplianceError where it is refused; NoAnswer where nobody takes it up."""
+        """What has become of the order. Raises ApplianceError where it is refused; NoAnswer where
+        nobody takes it up."""
         assert self.page.orders
         order = self.page.orders(self.request.body)
         try:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(order)), DONE_S)
         except TimeoutError as e:
             known = (
-                "it was not carried out; try again" if order.cancel() else "it may still be carried out; wait for it"
+                "it was not carried out; try again"
+                if order.cancel()
+                else "it may still be carried out; wait for it"
             )
             raise NoAnswer(f"no answer within {DONE_S:g} s; {known}") from e
 

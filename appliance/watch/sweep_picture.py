@@ -1,5 +1,5 @@
-"""The picture of one sweep for the page. In: a `sweep` line of the feed. Out: lines of the taxels and a spectrogram, as
-numbers for JSON."""
+"""The picture of one sweep for the page. In: a `sweep` line of the feed. Out: lines of the taxels
+and a spectrogram, as numbers for JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from appliance.signal import features
 MOST_TAXELS = 16
 """Of a larger skin the most loaded taxels are drawn."""
 FINEST = 300
-"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no peak is lost."""
+"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no
+peak is lost."""
 MOST_BYTES = 1 << 20
 """Of a window."""
 
@@ -33,18 +34,28 @@ class Window:
 
 
 def window(line: Mapping[str, Any], rate_hz: float) -> Window:
-    """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for one that is not as it must be."""
-    dtype, shape, data = line["dtype"], tuple(map(int, line["shape"])), a2b_base64(line["data"], strict_mode=True)
-    if dtype not in DATA_TYPES or len(shape) not in (3, 4) or min(shape) < 1 or len(data) > MOST_BYTES:
+    """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for one that is not as
+    it must be."""
+    dtype, shape, data = (
+        line["dtype"],
+        tuple(map(int, line["shape"])),
+        a2b_base64(line["data"], strict_mode=True),
+    )
+    if (
+        dtype not in DATA_TYPES
+        or len(shape) not in (3, 4)
+        or min(shape) < 1
+        or len(data) > MOST_BYTES
+    ):
         raise ValueError(f"a window of {shape} {dtype}")
     taxels = np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape)
     return Window(int(line["sweep"]), rate_hz, taxels)
 
 
 def picture(one: Window) -> dict[str, Any]:
-    """What the page draws. taxels: name, least and highest count of each step in time, of the axis along the normal.
-    spectrogram: share of each band [steps][bands] (features.h_features), of `band_hz` and `step_s`; `trouble` says why
-    there is none."""
+    """What the page draws. taxels: name, least and highest count of each step in time, of the axis
+    along the normal. spectrogram: share of each band [steps][bands] (features.h_features), of
+    `band_hz` and `step_s`; `trouble` says why there is none."""
     counts = normal(one.taxels, 1).astype(np.float64)
     counts = np.where(np.isfinite(counts), counts, 0)
     frames, rows, cols = counts.shape
@@ -56,19 +67,29 @@ def picture(one: Window) -> dict[str, Any]:
         for reduce in (np.minimum.reduceat, np.maximum.reduceat)
     )
     names = [f"{i // cols + 1}.{i % cols + 1}" for i in shown.tolist()]
-    lines = [{"name": name, "low": lo, "high": hi} for name, lo, hi in zip(names, low, high, strict=True)]
+    lines = [
+        {"name": name, "low": lo, "high": hi} for name, lo, hi in zip(names, low, high, strict=True)
+    ]
     return {
-        "sweep": one.sweep, "seconds": frames / one.rate_hz, "taxels": lines, "of": rows * cols,
+        "sweep": one.sweep,
+        "seconds": frames / one.rate_hz,
+        "taxels": lines,
+        "of": rows * cols,
         **_spectrogram(one.taxels, one.rate_hz),
-    }  # fmt: skip
+    }
 
 
 def _spectrogram(taxels: NDArray[Any], rate_hz: float) -> dict[str, Any]:
     try:
-        shares = features.h_features(taxels, rate_hz, "hann").reshape(features.h_shape(len(taxels), rate_hz))
+        shares = features.h_features(taxels, rate_hz, "hann").reshape(
+            features.h_shape(len(taxels), rate_hz)
+        )
     except FormatError as e:
         return {"spectrogram": [], "trouble": str(e)}
     width = round(features.WINDOW_S * rate_hz)
     return {
-        "spectrogram": shares.round(3).tolist(), "band_hz": 2 * rate_hz / width, "step_s": features.HOP_S, "trouble": "",
-    }  # fmt: skip
+        "spectrogram": shares.round(3).tolist(),
+        "band_hz": 2 * rate_hz / width,
+        "step_s": features.HOP_S,
+        "trouble": "",
+    }

@@ -1,5 +1,6 @@
-"""Shows the running box in a terminal, for `palpate watch`. In: lines of its feed. Out: a picture that is drawn again and
-again; where the output is no terminal, a line for each event; or the feed's lines as they are.
+"""Shows the running box in a terminal, for `palpate watch`. In: lines of its feed. Out: a picture
+that is drawn again and again; where the output is no terminal, a line for each event; or the feed's
+lines as they are.
 """
 
 from __future__ import annotations
@@ -55,15 +56,17 @@ class WatchedBox:
         self._lowest: Any = None
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take one line; one of an unknown type is for a later version. Raises FormatError for one that is not as
-        PROTOCOL.md has it."""
+        """Take one line; one of an unknown type is for a later version. Raises FormatError for one
+        that is not as PROTOCOL.md has it."""
         take = _TAKERS.get(line["type"])
         if not take:
             return
         try:
             take(self, line)
         except (KeyError, TypeError, ValueError, AttributeError, FormatError) as e:
-            raise FormatError(f"the feed's line {line['type']} is not as it must be ({e!r}); update palpate") from e
+            raise FormatError(
+                f"the feed's line {line['type']} is not as it must be ({e!r}); update palpate"
+            ) from e
 
     def report(self) -> dict[str, Any]:
         """The state as `status.lines` shows it."""
@@ -85,7 +88,11 @@ class WatchedBox:
             return f"NO FEED: {self.trouble or 'waiting for the box'}"
         if self.health["sweeping"]:
             return "SWEEPING"
-        return "READY" if self.health["ready"] else f"NOT READY: skin {self.health['skin']} {self.health['trouble']}"
+        return (
+            "READY"
+            if self.health["ready"]
+            else f"NOT READY: skin {self.health['skin']} {self.health['trouble']}"
+        )
 
     def _take_hello(self, line: Mapping[str, Any]) -> None:
         form = typed(SweepFormat, dict(line["format"]))
@@ -95,14 +102,20 @@ class WatchedBox:
 
     def _take_health(self, line: Mapping[str, Any]) -> None:
         health = {name: value for name, value in line.items() if name != "type"}
-        status.lines({**health, "running": True, "verdicts": []}, 0)  # what cannot be shown is noticed here
+        status.lines(
+            {**health, "running": True, "verdicts": []}, 0
+        )  # what cannot be shown is noticed here
         self.health = health
 
     def _take_state(self, line: Mapping[str, Any]) -> None:
         self.health |= {name: line[name] for name in ("skin", "trouble", "sweeping", "ready")}
 
     def _take_verdict(self, line: Mapping[str, Any]) -> None:
-        verdict = {**line, "status": Status(line["status"]), "scores": [float(p) for p in line["scores"]]}
+        verdict = {
+            **line,
+            "status": Status(line["status"]),
+            "scores": [float(p) for p in line["scores"]],
+        }
         status.verdict_line(verdict, 0)
         self.verdicts.append(verdict)
         if verdict["status"].classified:
@@ -123,7 +136,9 @@ class WatchedBox:
             raise ValueError(f"a window of {line['shape']} {line['dtype']}")
         data = np.frombuffer(a2b_base64(line["data"]), np.dtype(line["dtype"]).newbyteorder("<"))
         window = data.reshape(line["shape"])
-        sweep_text.picture(window, self.rate_hz, 80, colours=False)  # what cannot be shown is noticed here
+        sweep_text.picture(
+            window, self.rate_hz, 80, colours=False
+        )  # what cannot be shown is noticed here
         self.window = window
 
     def _take_lost(self, line: Mapping[str, Any]) -> None:
@@ -131,16 +146,23 @@ class WatchedBox:
 
 
 _TAKERS: Mapping[str, Callable[[WatchedBox, Mapping[str, Any]], None]] = {
-    "hello": WatchedBox._take_hello, "health": WatchedBox._take_health, "state": WatchedBox._take_state,
-    "verdict": WatchedBox._take_verdict, "frame": WatchedBox._take_frame, "sweep": WatchedBox._take_sweep, "lost": WatchedBox._take_lost,
-}  # fmt: skip
+    "hello": WatchedBox._take_hello,
+    "health": WatchedBox._take_health,
+    "state": WatchedBox._take_state,
+    "verdict": WatchedBox._take_verdict,
+    "frame": WatchedBox._take_frame,
+    "sweep": WatchedBox._take_sweep,
+    "lost": WatchedBox._take_lost,
+}
 
 
 class WatchScreen(LiveScreen[WatchedBox]):
     """Shows the box."""
 
     def _picture(self, view: WatchedBox, width: int, height: int) -> list[str]:
-        return picture(view, self._clock.now_ns(), width, height, colours=self._colours, signs=self._signs)
+        return picture(
+            view, self._clock.now_ns(), width, height, colours=self._colours, signs=self._signs
+        )
 
     def _line(self, view: WatchedBox) -> str:
         return view.headline
@@ -148,10 +170,15 @@ class WatchScreen(LiveScreen[WatchedBox]):
 
 def picture(
     state: WatchedBox, now_ns: int, width: int, height: int, *, colours: bool, signs: str = BLOCKS
-) -> list[str]:  # fmt: skip
-    """The box as at most `height` lines of at most `width` characters. now_ns: of the clock that the box has."""
+) -> list[str]:
+    """The box as at most `height` lines of at most `width` characters. now_ns: of the clock that
+    the box has."""
     says = wrap(_plain(state.headline), max(10, width - 2))
-    head = [f" palpate watch   {_what(state)}"[:width], *(f" {BOLD}{text}{PLAIN}" for text in says), ""]
+    head = [
+        f" palpate watch   {_what(state)}"[:width],
+        *(f" {BOLD}{text}{PLAIN}" for text in says),
+        "",
+    ]
     maps = [line for row in side_by_side(state.load, state.full, width // 2, signs) for line in row]
     wide = max((len(_SEQUENCE.sub("", line)) for line in maps), default=0)
     body = [
@@ -162,8 +189,13 @@ def picture(
     if not state.health:
         return [*head, " Ctrl-C ends"]
     words = [f" {line}"[:width] for line in status.lines(state.report(), now_ns)]
-    facts, verdicts = words[: len(words) - len(state.verdicts)], words[len(words) - len(state.verdicts) :]
-    body = body[: height - len(head) - 4]  # of a large skin the first rows, and below it skin and last answer
+    facts, verdicts = (
+        words[: len(words) - len(state.verdicts)],
+        words[len(words) - len(state.verdicts) :],
+    )
+    body = body[
+        : height - len(head) - 4
+    ]  # of a large skin the first rows, and below it skin and last answer
     room = height - len(head) - len(body) - 2 * bool(body) - 1
     most = room - min(len(verdicts), 3)
     few = facts[:most] if most > 1 else facts[1:2]  # the skin, where there is room for one
@@ -175,11 +207,14 @@ def _what(state: WatchedBox) -> str:
     if not state.hello:
         return ""
     simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
-    return _plain(f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}")
+    return _plain(
+        f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}"
+    )
 
 
 def _beside(state: WatchedBox, width: int, signs: str) -> list[str]:
-    """What stands beside the skin: probabilities; while sweeps are recorded, the picture of the last one."""
+    """What stands beside the skin: probabilities; while sweeps are recorded, the picture of the
+    last one."""
     if state.hello.get("labels") and width >= NAME + BAR + 10:
         return list(probabilities(state, signs))
     if state.window is None or width < NAME + BAR:
@@ -188,7 +223,8 @@ def _beside(state: WatchedBox, width: int, signs: str) -> list[str]:
 
 
 def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
-    """The last classified verdict: its label, then all labels with their probabilities, the most probable first."""
+    """The last classified verdict: its label, then all labels with their probabilities, the most
+    probable first."""
     last = next((v for v in reversed(state.verdicts) if v["status"].classified), None)
     labels = state.hello.get("labels", [])
     if last is None or len(last["scores"]) != len(labels):
@@ -201,7 +237,8 @@ def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
 
 
 def events(state: WatchedBox, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:
-    """What is printed for a line of the feed where there is no terminal: connections, verdicts, changes of the state."""
+    """What is printed for a line of the feed where there is no terminal: connections, verdicts,
+    changes of the state."""
     if line["type"] == "hello":
         return [f"box {line['pid']}: {_what(state)}"]
     if line["type"] == "verdict":
@@ -219,7 +256,8 @@ def _plain(text: str) -> str:
 
 
 class TerminalWatch:
-    """`palpate watch` in a terminal: reads the feed at `path` until it is told to stop, also over restarts of the box."""
+    """`palpate watch` in a terminal: reads the feed at `path` until it is told to stop, also over
+    restarts of the box."""
 
     def __init__(self, path: str, out: TextIO, clock: Clock) -> None:
         self._screen = WatchScreen(out, clock)
@@ -263,8 +301,11 @@ class TerminalWatch:
             self._out.flush()
 
 
-def pass_on(path: str, out: TextIO, clock: Clock, stopped: Callable[[], bool], report: Callable[[str], None]) -> None:
-    """Write the feed's lines as they are, with frames at FRAMES_HZ, until `stopped()`. report: gets why there is none."""
+def pass_on(
+    path: str, out: TextIO, clock: Clock, stopped: Callable[[], bool], report: Callable[[str], None]
+) -> None:
+    """Write the feed's lines as they are, with frames at FRAMES_HZ, until `stopped()`. report: gets
+    why there is none."""
     with Feed(path, frames_hz=FRAMES_HZ, clock=clock) as feed:
         while not stopped():
             if line := feed.read(READ_S):

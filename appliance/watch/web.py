@@ -15,21 +15,27 @@ from appliance.watch.board import KEPT, PageBoard
 from appliance.watch.server import PageServer
 
 FRAMES_HZ = 20.0
-"""Frames that are asked for while somebody watches: alignment averages the last third of a second."""
+"""Frames that are asked for while somebody watches: alignment averages the last third of a
+second."""
 READ_S = 0.5
-"""Longest wait for a line: a box that is away is shown as often, which tells browsers that this program is there."""
+"""Longest wait for a line: a box that is away is shown as often, which tells browsers that this
+program is there."""
 
 
 class PageWatcher:
-    """The page of `palpate watch --web` at `access`, and what it shows: the feed at `path`. now_ns: the clock by which the
-    box stamps. Raises ConfigError where the address cannot be used."""
+    """The page of `palpate watch --web` at `access`, and what it shows: the feed at `path`. now_ns:
+    the clock by which the box stamps. Raises ConfigError where the address cannot be used."""
 
     def __init__(self, path: str, access: Access, now_ns: Callable[[], int]) -> None:
         self.feed = Feed(path, sweeps=True)
-        self.server = PageServer("watch.html", access, now_ns, KEPT, {"sweep": lambda which: self.board.sweep(which)})
+        self.server = PageServer(
+            "watch.html", access, now_ns, KEPT, {"sweep": lambda which: self.board.sweep(which)}
+        )
         self.board = PageBoard(self.server.publish)
         self._frames = False
-        self._log = TroubleLog("feed", "the page shows the box as away", end="feed: it is read", known=False)
+        self._log = TroubleLog(
+            "feed", "the page shows the box as away", end="feed: it is read", known=False
+        )
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Watch until `stopped()`."""

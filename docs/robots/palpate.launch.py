@@ -1,4 +1,5 @@
-"""ros2 launch palpate.launch.py port:=/dev/ttyUSB0 : the box as a node, started again if it ends."""
+"""ros2 launch palpate.launch.py port:=/dev/ttyUSB0 : the box as a node, started again if it
+ends."""
 
 from pathlib import Path
 
@@ -12,13 +13,24 @@ def generate_launch_description():
     parameters = str(Path(__file__).with_name("palpate.yaml"))
     return LaunchDescription(
         [
-            DeclareLaunchArgument("port", description="the box's serial line, or socket://HOST:PORT"),
+            DeclareLaunchArgument(
+                "port", description="the box's serial line, or socket://HOST:PORT"
+            ),
             ExecuteProcess(
                 cmd=[
-                    "python3", "-m", "appliance.bridges", "ros", "--ros-args", "--params-file", parameters,
-                    "-p", ["port:=", LaunchConfiguration("port")],
+                    "python3",
+                    "-m",
+                    "appliance.bridges",
+                    "ros",
+                    "--ros-args",
+                    "--params-file",
+                    parameters,
+                    "-p",
+                    ["port:=", LaunchConfiguration("port")],
                 ],
-                output="screen", respawn=True, respawn_delay=2.0,
+                output="screen",
+                respawn=True,
+                respawn_delay=2.0,
             ),
         ]
-    )  # fmt: skip
+    )

@@ -1,7 +1,8 @@
-"""What a frame may take, and what it takes: `mpremote run budget.py` on a Pico; `micropython budget.py` anywhere.
+"""What a frame may take, and what it takes: `mpremote run budget.py` on a Pico; `micropython
+budget.py` anywhere.
 
-Calculated from data sheets (README.md names them): what is left for MicroPython of the time of one reading. Measured where
-this runs: the part without pins, and on a Pico the reading of a frame.
+Calculated from data sheets (README.md names them): what is left for MicroPython of the time of one
+reading. Measured where this runs: the part without pins, and on a Pico the reading of a frame.
 """
 
 import math
@@ -13,7 +14,8 @@ import settings
 CONVERSION_US = 2
 """RP2040 and RP2350: 96 cycles of 48 MHz."""
 PULL_DOWN_OHM, FARAD = 4700, 150e-12
-"""The resistor at the converter; 45 pF and 5 pF of the multiplexer, 100 pF assumed for the wires."""
+"""The resistor at the converter; 45 pF and 5 pF of the multiplexer, 100 pF assumed for the
+wires."""
 FORMS = ((4, 4, 750, "uint8"), (16, 16, 100, "uint8"), (16, 16, 100, "uint16"))
 
 
@@ -23,13 +25,20 @@ def settle_us(bits):
 
 
 def calculated(rows, cols, rate_hz, dtype):
-    """(us a reading, us of them that settling takes, us left for MicroPython, bytes a second, bytes of memory)."""
+    """(us a reading, us of them that settling takes, us left for MicroPython, bytes a second, bytes
+    of memory)."""
     form = readout.Form(rows, cols, rate_hz, dtype)
     reading_us = form.period_us / (rows * cols)
     settling_us = settle_us(12 if form.item_bytes == 2 else 8)
     packet = readout.HEADER_BYTES + form.packet_frames * form.frame_bytes + readout.CRC_BYTES
     rate = packet * 1000000 / (form.period_us * form.packet_frames)
-    return reading_us, settling_us, reading_us - settling_us - CONVERSION_US, rate, packet * (form.packets + 2)
+    return (
+        reading_us,
+        settling_us,
+        reading_us - settling_us - CONVERSION_US,
+        rate,
+        packet * (form.packets + 2),
+    )
 
 
 class Ticks:
@@ -55,11 +64,12 @@ class Ticks:
 
 
 def pure_us(rows, cols, rate_hz, dtype):
-    """Microseconds a frame takes without its reading: number, time, FIFO, header, CRC; the best of 40 times 60 frames."""
+    """Microseconds a frame takes without its reading: number, time, FIFO, header, CRC; the best of
+    40 times 60 frames."""
     form, clock = readout.Form(rows, cols, rate_hz, dtype), Ticks()
     board = readout.Readout(
         form, "", lambda buffer, at: None, lambda: 0, clock, clock, lambda: 0, lambda state: None
-    )  # fmt: skip
+    )
     board.request(readout.START)
     best = 1000000
     for _ in range(40):
@@ -79,7 +89,9 @@ def reading_us():
     except ImportError:
         return None
     form = readout.Form(settings.ROWS, settings.COLS, settings.RATE_HZ, settings.DTYPE)
-    scanner = main.Scanner(form, settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, settings.SETTLE_US)
+    scanner = main.Scanner(
+        form, settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, settings.SETTLE_US
+    )
     buffer = bytearray(form.frame_bytes)
     began = time.ticks_us()
     for _ in range(100):
@@ -109,4 +121,6 @@ if __name__ == "__main__":
     if measured is None:
         print("a reading is measured on a Pico alone")
     else:
-        print(f"measured here: {measured:.1f} us a reading, as settings.py has it, settling included")
+        print(
+            f"measured here: {measured:.1f} us a reading, as settings.py has it, settling included"
+        )

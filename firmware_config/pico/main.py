@@ -1,4 +1,5 @@
-"""The readout board on a Raspberry Pi Pico: pins, converter, timer and the port, around `readout`."""
+"""The readout board on a Raspberry Pi Pico: pins, converter, timer and the port, around
+`readout`."""
 
 import select
 import sys
@@ -12,16 +13,23 @@ from machine import ADC, Pin, Timer, disable_irq, enable_irq, unique_id
 
 
 class Scanner:
-    """Reads the taxels one by one, in an interrupt, where nothing may be allocated. So it is a class and no closure, which
-    allocates when it is called with more than five names, and assigns at most three names at once, since four make a tuple.
+    """Reads the taxels one by one, in an interrupt, where nothing may be allocated. So it is a
+    class and no closure, which allocates when it is called with more than five names, and assigns
+    at most three names at once, since four make a tuple.
     """
 
     def __init__(self, form, row_pins, col_pins, adc_pin, settle_us):
         lines, levels, taxels = readout.reading_order(form.rows, form.cols)
-        self._lines, self._levels, self._taxels = bytearray(lines), bytearray(levels), array("H", taxels)
+        self._lines, self._levels, self._taxels = (
+            bytearray(lines),
+            bytearray(levels),
+            array("H", taxels),
+        )
         self._pins = [Pin(number, Pin.OUT, value=0) for number in tuple(row_pins) + tuple(col_pins)]
         self._read, self._settle_us = ADC(Pin(adc_pin)).read_u16, settle_us
-        self.scan = self._scan8 if form.item_bytes == 1 else self._scan16  # (buffer, at): writes a frame there
+        self.scan = (
+            self._scan8 if form.item_bytes == 1 else self._scan16
+        )  # (buffer, at): writes a frame there
 
     @micropython.native
     def _scan8(self, buffer, at):
@@ -60,7 +68,13 @@ class Ticker:
 
     def start(self, period_us, callback):
         """Call `callback` once a period."""
-        self._timer.init(mode=Timer.PERIODIC, period=period_us, tick_hz=1000000, callback=callback, **self._options)
+        self._timer.init(
+            mode=Timer.PERIODIC,
+            period=period_us,
+            tick_hz=1000000,
+            callback=callback,
+            **self._options,
+        )
 
     def stop(self):
         """Call it no more."""
@@ -69,15 +83,25 @@ class Ticker:
 
 def board(config, **counters):
     """The board that the settings ask for. counters: see `readout.Readout`."""
-    form = readout.Form(config.ROWS, config.COLS, config.RATE_HZ, config.DTYPE, config.FIFO_S, config.BOARD)
+    form = readout.Form(
+        config.ROWS, config.COLS, config.RATE_HZ, config.DTYPE, config.FIFO_S, config.BOARD
+    )
     scan = Scanner(form, config.ROW_PINS, config.COL_PINS, config.ADC_PIN, config.SETTLE_US).scan
-    level = (lambda: 0) if config.TRIGGER_PIN is None else Pin(config.TRIGGER_PIN, Pin.IN, Pin.PULL_DOWN)
+    level = (
+        (lambda: 0)
+        if config.TRIGGER_PIN is None
+        else Pin(config.TRIGGER_PIN, Pin.IN, Pin.PULL_DOWN)
+    )
     serial = "".join(f"{byte:02x}" for byte in unique_id())[-16:]
     ticker = Ticker(config.HARD_TIMER)
     try:
-        return readout.Readout(form, serial, scan, level, time, ticker, disable_irq, enable_irq, **counters)
+        return readout.Readout(
+            form, serial, scan, level, time, ticker, disable_irq, enable_irq, **counters
+        )
     except MemoryError:
-        raise ValueError(f"FIFO_S = {config.FIFO_S} does not fit the memory; use less, at least 0.25") from None
+        raise ValueError(
+            f"FIFO_S = {config.FIFO_S} does not fit the memory; use less, at least 0.25"
+        ) from None
 
 
 def run(config=settings, **counters):
@@ -100,5 +124,7 @@ def run(config=settings, **counters):
 
 
 if __name__ == "__main__" and Pin(settings.SERVICE_PIN, Pin.IN, Pin.PULL_UP).value():
-    micropython.alloc_emergency_exception_buf(100)  # an interrupt cannot allocate what would tell of its failure
+    micropython.alloc_emergency_exception_buf(
+        100
+    )  # an interrupt cannot allocate what would tell of its failure
     run()

@@ -1,8 +1,10 @@
-"""The readout board without its pins: form, order of reading, FIFO, packets, requests (PROTOCOL.md, part 1).
+"""The readout board without its pins: form, order of reading, FIFO, packets, requests (PROTOCOL.md,
+part 1).
 
-In: settings, a scan function, a clock with MicroPython's ticks_us, ticks_add and ticks_diff. Out: bytes.
-`Readout.tick` runs in a timer interrupt. It must not allocate memory, so buffers are made beforehand, and counters of 32
-bits are kept as two halves: on a Pico, an integer of more than 30 bits is an object on the heap.
+In: settings, a scan function, a clock with MicroPython's ticks_us, ticks_add and ticks_diff. Out:
+bytes. `Readout.tick` runs in a timer interrupt. It must not allocate memory, so buffers are made
+beforehand, and counters of 32 bits are kept as two halves: on a Pico, an integer of more than 30
+bits is an object on the heap.
 """
 
 import struct
@@ -32,7 +34,9 @@ class Form:
         if not 1 <= rate_hz <= 10000:
             raise ValueError(f"RATE_HZ = {rate_hz} is out of range; use 1 to 10000")
         if dtype not in DATA_TYPES:
-            raise ValueError(f"DTYPE = {dtype!r} is unknown; use one of {', '.join(sorted(DATA_TYPES))}")
+            raise ValueError(
+                f"DTYPE = {dtype!r} is unknown; use one of {', '.join(sorted(DATA_TYPES))}"
+            )
         if not 0.25 <= fifo_s <= 60:
             raise ValueError(f"FIFO_S = {fifo_s} is out of range; use 0.25 to 60")
         if not 1 <= len(board) <= 16:
@@ -40,15 +44,21 @@ class Form:
         self.rows, self.cols, self.board = rows, cols, board
         self.code, self.item_bytes = DATA_TYPES[dtype]
         self.frame_bytes = rows * cols * self.item_bytes
-        self.period_us = int(1000000 / rate_hz + 0.5)  # timers count whole microseconds, and the rate is said as it is
-        self.packet_frames = max(1, min(MAX_FRAMES, MAX_PAYLOAD // self.frame_bytes, PACKET_US // self.period_us))
+        self.period_us = int(
+            1000000 / rate_hz + 0.5
+        )  # timers count whole microseconds, and the rate is said as it is
+        self.packet_frames = max(
+            1, min(MAX_FRAMES, MAX_PAYLOAD // self.frame_bytes, PACKET_US // self.period_us)
+        )
         self.packets = -int(-fifo_s * 1000000 // (self.period_us * self.packet_frames))
 
     def format_payload(self):
         """Payload of the reply to FORMAT."""
         rate_mhz = (1000000000 + self.period_us // 2) // self.period_us
         fifo = self.packets * self.packet_frames
-        return struct.pack("<BBBBIII", self.rows, self.cols, self.code, 0, rate_mhz, fifo, self.packet_frames)
+        return struct.pack(
+            "<BBBBIII", self.rows, self.cols, self.code, 0, rate_mhz, fifo, self.packet_frames
+        )
 
     def identity_payload(self, serial):
         """Payload of the reply to IDENTITY. serial: at most 16 ASCII characters."""
@@ -79,16 +89,17 @@ def put32(buffer, at, low, high):
 
 
 def gray(count):
-    """The numbers below `count` in the order of a Gray code: for 4, 8 and 16 each differs from the next in one bit."""
+    """The numbers below `count` in the order of a Gray code: for 4, 8 and 16 each differs from the
+    next in one bit."""
     return [code for code in (i ^ (i >> 1) for i in range(MOST)) if code < count]
 
 
 def reading_order(rows, cols):
     """How one frame is read with the fewest switches: lists (lines, levels, taxels), item by item.
 
-    Set select line `lines[i]` (0 to 3: rows, 4 to 7: columns, lowest bit first) to `levels[i]`, then read taxel
-    `taxels[i]`, its place in the frame, row by row; nothing where that is NO_TAXEL. All lines are low at first, and are
-    again after the last item.
+    Set select line `lines[i]` (0 to 3: rows, 4 to 7: columns, lowest bit first) to `levels[i]`,
+    then read taxel `taxels[i]`, its place in the frame, row by row; nothing where that is NO_TAXEL.
+    All lines are low at first, and are again after the last item.
     """
     lines, levels, taxels = [], [], []
     at, forwards = 0, gray(cols)
@@ -111,15 +122,18 @@ def reading_order(rows, cols):
 
 
 class Fifo:
-    """A ring of packets. The interrupt fills one frame by frame; the main program takes the oldest one that is full.
+    """A ring of packets. The interrupt fills one frame by frame; the main program takes the oldest
+    one that is full.
 
-    lock, unlock: `machine.disable_irq` and `enable_irq`; they guard the few statements that must not be torn apart.
-    Raises MemoryError if it does not fit the memory.
+    lock, unlock: `machine.disable_irq` and `enable_irq`; they guard the few statements that must
+    not be torn apart. Raises MemoryError if it does not fit the memory.
     """
 
     def __init__(self, form, lock, unlock):
         self._form, self._lock, self._unlock = form, lock, unlock
-        self._slots = [self._blank() for _ in range(form.packets + 1)]  # one more: the one being filled
+        self._slots = [
+            self._blank() for _ in range(form.packets + 1)
+        ]  # one more: the one being filled
         self._counts = bytearray(form.packets + 1)
         self._spare = self._blank()
         self._oldest = self._full = self._filled = 0
@@ -142,7 +156,8 @@ class Fifo:
         self._unlock(state)
 
     def room(self, seq_low, seq_high, t_low, t_high, level):
-        """In the interrupt: where in `filling` the next frame goes. The others tell of it: number, time, trigger line."""
+        """In the interrupt: where in `filling` the next frame goes. The others tell of it: number,
+        time, trigger line."""
         if self._filled == 0:
             put32(self.filling, 12, seq_low, seq_high)
             put32(self.filling, 16, t_low, t_high)
@@ -156,8 +171,8 @@ class Fifo:
             self.finish()
 
     def finish(self):
-        """In the interrupt: the packet ends here, for it is full or the next number does not follow. Drops the oldest
-        packet if there is no other room."""
+        """In the interrupt: the packet ends here, for it is full or the next number does not
+        follow. Drops the oldest packet if there is no other room."""
         if self._filled == 0:
             return
         size = len(self._slots)
@@ -171,8 +186,8 @@ class Fifo:
         self.filling = self._slots[(self._oldest + self._full) % size]
 
     def take(self):
-        """The oldest packet, complete with its CRC, and its size; (None, 0) if there is none. It stays as it is until
-        the next call."""
+        """The oldest packet, complete with its CRC, and its size; (None, 0) if there is none. It
+        stays as it is until the next call."""
         state = self._lock()
         if self._full == 0:
             self._unlock(state)
@@ -185,7 +200,9 @@ class Fifo:
         overflowed, self._overflowed = self._overflowed, False
         self._unlock(state)
         length = frames * self._form.frame_bytes
-        struct.pack_into("<HBB", packet, 4, length, packet[6] | (OVERFLOW if overflowed else 0), frames)
+        struct.pack_into(
+            "<HBB", packet, 4, length, packet[6] | (OVERFLOW if overflowed else 0), frames
+        )
         seal(packet, length)
         return packet, HEADER_BYTES + length + CRC_BYTES
 
@@ -193,12 +210,14 @@ class Fifo:
 class Readout:
     """The board: numbers and times of frames, and what is sent.
 
-    scan: called with a buffer and an offset, writes one frame there. level: the trigger line. clock: `time`. timer: its
-    start(period_us, callback) and stop() let `tick` be called. lock, unlock: as for Fifo. seq, t_us: the first number and
-    time, as (low, high).
+    scan: called with a buffer and an offset, writes one frame there. level: the trigger line.
+    clock: `time`. timer: its start(period_us, callback) and stop() let `tick` be called. lock,
+    unlock: as for Fifo. seq, t_us: the first number and time, as (low, high).
     """
 
-    def __init__(self, form, serial, scan, level, clock, timer, lock, unlock, seq=(0, 0), t_us=(0, 0)):
+    def __init__(
+        self, form, serial, scan, level, clock, timer, lock, unlock, seq=(0, 0), t_us=(0, 0)
+    ):
         self._scan, self._level, self._clock, self._timer = scan, level, clock, timer
         self._period, self._half = form.period_us, form.period_us // 2
         self._fifo = Fifo(form, lock, unlock)
@@ -215,8 +234,9 @@ class Readout:
     def tick(self, _timer=None):
         """In the interrupt, once a period: take the frame that is due.
 
-        Its number comes from the clock: if the interrupt was late by more than half a period, the frames that were not
-        taken keep their numbers, so that the count and the clock agree and the loss is seen.
+        Its number comes from the clock: if the interrupt was late by more than half a period, the
+        frames that were not taken keep their numbers, so that the count and the clock agree and the
+        loss is seen.
         """
         if not self.running:
             return  # a soft timer's interrupt that had waited when STOP came
@@ -247,7 +267,8 @@ class Readout:
         self._seq_high = (self._seq_high + (low >> 16)) & 0xFFFF
 
     def request(self, number):
-        """Do what a request byte asks for. Other bytes are left alone: a modem manager may send anything."""
+        """Do what a request byte asks for. Other bytes are left alone: a modem manager may send
+        anything."""
         if number in self._replies:
             self._reply = self._replies[number]
         elif number == START and not self.running:
@@ -267,7 +288,8 @@ class Readout:
         return self._reply is not None
 
     def next(self):
-        """What is sent next, a reply before frames: a buffer and how many of its bytes; (None, 0) for nothing."""
+        """What is sent next, a reply before frames: a buffer and how many of its bytes; (None, 0)
+        for nothing."""
         answer, self._reply = self._reply, None
         return (answer, len(answer)) if answer else self._fifo.take()
 
@@ -275,8 +297,9 @@ class Readout:
 def serve(readout, stdin, stdout, readable):
     """Answer requests and send packets until `stdin` ends, which on a Pico it never does.
 
-    readable: called with milliseconds, whether a byte can be read from `stdin`, after so long a wait at most.
-    `stdout.write` may take a part, or nothing while the host does not read; the rest is sent later.
+    readable: called with milliseconds, whether a byte can be read from `stdin`, after so long a
+    wait at most. `stdout.write` may take a part, or nothing while the host does not read; the rest
+    is sent later.
     """
     byte = bytearray(1)
     packet, sent, size = None, 0, 0

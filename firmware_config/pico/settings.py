@@ -1,4 +1,5 @@
-"""The settings of the readout board: change them to fit the skin, copy this file to the Pico, and switch it on again."""
+"""The settings of the readout board: change them to fit the skin, copy this file to the Pico, and
+switch it on again."""
 
 ROWS = 4  # along the direction of sliding, 1 to 16
 COLS = 4  # 1 to 16
@@ -12,5 +13,7 @@ COL_PINS = (6, 7, 8, 9)  # the same for the columns
 ADC_PIN = 26  # GPIO 26, 27 or 28: the common pin of the columns' multiplexer
 SETTLE_US = 5  # wait between switching to a taxel and reading it; README.md, "Budget"
 TRIGGER_PIN = None  # GPIO of the robot's trigger line, where it is wired to this board as well
-SERVICE_PIN = 22  # connected to GND while the power comes: the prompt of MicroPython in place of the firmware
+SERVICE_PIN = (
+    22  # connected to GND while the power comes: the prompt of MicroPython in place of the firmware
+)
 HARD_TIMER = True  # frames are taken even while MicroPython collects garbage; needs MicroPython 1.26 or later

@@ -1,6 +1,8 @@
-"""Backends: what can lie below the drivers of the box. In: PALPATE_BACKEND. Out: a Backend, or BackendMissing.
+"""Backends: what can lie below the drivers of the box. In: PALPATE_BACKEND. Out: a Backend, or
+BackendMissing.
 
-tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink; it runs over any of them.
+tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink; it
+runs over any of them.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ class BackendMissing(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """A skin as it is plugged in: serial number, protocol version, and the form of what it sends."""
+    """A skin as it is plugged in: serial number, protocol version, and the form of what it
+    sends."""
 
     serial: str = "SIM0001"
     protocol: int = packets.VERSION
@@ -66,14 +69,14 @@ class Skin:
 class Backend(Protocol):
     """What lies below the drivers: what they are given, and what a test can do to it from outside.
 
-    can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is unplugged, plugged in and
-    swapped. "unbind": its driver is taken away. "garble", "silence", "hold" (another program has it), "deny" (this user
-    may not open it).
-    "lines": inputs are driven, outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends
-    and receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
+    can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is
+    unplugged, plugged in and swapped. "unbind": its driver is taken away. "garble", "silence",
+    "hold" (another program has it), "deny" (this user may not open it). "lines": inputs are driven,
+    outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends and
+    receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
 
-    slack_s: how much later than asked this machine may be before a wait counts as endless. pulse_s: how long a level is
-    held so that the kernel sees it for certain. Controls act at once.
+    slack_s: how much later than asked this machine may be before a wait counts as endless. pulse_s:
+    how long a level is held so that the kernel sees it for certain. Controls act at once.
     """
 
     name: str
@@ -90,7 +93,8 @@ class Backend(Protocol):
     serial: SerialConfig
 
     def reset(self) -> None:
-        """A plain `Skin()` in its socket, inputs low, nothing on the serial line; nothing is in the way."""
+        """A plain `Skin()` in its socket, inputs low, nothing on the serial line; nothing is in the
+        way."""
         ...
 
     def wait(self, seconds: float) -> None:
@@ -159,7 +163,8 @@ class Backend(Protocol):
 
 
 def chosen() -> str:
-    """The name in PALPATE_BACKEND; the simulator where it is not set. Raises BackendMissing for an unknown one."""
+    """The name in PALPATE_BACKEND; the simulator where it is not set. Raises BackendMissing for an
+    unknown one."""
     name = os.environ.get(VARIABLE) or "simulated"
     if name not in NAMES:
         raise BackendMissing(f"{VARIABLE} = {name!r} is unknown; known are {', '.join(NAMES)}")
@@ -167,6 +172,7 @@ def chosen() -> str:
 
 
 def opened(name: str) -> AbstractContextManager[Backend]:
-    """The backend of that name, to be used in a `with`. Raises BackendMissing where this machine has not got it."""
+    """The backend of that name, to be used in a `with`. Raises BackendMissing where this machine
+    has not got it."""
     made: AbstractContextManager[Backend] = import_module(f"{__name__}.{name}").opened()
     return made

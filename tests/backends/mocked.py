@@ -1,4 +1,5 @@
-"""umockdev as a backend: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in real time.
+"""umockdev as a backend: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in
+real time.
 
 In: a process under umockdev-wrapper. Out: the skins of `skins`, a GPIO chip, and a pseudo-terminal.
 """
@@ -32,7 +33,12 @@ class Mocked(real.Real):
         self._chip = mocked_gpio.Chip(bench, [f"GPIO{i}" for i in range(28)])
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
-        self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
+        self.put, self.pull, self.say, self.hear = (
+            self._far.put,
+            self._far.pull,
+            self._far.say,
+            self._far.hear,
+        )
         self.drive, self.unplug = self._chip.drive, self._socket.unplug
 
     def reset(self) -> None:
@@ -79,7 +85,8 @@ class Mocked(real.Real):
 
 @contextmanager
 def opened() -> Iterator[Mocked]:
-    """A mocked machine. Raises BackendMissing where umockdev is not there, or not below this process."""
+    """A mocked machine. Raises BackendMissing where umockdev is not there, or not below this
+    process."""
     with ExitStack() as stack:
         bench = mocks.MockedDevices()
         stack.callback(bench.close)

@@ -1,7 +1,9 @@
-"""A GPIO chip over umockdev: the kernel's v2 ioctls below unmodified libgpiod. In: levels. Out: edge events, levels.
+"""A GPIO chip over umockdev: the kernel's v2 ioctls below unmodified libgpiod. In: levels. Out:
+edge events, levels.
 
-Each request's file is a named pipe with an answer to ioctls: libgpiod polls and reads events from it, as from the
-kernel, and a pipe that is full drops its oldest event, as the kernel's queue does (at 1360 events, not at 1024).
+Each request's file is a named pipe with an answer to ioctls: libgpiod polls and reads events from
+it, as from the kernel, and a pipe that is full drops its oldest event, as the kernel's queue does
+(at 1360 events, not at 1024).
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ REQUESTS = 12
 
 @dataclass(slots=True)
 class Held:
-    """One request of lines: offsets in its order, flags and consumer as asked, its file, and what it has counted.
+    """One request of lines: offsets in its order, flags and consumer as asked, its file, and what
+    it has counted.
 
     pipe: the same file, opened here.
     """
@@ -81,7 +84,10 @@ class Chip:
             if offset in held.offsets and held.flags & (RISING if rises else FALLING):
                 held.number += 1
                 held.numbers[offset] = held.numbers.get(offset, 0) + 1
-                put(held.pipe, EVENT.pack(t_ns, 1 if rises else 2, offset, held.number, held.numbers[offset]))
+                put(
+                    held.pipe,
+                    EVENT.pack(t_ns, 1 if rises else 2, offset, held.number, held.numbers[offset]),
+                )
 
     def _answer(self, number: int, argument: Any, _: int) -> None:
         """An ioctl of the chip."""
@@ -101,7 +107,9 @@ class Chip:
         (offset,) = struct.unpack_from("<I", bytes(info.retrieve()), 64)
         holder = next((held for held in self._held.values() if offset in held.offsets), None)
         consumer, flags = (holder.consumer, holder.flags | USED) if holder else (b"", 0)
-        info.update(0, struct.pack("<32s32sIIQ", self._names[offset].encode(), consumer, offset, 0, flags))
+        info.update(
+            0, struct.pack("<32s32sIIQ", self._names[offset].encode(), consumer, offset, 0, flags)
+        )
 
     def _request(self, asked: Any) -> None:
         """struct gpio_v2_line_request."""
@@ -142,7 +150,8 @@ class Chip:
                 self._levels[self._names[offset]] = bool(bits >> i & 1) != bool(flags & ACTIVE_LOW)
 
     def _look(self) -> None:
-        """See which requests were closed. Outputs stay as they were driven, as on chips whose driver resets nothing."""
+        """See which requests were closed. Outputs stay as they were driven, as on chips whose
+        driver resets nothing."""
         for slot, held in list(self._held.items()):
             with suppress(OSError):
                 if os.path.sameopenfile(held.file, held.pipe):

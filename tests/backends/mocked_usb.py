@@ -1,4 +1,5 @@
-"""A USB socket over umockdev: usbfs ioctls and uevents below unmodified libusb. In: a board. Out: what a bus does."""
+"""A USB socket over umockdev: usbfs ioctls and uevents below unmodified libusb. In: a board. Out:
+what a bus does."""
 
 from __future__ import annotations
 
@@ -17,9 +18,12 @@ CLAIM, RELEASE, DRIVER, CAPABILITIES = 0x550F, 0x5510, 0x5508, 0x551A
 PLAIN = {0x5504, 0x5505, 0x5514, 0x5515}
 URB_CONTROL = 2
 PACE_S = 0.0005
-"""libusb asks again and again, since a mocked file is always ready to be asked: pause that long before `not yet`."""
+"""libusb asks again and again, since a mocked file is always ready to be asked: pause that long
+before `not yet`."""
 
-DEVICE = struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, 64, usb.VENDOR_ID, usb.PRODUCT_ID, 0x0100, 1, 2, 3, 1)
+DEVICE = struct.pack(
+    "<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, 64, usb.VENDOR_ID, usb.PRODUCT_ID, 0x0100, 1, 2, 3, 1
+)
 CONFIGURATION = (
     struct.pack("<BBHBBBBB", 9, 2, 25, 1, 1, 0, 0x80, 50)
     + struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 1, 255, 0, 0, 0)
@@ -46,7 +50,8 @@ H: descriptors={descriptors}
 
 @dataclass(slots=True, eq=False)
 class Urb:
-    """A request on its way: the kernel's struct usbdevfs_urb [56 bytes], and its buffer, and the open file."""
+    """A request on its way: the kernel's struct usbdevfs_urb [56 bytes], and its buffer, and the
+    open file."""
 
     head: Any
     buffer: Any
@@ -60,7 +65,8 @@ class Urb:
 
 
 class Device:
-    """One device on the bus, from plugging in to pulling out. mangle: what the cable does to the bytes of a transfer.
+    """One device on the bus, from plugging in to pulling out. mangle: what the cable does to the
+    bytes of a transfer.
 
     All of it runs in the mocks' thread.
     """
@@ -90,7 +96,9 @@ class Device:
         elif number == RELEASE:
             self._claimed = 0
         elif number == CAPABILITIES:
-            argument.resolve(0, 4).update(0, bytes(4))  # the first that libusb asks of a file: nothing is under way
+            argument.resolve(0, 4).update(
+                0, bytes(4)
+            )  # the first that libusb asks of a file: nothing is under way
             self._waiting = [urb for urb in self._waiting if urb.client != client]
             self._done = [urb for urb in self._done if urb.client != client]
         elif number == DRIVER:
@@ -114,7 +122,9 @@ class Device:
     def _control(self, urb: Urb) -> None:
         kind, request, value, _, length = struct.unpack_from("<BBHHH", urb.buffer.retrieve())
         if kind == 0x80 and request == 6 and value >> 8 == 3:
-            text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[value & 0xFF]
+            text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[
+                value & 0xFF
+            ]
             body = text.encode("utf-16-le") if text else b"\x09\x04"
             reply: bytes | None = bytes([len(body) + 2, 3]) + body
         else:
@@ -182,12 +192,15 @@ class Socket:
         return f"bus/usb/001/{self._number:03}"
 
     def plug(self, board: rig.Board) -> None:
-        """Put a board in, in place of the one before; the kernel's word of it is out when this returns."""
+        """Put a board in, in place of the one before; the kernel's word of it is out when this
+        returns."""
         self.unplug()
         self._number += 1
         device = self.device = Device(board)
         descriptors = (DEVICE + CONFIGURATION).hex().upper()
-        self._bench.testbed.add_from_string(ENTRY.format(number=self._number, descriptors=descriptors))
+        self._bench.testbed.add_from_string(
+            ENTRY.format(number=self._number, descriptors=descriptors)
+        )
         self._bench.attach(self.name, device.answer)
 
     def unplug(self) -> None:
@@ -202,7 +215,8 @@ class Socket:
     def unbind(self, on: bool) -> None:
         """Let requests fail and the node be away without a uevent, or bring both back.
 
-        Linux keeps the node and ends its open files with POLLERR, which umockdev cannot; libusb takes either for unplugged.
+        Linux keeps the node and ends its open files with POLLERR, which umockdev cannot; libusb
+        takes either for unplugged.
         """
         assert self.device
         self.device.unbind(on)

@@ -1,6 +1,8 @@
-"""umockdev for backends: devices that open, read and ioctl of this process meet, answered by handlers in one thread.
+"""umockdev for backends: devices that open, read and ioctl of this process meet, answered by
+handlers in one thread.
 
-In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: MockedDevices with a testbed and its thread.
+In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: MockedDevices with a
+testbed and its thread.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ def lacking() -> str:
 def introspection() -> tuple[Any, Any]:
     """The modules (UMockdev, GLib). Raises ImportError or ValueError where they are not there."""
     if DEBIAN not in sys.path:
-        sys.path.append(DEBIAN)  # PyGObject is in no wheel; behind the environment's own packages it shadows none
+        sys.path.append(
+            DEBIAN
+        )  # PyGObject is in no wheel; behind the environment's own packages it shadows none
     import gi
 
     gi.require_version("UMockdev", "1.0")
@@ -54,7 +58,9 @@ class MockedDevices:
         if missing := lacking():
             raise BackendMissing(missing)
         if "libumockdev-preload" not in os.environ.get("LD_PRELOAD", ""):
-            raise BackendMissing("umockdev is not below this process; start it with umockdev-wrapper")
+            raise BackendMissing(
+                "umockdev is not below this process; start it with umockdev-wrapper"
+            )
         umockdev, self._glib = introspection()
         self._base = umockdev.IoctlBase
         self.testbed = umockdev.Testbed.new()
@@ -92,12 +98,14 @@ class MockedDevices:
         return self._root / "dev" / name
 
     def take_away(self, name: str, on: bool) -> None:
-        """Let /dev/NAME not be there, or be there again; nobody is told. umockdev keeps a socket open for each look at it."""
+        """Let /dev/NAME not be there, or be there again; nobody is told. umockdev keeps a socket
+        open for each look at it."""
         node, away = self.node(name), self.node(f"{name}.away")
         (node if on else away).rename(away if on else node)
 
     def close_to_all(self, name: str, on: bool) -> None:
-        """Let nobody open /dev/NAME, root neither: this thread is not root where files are opened."""
+        """Let nobody open /dev/NAME, root neither: this thread is not root where files are
+        opened."""
         be_to_files = ctypes.CDLL(None).setfsuid
         be_to_files(os.geteuid())
         if (node := self.node(name)).exists():
@@ -109,7 +117,8 @@ class MockedDevices:
             be_to_files(os.geteuid() or NOBODY)
 
     def attach(self, name: str, answer: Callable[[int, Any, int], None]) -> None:
-        """Answer the ioctls of /dev/NAME: answer(number, argument, number of the open file); OSError is its errno."""
+        """Answer the ioctls of /dev/NAME: answer(number, argument, number of the open file);
+        OSError is its errno."""
 
         class Handler(self._base):  # type: ignore[misc,name-defined]
             """umockdev's way of asking."""

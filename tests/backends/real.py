@@ -1,4 +1,5 @@
-"""What backends in real time share: the machine's clock and libraries. In: a skin's ids. Out: time, and a rival."""
+"""What backends in real time share: the machine's clock and libraries. In: a skin's ids. Out: time,
+and a rival."""
 
 from __future__ import annotations
 
@@ -55,6 +56,8 @@ class Real:
             usb.util.dispose_resources(self._rival)
             self._rival = None
         if on:
-            self._rival = usb.core.find(idVendor=self.sensor.vendor_id, idProduct=self.sensor.product_id)
+            self._rival = usb.core.find(
+                idVendor=self.sensor.vendor_id, idProduct=self.sensor.product_id
+            )
             assert self._rival, "no skin to hold"
             usb.util.claim_interface(self._rival, 0)

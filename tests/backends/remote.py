@@ -1,8 +1,9 @@
-"""The virtual box as a backend: the drivers run in the guest, over its kernel; the devices outside are controlled by requests.
+"""The virtual box as a backend: the drivers run in the guest, over its kernel; the devices outside
+are controlled by requests.
 
-In: the guest's own settings, and JSON lines over a character device: one request, one reply. Outside, `serve` answers
-them with an object that has the controls of a Backend that are in CONTROLS; `able` gives what it can, as in `can`, and
-`reset` leaves the cable alone.
+In: the guest's own settings, and JSON lines over a character device: one request, one reply.
+Outside, `serve` answers them with an object that has the controls of a Backend that are in
+CONTROLS; `able` gives what it can, as in `can`, and `reset` leaves the cable alone.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ ANSWER_S = 60
 
 
 def serve(stream: IO[bytes], bench: Any) -> None:
-    """Do what comes in over `stream`, until it ends. bench: who does it; its errors are sent back as text."""
+    """Do what comes in over `stream`, until it ends. bench: who does it; its errors are sent back
+    as text."""
     for line in stream:
         asked = json.loads(line)
         try:
@@ -69,20 +71,25 @@ def _unpack(value: Any) -> Any:
 
 
 class Asker:
-    """The guest's end of the wire. Raises TimeoutError where nobody answers, AssertionError where it went wrong."""
+    """The guest's end of the wire. Raises TimeoutError where nobody answers, AssertionError where
+    it went wrong."""
 
     def __init__(self, file: int) -> None:
         self._file, self._one, self._rest = file, threading.Lock(), b""
 
     def ask(self, control: str, *given: Any) -> Any:
         """Have a control done outside; what it returned."""
-        request = json.dumps({"do": control, "with": [_pack(value) for value in given]}).encode() + b"\n"
+        request = (
+            json.dumps({"do": control, "with": [_pack(value) for value in given]}).encode() + b"\n"
+        )
         with self._one:
             while request:
                 request = request[os.write(self._file, request) :]
             while b"\n" not in self._rest:
                 if not select.select([self._file], [], [], ANSWER_S)[0]:
-                    raise TimeoutError(f"nobody outside has done {control} within {ANSWER_S} s; is `serve` running?")
+                    raise TimeoutError(
+                        f"nobody outside has done {control} within {ANSWER_S} s; is `serve` running?"
+                    )
                 self._rest += os.read(self._file, 65536)
             line, _, self._rest = self._rest.partition(b"\n")
         reply = json.loads(line)
@@ -91,7 +98,8 @@ class Asker:
 
 
 class Remote(real.Real):
-    """The guest's kernel. An emulated processor may take its time, and looks at a line long after its interrupt."""
+    """The guest's kernel. An emulated processor may take its time, and looks at a line long after
+    its interrupt."""
 
     name = "remote"
     slack_s = 20.0
@@ -172,7 +180,9 @@ def opened() -> Iterator[Remote]:
     try:
         file = os.open(PORT, os.O_RDWR)
     except OSError as e:
-        raise BackendMissing(f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig") from e
+        raise BackendMissing(
+            f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig"
+        ) from e
     with ExitStack() as stack:
         stack.callback(os.close, file)
         yield Remote(stack, Asker(file))

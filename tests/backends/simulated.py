@@ -1,4 +1,5 @@
-"""The simulator as a backend: appliance.sim below the drivers, a pseudo-terminal, and a clock that skips all waits."""
+"""The simulator as a backend: appliance.sim below the drivers, a pseudo-terminal, and a clock that
+skips all waits."""
 
 from __future__ import annotations
 
@@ -31,7 +32,12 @@ class Simulated:
         self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
-        self.put, self.pull, self.say, self.hear = self._far.put, self._far.pull, self._far.say, self._far.hear
+        self.put, self.pull, self.say, self.hear = (
+            self._far.put,
+            self._far.pull,
+            self._far.say,
+            self._far.hear,
+        )
 
     def reset(self) -> None:
         """See Backend; the same below."""

@@ -1,4 +1,5 @@
-"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and the raw counts of each frame."""
+"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and
+the raw counts of each frame."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from tests.factories.simulated_box import numbered
 _PERIOD = 97
 _LENGTH = 30 * _PERIOD  # the script is one act for ever; frame i looks as frame i + 97
 _FIFO_S = 10
-"""Real boards have 0.25 s to 1 s. So deep a FIFO loses nothing however late a busy machine reads."""
+"""Real boards have 0.25 s to 1 s. So deep a FIFO loses nothing however late a busy machine
+reads."""
 
 
 class Nowhere:
@@ -37,7 +39,9 @@ def board(what: Skin, clock: Clock) -> rig.Board:
     fmt = SweepFormat(what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes)
     act = rig.Act(numbered(_LENGTH, fmt), 10**9, 10**9 + 1, "")
     robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
-    made = rig.Board(fmt, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz))
+    made = rig.Board(
+        fmt, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz)
+    )
     made.identity = replace(made.identity, protocol=what.protocol)
     return made
 

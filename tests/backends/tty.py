@@ -1,4 +1,5 @@
-"""The serial line of backends without one: a pseudo-terminal under a name that stays. In: bytes. Out: bytes."""
+"""The serial line of backends without one: a pseudo-terminal under a name that stays. In: bytes.
+Out: bytes."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from pathlib import Path
 from appliance.tools import pseudo_terminal
 
 DELIVERY_S = 0.02
-"""The kernel passes on what one end wrote in its own time; under a virtual clock that has to be waited for."""
+"""The kernel passes on what one end wrote in its own time; under a virtual clock that has to be
+waited for."""
 
 
 class PseudoTerminalEnd:

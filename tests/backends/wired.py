@@ -1,9 +1,12 @@
-"""A real board as a backend, wired to itself: the box's inputs are driven, and its outputs seen, by spare pins.
+"""A real board as a backend, wired to itself: the box's inputs are driven, and its outputs seen, by
+spare pins.
 
-In: a Raspberry Pi with these loops, and a skin on its USB where there is one. Run on it, as root or in the groups gpio,
-dialout and plugdev, with the service stopped: `systemctl stop palpate; make test-hw`.
+In: a Raspberry Pi with these loops, and a skin on its USB where there is one. Run on it, as root or
+in the groups gpio, dialout and plugdev, with the service stopped: `systemctl stop palpate; make
+test-hw`.
 
-Ten loops of 1 kohm each (two outputs that fight cost 3 mA then, no pin), pins of the 40-pin header in brackets:
+Ten loops of 1 kohm each (two outputs that fight cost 3 mA then, no pin), pins of the 40-pin header
+in brackets:
 
     driver            the box's input             the box's output              watcher
     GPIO18 (12) --1k-- GPIO17 (11) start          GPIO23 (16) ready        --1k-- GPIO8  (24)
@@ -14,10 +17,11 @@ Ten loops of 1 kohm each (two outputs that fight cost 3 mA then, no pin), pins o
     GPIO14 (8)  TXD0 --1k-- GPIO5 (29) RXD2       GPIO16 (36) class_bits 0 --1k-- GPIO26 (37)
     GPIO15 (10) RXD0 --1k-- GPIO4 (7)  TXD2       GPIO20 (38) class_bits 1 --1k-- GPIO21 (40)
 
-Class bits 2 and 3 are not driven here: their pins (40, 37) watch. SPI must be off, it would hold pins 19 to 26. The far
-end is the header's second serial port: `dtoverlay=uart2-pi5` in /boot/firmware/config.txt makes it /dev/ttyAMA2; on a
-Raspberry Pi 4 it is `dtoverlay=uart3`, PALPATE_BOARD=rpi4 and PALPATE_FAR_END=/dev/ttyAMA3. Without it the serial part
-is skipped, without a skin the sensor's part.
+Class bits 2 and 3 are not driven here: their pins (40, 37) watch. SPI must be off, it would hold
+pins 19 to 26. The far end is the header's second serial port: `dtoverlay=uart2-pi5` in
+/boot/firmware/config.txt makes it /dev/ttyAMA2; on a Raspberry Pi 4 it is `dtoverlay=uart3`,
+PALPATE_BOARD=rpi4 and PALPATE_FAR_END=/dev/ttyAMA3. Without it the serial part is skipped, without
+a skin the sensor's part.
 """
 
 from __future__ import annotations
@@ -40,9 +44,14 @@ from tests.backends import BackendMissing, real
 
 DRIVERS = {"GPIO17": "GPIO18", "GPIO27": "GPIO9", "GPIO22": "GPIO10"}
 WATCHERS = {
-    "GPIO23": "GPIO8", "GPIO24": "GPIO7", "GPIO25": "GPIO11", "GPIO12": "GPIO6", "GPIO13": "GPIO19",
-    "GPIO16": "GPIO26", "GPIO20": "GPIO21",
-}  # fmt: skip
+    "GPIO23": "GPIO8",
+    "GPIO24": "GPIO7",
+    "GPIO25": "GPIO11",
+    "GPIO12": "GPIO6",
+    "GPIO13": "GPIO19",
+    "GPIO16": "GPIO26",
+    "GPIO20": "GPIO21",
+}
 """Line of the box: the spare line that is wired to it."""
 
 
@@ -66,7 +75,9 @@ class Wired(real.Real):
                 can |= {"skin", "hold"}
         far_end = os.environ.get("PALPATE_FAR_END", "/dev/ttyAMA2")
         if Path(far_end).exists() and Path(self.serial.port).exists():
-            self._far = stack.enter_context(serial.Serial(far_end, self.serial.baud, timeout=0, write_timeout=2))
+            self._far = stack.enter_context(
+                serial.Serial(far_end, self.serial.baud, timeout=0, write_timeout=2)
+            )
             can.add("serial")
         self.can = frozenset(can)
 
@@ -102,7 +113,8 @@ class Wired(real.Real):
 
 
 def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
-    """These spare lines, all on one chip. Raises BackendMissing where no chip has them, or somebody holds them."""
+    """These spare lines, all on one chip. Raises BackendMissing where no chip has them, or somebody
+    holds them."""
     names = tuple(names)
     for path in sorted(map(str, Path("/dev").glob("gpiochip*"))):
         try:
@@ -112,7 +124,9 @@ def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
             return gpiod.request_lines(path, {names: settings}, consumer="palpate-loops")
         except OSError as e:
             if e.errno in (errno.EACCES, errno.EBUSY):
-                raise BackendMissing(f"{path}: {e.strerror}; join group gpio, stop the service and turn SPI off") from e
+                raise BackendMissing(
+                    f"{path}: {e.strerror}; join group gpio, stop the service and turn SPI off"
+                ) from e
     raise BackendMissing(
         f"no gpio chip has {', '.join(names)}; run this on a board wired as tests/backends/wired.py draws"
     )

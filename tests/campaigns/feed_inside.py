@@ -1,7 +1,9 @@
-"""A command with the processor time of the box's feed counted: `python -m tests.campaigns.feed_inside FILE COMMAND...`. In: the
-command line of `palpate`. Out: what that gives; FILE holds the nanoseconds that the loop has spent in the feed so far.
+"""A command with the processor time of the box's feed counted: `python -m
+tests.campaigns.feed_inside FILE COMMAND...`. In: the command line of `palpate`. Out: what that
+gives; FILE holds the nanoseconds that the loop has spent in the feed so far.
 
-The whole process varies by more than the feed takes, from one turn to the next: caches and memory are shared with others.
+The whole process varies by more than the feed takes, from one turn to the next: caches and memory
+are shared with others.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ def count(path: Path, feed: type) -> None:
             try:
                 plain(*args)
             finally:
-                _COUNT.pack_into(total, 0, _COUNT.unpack_from(total)[0] + time.thread_time_ns() - begun_ns)
+                _COUNT.pack_into(
+                    total, 0, _COUNT.unpack_from(total)[0] + time.thread_time_ns() - begun_ns
+                )
 
         return call
 

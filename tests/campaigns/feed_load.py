@@ -1,10 +1,11 @@
-"""What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out docs/feed.json`. In: minutes for
-each kind of readers. Out: JSON and a table: share of a core, memory, latency and losses, with and without them; exit code 1
-if a target was missed.
+"""What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out
+docs/feed.json`. In: minutes for each kind of readers. Out: JSON and a table: share of a core,
+memory, latency and losses, with and without them; exit code 1 if a target was missed.
 
-One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had the same machine. Box
-and listener run with real-time priority where `chrt` may be used: other programs of the machine then cost no latency. What
-the loop spends in the feed is counted by itself, too (feed_inside).
+One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had
+the same machine. Box and listener run with real-time priority where `chrt` may be used: other
+programs of the machine then cost no latency. What the loop spends in the feed is counted by itself,
+too (feed_inside).
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from train.reports import marked_text
 SLOT_S, SETTLE_S = 20.0, 2.0
 WAIT_S = 0.1
 SHARE, MIB, LATE_MS = 0.01, 2.0, 1.0
-"""Targets: additional share of a core, additional memory, additional time to the sentence in the median."""
+"""Targets: additional share of a core, additional memory, additional time to the sentence in the
+median."""
 LOST, DROPPED = 7, 10
 """Fields of an STA sentence, counted from the talker."""
 PACKET = 6
@@ -60,7 +62,8 @@ class Kind:
     """When each answer came, in seconds, and the frame at which its stop edge was."""
     latency_ms: list[float] = field(default_factory=list)
     way_ms: list[float] = field(default_factory=list)
-    """From the verdict, whose time has whole milliseconds, to the robot's end: what is not the box's."""
+    """From the verdict, whose time has whole milliseconds, to the robot's end: what is not the
+    box's."""
     lost: int = 0
     dropped: int = 0
     faults: Counter[str] = field(default_factory=Counter)
@@ -107,7 +110,13 @@ def measure(
     kinds = {name: Kind() for name in names}
     with ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
-        counted = [*before, sys.executable, "-m", "tests.campaigns.feed_inside", os.fspath(_inside(path))]
+        counted = [
+            *before,
+            sys.executable,
+            "-m",
+            "tests.campaigns.feed_inside",
+            os.fspath(_inside(path)),
+        ]
         box, sweeps = ThisMachine(counted, [f"feed.socket={path}"]), Script(seed)
         stack.callback(box.close)
         box.start(seed, sweeps)
@@ -117,7 +126,9 @@ def measure(
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
             for name, kind in kinds.items():
                 _slot(name, path, box, listener, kind)
-                report(f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a core, {kind.rss_kib[-1]} KiB")
+                report(
+                    f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a core, {kind.rss_kib[-1]} KiB"
+                )
         box.stop()
     return kinds, rss_kib, dict(box.about())
 
@@ -130,7 +141,9 @@ def _inside(feed: Path) -> Path:
 def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
     """One turn of a kind: readers come, the box is watched, they go."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as readers:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+    ) as readers:
         listener.listen(SETTLE_S, Kind())
         begin_s, cpu_s, inside_ns = time.monotonic(), box.process()[2], spent_ns(_inside(path))
         listener.listen(SLOT_S, kind)
@@ -145,16 +158,20 @@ def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, ki
 
 
 def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
-    """Milliseconds of each answer after the packet in which its stop edge came, less those of the quickest answer of all.
+    """Milliseconds of each answer after the packet in which its stop edge came, less those of the
+    quickest answer of all.
 
-    Packets begin at every sixth frame. At which of six is not known outside the box: it is where answers differ least.
+    Packets begin at every sixth frame. At which of six is not known outside the box: it is where
+    answers differ least.
     """
 
     def after(begin: int) -> dict[str, Any]:
         late = {}
         for name, kind in kinds.items():
             at_s, stop = np.array(kind.answers).T
-            late[name] = at_s - (np.ceil((stop - begin) / PACKET) * PACKET + begin) / skin.FORMAT.rate_hz
+            late[name] = (
+                at_s - (np.ceil((stop - begin) / PACKET) * PACKET + begin) / skin.FORMAT.rate_hz
+            )
         quickest = min(values.min() for values in late.values())
         return {name: 1e3 * (values - quickest) for name, values in late.items()}
 
@@ -166,25 +183,35 @@ def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
 
 
 def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
-    """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader, mean of the turns with a 95 %
-    interval. inside: share of a core that the loop spends in the feed. memory_mib: resident, more than before the first
-    reader, the most of all turns."""
+    """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader, mean of the
+    turns with a 95 % interval. inside: share of a core that the loop spends in the feed.
+    memory_mib: resident, more than before the first reader, the most of all turns."""
     late, figures = lateness(kinds), {}
     for name, kind in kinds.items():
         more = np.array(kind.shares) - np.array(kinds["0"].shares)
         width = 1.96 * more.std(ddof=1) / np.sqrt(len(more)) if len(more) > 1 else float("nan")
         figures[name] = {
-            "seconds": round(kind.wall_s), "answers": len(kind.answers),
-            "share": round(kind.cpu_s / kind.wall_s, 5), "inside": round(kind.inside_s / kind.wall_s, 5),
-            "share_more": [round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)],
+            "seconds": round(kind.wall_s),
+            "answers": len(kind.answers),
+            "share": round(kind.cpu_s / kind.wall_s, 5),
+            "inside": round(kind.inside_s / kind.wall_s, 5),
+            "share_more": [
+                round(float(v), 5) for v in (more.mean(), more.mean() - width, more.mean() + width)
+            ],
             "memory_mib": round((max(kind.rss_kib) - rss_kib) / 1024, 2),
             "late_ms": {f"p{q}": round(float(np.percentile(late[name], q)), 2) for q in (50, 99)},
             "way_ms": {f"p{q}": round(float(np.percentile(kind.way_ms, q)), 1) for q in (50, 99)},
-            "slowest": [[round(float(v), 1), round(kind.way_ms[i], 1)] for i, v in slowest(late[name])],
-            "latency_ms": {f"p{q}": round(float(np.percentile(kind.latency_ms, q)), 2) for q in (50, 99)},
-            "frames_lost": kind.lost, "sentences_dropped": kind.dropped,
-            "faults": {k: n for k, n in kind.faults.items() if n}, "lines": dict(kind.seen),
-        }  # fmt: skip
+            "slowest": [
+                [round(float(v), 1), round(kind.way_ms[i], 1)] for i, v in slowest(late[name])
+            ],
+            "latency_ms": {
+                f"p{q}": round(float(np.percentile(kind.latency_ms, q)), 2) for q in (50, 99)
+            },
+            "frames_lost": kind.lost,
+            "sentences_dropped": kind.dropped,
+            "faults": {k: n for k, n in kind.faults.items() if n},
+            "lines": dict(kind.seen),
+        }
     return figures
 
 
@@ -233,7 +260,11 @@ def table(content: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, one in figures.items():
-        more = "" if name == "0" else "{:+.2f} % [{:+.2f}, {:+.2f}]".format(*(100 * v for v in one["share_more"]))
+        more = (
+            ""
+            if name == "0"
+            else "{:+.2f} % [{:+.2f}, {:+.2f}]".format(*(100 * v for v in one["share_more"]))
+        )
         late, latency = one["late_ms"], one["latency_ms"]
         rows.append(
             f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {100 * one['inside']:.2f} % | {one['memory_mib']:.2f} MiB | "
@@ -245,20 +276,32 @@ def table(content: dict[str, Any]) -> str:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=5.0, help="for each kind of readers (%(default)s)")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="some of them, beside 0")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=5.0, help="for each kind of readers (%(default)s)"
+    )
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=KINDS, help="some of them, beside 0"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/feed.json"))
-    parser.add_argument("--page", type=Path, help="also put the table there, between the markers named after --out")
-    parser.add_argument("--draw", action="store_true", help="measure nothing: the table of --out as it is")
+    parser.add_argument(
+        "--page", type=Path, help="also put the table there, between the markers named after --out"
+    )
+    parser.add_argument(
+        "--draw", action="store_true", help="measure nothing: the table of --out as it is"
+    )
     args = parser.parse_args()
     if not args.draw:
         _measured(args)
     content = json.loads(args.out.read_text())
     print(table(content))
     if args.page:
-        page = marked_text.insert(args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page))
+        page = marked_text.insert(
+            args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page)
+        )
         args.page.write_text(page, "utf-8")
     for text in (bad := missed(content["readers"])):
         print(f"FAIL {text}")
@@ -267,7 +310,9 @@ def main() -> int:
 
 def _measured(args: argparse.Namespace) -> None:
     """Measure, and write the figures to --out."""
-    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    real_time = (
+        subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    )
     kinds, rss_kib, about = measure(
         ["0", *(name for name in args.kinds if name != "0")],
         args.minutes,
@@ -277,7 +322,14 @@ def _measured(args: argparse.Namespace) -> None:
     )
     figures = result(kinds, rss_kib)
     load = round(os.getloadavg()[2], 1)
-    content = {"commit": commit(), "seed": args.seed, **about, "real_time": real_time, "load": load, "readers": figures}
+    content = {
+        "commit": commit(),
+        "seed": args.seed,
+        **about,
+        "real_time": real_time,
+        "load": load,
+        "readers": figures,
+    }
     storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
 
 

@@ -1,8 +1,8 @@
-"""Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND` until its input ends. In: the
-socket, one of KINDS. Out: one line of JSON, what they got.
+"""Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND`
+until its input ends. In: the socket, one of KINDS. Out: one line of JSON, what they got.
 
-All are in one process, which pauses between its rounds, so that it takes less than a core. It has the usual priority, also where
-the one that starts it has another.
+All are in one process, which pauses between its rounds, so that it takes less than a core. It has
+the usual priority, also where the one that starts it has another.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from tests.factories.paths import ROOT
 ALL = b'{"frames": 20, "sweeps": true}\n'
 PAUSE_S = 0.002
 STORM = 1000
-"""Connections that are open at once while the feed is attacked, most of which the box has not taken up or has refused."""
+"""Connections that are open at once while the feed is attacked, most of which the box has not taken
+up or has refused."""
 KINDS = ("0", "1", "8", "64", "attacked", "bridge")
 
 Act = Callable[[], None]
@@ -34,7 +35,8 @@ Address = str | tuple[str, int]
 
 
 def connected(address: Address) -> socket.socket | None:
-    """A connection that does not wait, None where there is no room for it now. address: of a local socket or of TCP."""
+    """A connection that does not wait, None where there is no room for it now. address: of a local
+    socket or of TCP."""
     family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
     one = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
@@ -118,7 +120,9 @@ def sluggish(path: str, seen: Counter[str]) -> Act:
     return act
 
 
-def talker(path: Address, seen: Counter[str], said: Callable[[], bytes], *, reads: bool = False) -> Act:
+def talker(
+    path: Address, seen: Counter[str], said: Callable[[], bytes], *, reads: bool = False
+) -> Act:
     """One that sends without end, and comes again when it is closed. reads: takes what it gets."""
     held: list[socket.socket] = []
 
@@ -141,8 +145,8 @@ def talker(path: Address, seen: Counter[str], said: Callable[[], bytes], *, read
 
 
 def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int = 20) -> Act:
-    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the oldest then go. half: what
-    some of them say, and no more. burst: connections of a round."""
+    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the
+    oldest then go. half: what some of them say, and no more. burst: connections of a round."""
     held: list[socket.socket] = []
 
     def act() -> None:
@@ -163,13 +167,18 @@ def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int 
 
 
 def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
-    """Those of a kind. Of 8 and 64 readers one never reads; attacked: eight good ones, and all that is bad."""
+    """Those of a kind. Of 8 and 64 readers one never reads; attacked: eight good ones, and all that
+    is bad."""
     if kind != "attacked":
         n = int(kind)
         return [reader(path, seen) for _ in range(n - (n > 1))] + [silent(path, seen)] * (n > 1)
     bad: Counter[str] = Counter()
-    floods = [talker(path, bad, lambda: b'{"frames": 20}\n{"sweeps": false}\n' * 200) for _ in range(10)]
-    garbage = [talker(path, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(10)]
+    floods = [
+        talker(path, bad, lambda: b'{"frames": 20}\n{"sweeps": false}\n' * 200) for _ in range(10)
+    ]
+    garbage = [
+        talker(path, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(10)
+    ]
     endless = [talker(path, bad, lambda: b"x" * 300) for _ in range(5)]
     good = [reader(path, seen) for _ in range(8)]
     slow = [sluggish(path, bad) for _ in range(10)] + [silent(path, bad) for _ in range(10)]
@@ -208,16 +217,29 @@ def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
 
 
 def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
-    """A Modbus bridge on the feed, whose own port is attacked: floods of requests, garbage, endless frames, a storm."""
+    """A Modbus bridge on the feed, whose own port is attacked: floods of requests, garbage, endless
+    frames, a storm."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "appliance", "bridge", "modbus", "--feed", path, "--listen", f"127.0.0.1:{port}"]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "bridge",
+        "modbus",
+        "--feed",
+        path,
+        "--listen",
+        f"127.0.0.1:{port}",
+    ]
     bridge = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
     stack.callback(bridge.kill)
     there = ("127.0.0.1", port)
     read = b"\0\1\0\0\0\6\1\3\0\0\0\x0a"  # ten holding registers from the first
     floods = [talker(there, seen, lambda: read * 50) for _ in range(5)]
-    garbage = [talker(there, seen, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(5)]
+    garbage = [
+        talker(there, seen, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(5)
+    ]
     good = asker(there, seen, read)
     return [
         good,

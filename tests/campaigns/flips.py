@@ -1,10 +1,12 @@
-"""Alters a signed bundle in every way. In: a signed bundle. Out: how many alterations a box accepted; any is a failure.
+"""Alters a signed bundle in every way. In: a signed bundle. Out: how many alterations a box
+accepted; any is a failure.
 
-`python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits of the other files,
-swaps each file with that of another signed bundle, and tries bundles that are unsigned, wrongly signed, cut or older. The
-same of a bundle into which the box has enrolled a label, all bits of its enrolment among them, or some of them.
-Each one goes the way of a delivered bundle, `Store.install`. Bits of the signature's own file are not counted: some of its
-line ends, say, may be others, and it is the same signature of the same manifest.
+`python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits
+of the other files, swaps each file with that of another signed bundle, and tries bundles that are
+unsigned, wrongly signed, cut or older. The same of a bundle into which the box has enrolled a
+label, all bits of its enrolment among them, or some of them. Each one goes the way of a delivered
+bundle, `Store.install`. Bits of the signature's own file are not counted: some of its line ends,
+say, may be others, and it is the same signature of the same manifest.
 """
 
 from __future__ import annotations
@@ -50,22 +52,34 @@ def flipped(files: Files, name: str, bit: int) -> Files:
 def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Case]:
     """One file with each of its bits flipped (None), or `count` of them drawn."""
     bits = range(8 * len(files[name]))
-    chosen = bits if count is None else sorted(random.Random(f"{seed} {name}").sample(bits, min(count, len(bits))))
-    return ((FLIPPED.replace(bundle.MANIFEST, name), f"bit {bit}", flipped(files, name, bit)) for bit in chosen)
+    chosen = (
+        bits
+        if count is None
+        else sorted(random.Random(f"{seed} {name}").sample(bits, min(count, len(bits))))
+    )
+    return (
+        (FLIPPED.replace(bundle.MANIFEST, name), f"bit {bit}", flipped(files, name, bit))
+        for bit in chosen
+    )
 
 
 def swaps(one: Files, other: Files) -> Iterator[Case]:
-    """Each file, and each two of them, in place of another signed bundle's; the manifest with its signature is that one."""
+    """Each file, and each two of them, in place of another signed bundle's; the manifest with its
+    signature is that one."""
     names = sorted(one)
     for i, name in enumerate(names):
         yield "a file swapped", name, one | {name: other[name]}
         for second in names[i + 1 :]:
-            yield "two files swapped", f"{name}, {second}", one | {n: other[n] for n in (name, second)}
+            yield (
+                "two files swapped",
+                f"{name}, {second}",
+                one | {n: other[n] for n in (name, second)},
+            )
 
 
 def another(key: Path) -> Files:
-    """A bundle of which no file is the default's: its golden sweeps and means are packed otherwise, its weights are a bit
-    off."""
+    """A bundle of which no file is the default's: its golden sweeps and means are packed otherwise,
+    its weights are a bit off."""
     held = deliveries.files(4, None)
     model = bytearray(held[bundle.MODEL])
     model[len(model) // 2] ^= 1
@@ -81,20 +95,39 @@ def another(key: Path) -> Files:
 def enrolled(box: Delivery, bits: int | None, seed: int) -> Iterator[Case]:
     """All alterations of a bundle into which the box has enrolled a label."""
     one, other = (
-        deliveries.enrolled(made, box.enrolment_key) for made in (deliveries.files(3, box.key), another(box.key))
+        deliveries.enrolled(made, box.enrolment_key)
+        for made in (deliveries.files(3, box.key), another(box.key))
     )
     parts = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
-    yield "not signed", "", {name: data for name, data in one.items() if name != bundle.ENROLMENT_SIGNATURE}
-    yield "a base not signed", "", {name: data for name, data in one.items() if name != bundle.SIGNATURE}
+    yield (
+        "not signed",
+        "",
+        {name: data for name, data in one.items() if name != bundle.ENROLMENT_SIGNATURE},
+    )
+    yield (
+        "a base not signed",
+        "",
+        {name: data for name, data in one.items() if name != bundle.SIGNATURE},
+    )
     foreign = install_scripts.enrolment_key(box.folder / "foreign")
     for who, signed in (
-        ("another box", foreign.sign(one[bundle.ENROLMENT])), ("a signer", signature.sign(one[bundle.ENROLMENT], box.key)),
-        ("the box, for bundles", signature.sign(one[bundle.ENROLMENT], box.enrolment_key.folder / KEY)),
-    ):  # fmt: skip
+        ("another box", foreign.sign(one[bundle.ENROLMENT])),
+        ("a signer", signature.sign(one[bundle.ENROLMENT], box.key)),
+        (
+            "the box, for bundles",
+            signature.sign(one[bundle.ENROLMENT], box.enrolment_key.folder / KEY),
+        ),
+    ):
         yield "wrongly signed", who, one | {bundle.ENROLMENT_SIGNATURE: signed}
     for version in (1, 0):
-        yield "older", str(version), deliveries.enrolled(deliveries.files(version, box.key), box.enrolment_key)
-    by_box = deliveries.signed(deliveries.files(3, None, name="by the box"), box.enrolment_key.folder / KEY)
+        yield (
+            "older",
+            str(version),
+            deliveries.enrolled(deliveries.files(version, box.key), box.enrolment_key),
+        )
+    by_box = deliveries.signed(
+        deliveries.files(3, None, name="by the box"), box.enrolment_key.folder / KEY
+    )
     yield "a base signed by the box", "", deliveries.enrolled(by_box, box.enrolment_key)
     yield "labels of another bundle", "", one | {name: other[name] for name in parts}
     for name in sorted(one.keys() - set(parts)):
@@ -113,7 +146,11 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
     unknown = deliveries.key(box.folder / "unknown")
     yield "signed by an unknown key", "", files | {bundle.SIGNATURE: signature.sign(text, unknown)}
     for space in ("file", "git", "palpate", "palpate-bundle2", " "):
-        yield "signed for another use", space, files | {bundle.SIGNATURE: signature.sign(text, box.key, space)}
+        yield (
+            "signed for another use",
+            space,
+            files | {bundle.SIGNATURE: signature.sign(text, box.key, space)},
+        )
     for name, data in sorted(files.items()):
         yield "a file missing", name, {n: d for n, d in files.items() if n != name}
         for kept in (0, 1, len(data) // 2, len(data) - 1)[: 4 - (name == bundle.SIGNATURE)]:
@@ -127,7 +164,8 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
 
 
 def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
-    """All alterations of a bundle that the box would take. manifest_bits: of all bits of its manifest so many are drawn."""
+    """All alterations of a bundle that the box would take. manifest_bits: of all bits of its
+    manifest so many are drawn."""
     good, other = deliveries.files(3, box.key), another(box.key)
     assert not any(good[name] == other[name] for name in good)
     yield from others(good, box)
@@ -135,7 +173,10 @@ def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]
     yield from flips(good, bundle.MANIFEST, manifest_bits, seed)
     for name in sorted(good.keys() - {bundle.MANIFEST, bundle.SIGNATURE}):
         yield from flips(good, name, FLIPS if manifest_bits is None else 10, seed)
-    yield from ((f"{ENROLLED}{kind}", which, files) for kind, which, files in enrolled(box, manifest_bits, seed))
+    yield from (
+        (f"{ENROLLED}{kind}", which, files)
+        for kind, which, files in enrolled(box, manifest_bits, seed)
+    )
 
 
 def tried(box: Delivery, case: Case) -> str:
@@ -153,14 +194,19 @@ def tried(box: Delivery, case: Case) -> str:
 def believed(box: Delivery, files: Files) -> bool:
     """Whether the signature by itself fits the manifest."""
     try:
-        return bool(signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], Path(box.how.signers)))
+        return bool(
+            signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], Path(box.how.signers))
+        )
     except BundleError:
         return False
 
 
-def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0) -> dict[str, dict[str, int]]:
-    """By kind of alteration: how many were tried, how many accepted, how many refusals changed what runs; and how many
-    flipped manifests the signature alone let pass, which the box asks after it has read them.
+def campaign(
+    folder: Path, manifest_bits: int | None, seed: int, every: int = 0
+) -> dict[str, dict[str, int]]:
+    """By kind of alteration: how many were tried, how many accepted, how many refusals changed what
+    runs; and how many flipped manifests the signature alone let pass, which the box asks after it
+    has read them.
 
     every: after so many alterations a line on standard output, 0 for none.
     """
@@ -174,13 +220,19 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
         count["tried"] += 1
         count["accepted"] += not message
         count["believed"] += (
-            case[0] == FLIPPED and "does not fit the manifest" not in message and believed(box, case[2])
+            case[0] == FLIPPED
+            and "does not fit the manifest" not in message
+            and believed(box, case[2])
         )
         count["changed"] += box.store.current != current
         if every and n % every == 0:
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
-    for n, good in enumerate((deliveries.files(3, box.key), another(box.key))):  # else all of this would prove nothing
-        box.store.install(deliveries.put(folder / f"good{n}", deliveries.enrolled(good, box.enrolment_key)))
+    for n, good in enumerate(
+        (deliveries.files(3, box.key), another(box.key))
+    ):  # else all of this would prove nothing
+        box.store.install(
+            deliveries.put(folder / f"good{n}", deliveries.enrolled(good, box.enrolment_key))
+        )
         box.store.install(deliveries.put(folder / f"plain{n}", good))
     return {kind: dict(count) for kind, count in counts.items()}
 
@@ -188,18 +240,28 @@ def campaign(folder: Path, manifest_bits: int | None, seed: int, every: int = 0)
 def main() -> int:
     """Run the campaign and write its figures; 1 where anything was accepted."""
     parser = argparse.ArgumentParser(
-        prog="python -m tests.campaigns.flips", description="Counts the altered bundles that a box accepts."
+        prog="python -m tests.campaigns.flips",
+        description="Counts the altered bundles that a box accepts.",
     )
     parser.add_argument("--out", type=Path, default=Path("build/flips.json"))
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--bits", type=int, help="flip this many random bits of the manifest (all of them)")
+    parser.add_argument(
+        "--bits", type=int, help="flip this many random bits of the manifest (all of them)"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = campaign(Path(folder), args.bits, args.seed, every=1000)
     total = {
-        name: sum(count[name] for count in found.values()) for name in ("tried", "accepted", "believed", "changed")
+        name: sum(count[name] for count in found.values())
+        for name in ("tried", "accepted", "believed", "changed")
     }
-    result = {"total": total, "kinds": found, "seed": args.seed, "commit": commit(), "machine": platform.machine()}
+    result = {
+        "total": total,
+        "kinds": found,
+        "seed": args.seed,
+        "commit": commit(),
+        "machine": platform.machine(),
+    }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     put(args.out, (json.dumps(result, indent=1) + "\n").encode())
     print("\n".join(f"{kind}: {count}" for kind, count in [*found.items(), ("total", total)]))

@@ -1,10 +1,12 @@
-"""All that can be attached, at once and for long: `python -m tests.campaigns.full_load --minutes 60 --page docs/faults.md`. In:
-minutes, and how often each fault is made after them. Out: docs/full-load.json, tables; exit code 1 if a target was missed.
+"""All that can be attached, at once and for long: `python -m tests.campaigns.full_load --minutes 60
+--page docs/faults.md`. In: minutes, and how often each fault is made after them. Out:
+docs/full-load.json, tables; exit code 1 if a target was missed.
 
-Of each skin there are two boxes side by side (`palpate run`, emulator and box processes of their own in real time): one with
-recording, black box, shadow, feed with eight readers, page and both bridges, and one with nothing. Frames, stop edges and
-sentences are counted in the box apart from its own counters (full_load_inside). Its sweeps lie on a small file system of their
-own, which is mounted from a file: that needs root.
+Of each skin there are two boxes side by side (`palpate run`, emulator and box processes of their
+own in real time): one with recording, black box, shadow, feed with eight readers, page and both
+bridges, and one with nothing. Frames, stop edges and sentences are counted in the box apart from
+its own counters (full_load_inside). Its sweeps lie on a small file system of their own, which is
+mounted from a file: that needs root.
 """
 
 from __future__ import annotations
@@ -49,16 +51,19 @@ SKINS = ("flexitac", "papillarray")
 SETTLE_S, LOOK_S, WAIT_S = 20.0, 5.0, 0.1
 """Until the boxes are measured, between two looks at the processes, and longest wait for a line."""
 AWAY_S, FULL_S, DEAF_S, REST_S = 2.0, 15.0, 25.0, 10.0
-"""How long the processor is away, the disk full and the port blocked, and time after each for the box to come back."""
+"""How long the processor is away, the disk full and the port blocked, and time after each for the
+box to come back."""
 KEPT = 100
 """Sweeps in the black box."""
 DISK_MB = 512
 CHECKS = 5
 """A check listens for a second, in which a few percent vary."""
 MEMORY = Path("/dev/shm")
-"""Where logs and counts lie: one that waits for a disk that others keep busy would hold up the bare box, too."""
+"""Where logs and counts lie: one that waits for a disk that others keep busy would hold up the bare
+box, too."""
 STATE_S = 0.05
-"""Time between two STA: the line's buffers are then full soon after the robot has stopped reading."""
+"""Time between two STA: the line's buffers are then full soon after the robot has stopped
+reading."""
 
 
 class SkinBox(SharedLine):
@@ -74,9 +79,10 @@ class SkinBox(SharedLine):
 
 @dataclass
 class LoadedSide:
-    """One box and its robot. reading: share of a core that `palpate check` says reading its skin takes. folder: its disk.
-    heard: lines; results: of each sweep; kept: by outcome of REC. looks: (time, processor seconds, KiB resident).
-    timed: when each answer came, milliseconds in the box. deaf: while it is set, nobody reads."""
+    """One box and its robot. reading: share of a core that `palpate check` says reading its skin
+    takes. folder: its disk. heard: lines; results: of each sweep; kept: by outcome of REC. looks:
+    (time, processor seconds, KiB resident). timed: when each answer came, milliseconds in the box.
+    deaf: while it is set, nobody reads."""
 
     skin: str
     format: str
@@ -121,13 +127,25 @@ class LoadedSide:
         """All figures, once box and emulator have ended."""
         agreed = shadow.read(self.folder / "shadow")
         return {
-            "skin": self.skin, "full": self.full, "format": self.format, "reading": round(self.reading, 4),
-            **figures([*map(json.loads, self.counts.read_text().splitlines())], phases, self.timed, self.looks),
-            "heard": self.heard, "results": len(self.results), "twice": self.results.total() - len(self.results),
-            "kept": dict(self.kept), "recorded": len(list(self.folder.glob("sweeps/*.npy"))),
-            "black_box": len(list(self.folder.glob("black-box/*.npy"))), "compared": agreed.compared if agreed else 0,
+            "skin": self.skin,
+            "full": self.full,
+            "format": self.format,
+            "reading": round(self.reading, 4),
+            **figures(
+                [*map(json.loads, self.counts.read_text().splitlines())],
+                phases,
+                self.timed,
+                self.looks,
+            ),
+            "heard": self.heard,
+            "results": len(self.results),
+            "twice": self.results.total() - len(self.results),
+            "kept": dict(self.kept),
+            "recorded": len(list(self.folder.glob("sweeps/*.npy"))),
+            "black_box": len(list(self.folder.glob("black-box/*.npy"))),
+            "compared": agreed.compared if agreed else 0,
             **json.loads(self.player.communicate()[0]),
-        }  # fmt: skip
+        }
 
 
 @contextmanager
@@ -138,9 +156,13 @@ def disk(folder: Path) -> Iterator[Path]:
     with image.open("wb") as file:
         file.truncate(DISK_MB << 20)
     subprocess.run(["mkfs.ext4", "-q", "-m", "0", image], check=True)
-    done = subprocess.run(["mount", "-o", "loop", image, folder], check=False, capture_output=True, text=True)
+    done = subprocess.run(
+        ["mount", "-o", "loop", image, folder], check=False, capture_output=True, text=True
+    )
     if done.returncode:
-        raise SystemExit(f"a file system of {DISK_MB} MB cannot be mounted: {done.stderr.strip()}; run as root")
+        raise SystemExit(
+            f"a file system of {DISK_MB} MB cannot be mounted: {done.stderr.strip()}; run as root"
+        )
     try:
         yield folder
     finally:
@@ -161,46 +183,78 @@ def fill(path: Path) -> None:
 
 
 class FullLoad:
-    """All sides at work, with one thread each that hears them. seen: by skin, what the peers of its full box got."""
+    """All sides at work, with one thread each that hears them. seen: by skin, what the peers of its
+    full box got."""
 
-    def __init__(self, stack: ExitStack, disks: Path, bundles: Mapping[str, Path], before: Sequence[str]) -> None:
+    def __init__(
+        self, stack: ExitStack, disks: Path, bundles: Mapping[str, Path], before: Sequence[str]
+    ) -> None:
         self._attached = ExitStack()
         self._ended = threading.Event()
         self._before, self._disks = before, disks
         self._folder = Path(stack.enter_context(TemporaryDirectory()))
         self.seen: dict[str, Any] = {}
-        self.sides = [self._side(stack, skin, path, full) for skin, path in bundles.items() for full in (False, True)]
+        self.sides = [
+            self._side(stack, skin, path, full)
+            for skin, path in bundles.items()
+            for full in (False, True)
+        ]
         threads = stack.enter_context(ThreadPoolExecutor(len(self.sides)))
         stack.callback(self._ended.set)
         stack.enter_context(self._attached)
-        self._heard: list[Future[None]] = [threads.submit(side.listen, self._ended) for side in self.sides]
+        self._heard: list[Future[None]] = [
+            threads.submit(side.listen, self._ended) for side in self.sides
+        ]
         self.pass_time(LOOK_S)  # the feeds come
         self._peers = {side.skin: self._attach(side) for side in self.sides if side.full}
 
     def _side(self, stack: ExitStack, skin: str, path: Path, full: bool) -> LoadedSide:
         """One box, started."""
         name = f"{skin}-{'full' if full else 'bare'}"
-        fmt, counts, link = bundle.load(path).format, self._folder / f"{name}.jsonl", self._folder / f"{name}.tty"
+        fmt, counts, link = (
+            bundle.load(path).format,
+            self._folder / f"{name}.jsonl",
+            self._folder / f"{name}.tty",
+        )
         folder = stack.enter_context(disk(self._disks / name)) if full else self._folder / name
         player = stack.enter_context(load.playing(skin, fmt.rate_hz, link))
         stack.callback(player.kill)
         reading = self._reading(load.sets(skin, fmt, link))
         chosen = [
-            *load.sets(skin, fmt, link), f"classifier.bundle={path}", "classifier.allow_unsigned=true",
-            f"serial.state_s={STATE_S}", f"store.folder={folder}", f"store.black_box={KEPT * full}",
+            *load.sets(skin, fmt, link),
+            f"classifier.bundle={path}",
+            "classifier.allow_unsigned=true",
+            f"serial.state_s={STATE_S}",
+            f"store.folder={folder}",
+            f"store.black_box={KEPT * full}",
             f"feed.socket={self._feed(skin) if full else ''}",
-        ]  # fmt: skip
-        inside = (sys.executable, "-m", "tests.campaigns.full_load_inside", counts, folder / "sweeps" if full else "")
+        ]
+        inside = (
+            sys.executable,
+            "-m",
+            "tests.campaigns.full_load_inside",
+            counts,
+            folder / "sweeps" if full else "",
+        )
         box = SkinBox([*self._before, *map(str, inside)], chosen)
         stack.callback(box.close)
         box.launch(*(["--shadow", str(path)] if full else []))
         return LoadedSide(skin, str(fmt), full, box, player, reading, counts, folder)
 
     def _reading(self, chosen: Sequence[str]) -> float:
-        """The share of a core that `palpate check` says reading a skin takes, the median of CHECKS."""
-        command = [*self._before, sys.executable, "-m", "appliance", "check", *(f"--set={text}" for text in chosen)]
+        """The share of a core that `palpate check` says reading a skin takes, the median of
+        CHECKS."""
+        command = [
+            *self._before,
+            sys.executable,
+            "-m",
+            "appliance",
+            "check",
+            *(f"--set={text}" for text in chosen),
+        ]
         texts = [
-            subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT).stdout for _ in range(CHECKS)
+            subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT).stdout
+            for _ in range(CHECKS)
         ]
         return median(float(re.findall(r"([\d.]+) % of a core", text)[0]) / 100 for text in texts)
 
@@ -211,16 +265,26 @@ class FullLoad:
         """Bridges, page and peers come."""
         enter, feed = self._attached.enter_context, self._feed(side.skin)
         ports = (
-            enter(bridge("tcp", "--port", side.box.line))[1], enter(bridge("modbus", "--feed", feed))[1],
+            enter(bridge("tcp", "--port", side.box.line))[1],
+            enter(bridge("modbus", "--feed", feed))[1],
             enter(page_of(feed)),
-        )  # fmt: skip
-        command = [sys.executable, "-m", "tests.campaigns.full_load_peers", str(feed), *map(str, ports)]
-        peers = enter(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT))
+        )
+        command = [
+            sys.executable,
+            "-m",
+            "tests.campaigns.full_load_peers",
+            str(feed),
+            *map(str, ports),
+        ]
+        peers = enter(
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT)
+        )
         self._attached.callback(peers.kill)
         return peers
 
     def pass_time(self, seconds: float) -> tuple[float, float]:
-        """Let the boxes work; from when until when that was. Raises what a thread that hears them raised."""
+        """Let the boxes work; from when until when that was. Raises what a thread that hears them
+        raised."""
         begin_s = time.monotonic()
         while (left_s := begin_s + seconds - time.monotonic()) > 0:
             for side in self.sides:
@@ -293,25 +357,41 @@ def measure(
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="without faults (%(default)g)")
-    parser.add_argument("--rounds", type=int, default=10, help="how often each fault is made then (%(default)s)")
     parser.add_argument(
-        "--bundles", type=Path, default=ROOT / "build" / "skins", help="as `make skins PART=way` leaves it"
+        "--rounds", type=int, default=10, help="how often each fault is made then (%(default)s)"
     )
     parser.add_argument(
-        "--disks", type=Path, default=ROOT / "build" / "disks", help="where the boxes' disks lie as files"
+        "--bundles",
+        type=Path,
+        default=ROOT / "build" / "skins",
+        help="as `make skins PART=way` leaves it",
+    )
+    parser.add_argument(
+        "--disks",
+        type=Path,
+        default=ROOT / "build" / "disks",
+        help="where the boxes' disks lie as files",
     )
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "full-load.json")
-    parser.add_argument("--page", type=Path, help="also put the tables there, between the markers named after --out")
-    parser.add_argument("--draw", action="store_true", help="measure nothing: the tables of --out as it is")
+    parser.add_argument(
+        "--page", type=Path, help="also put the tables there, between the markers named after --out"
+    )
+    parser.add_argument(
+        "--draw", action="store_true", help="measure nothing: the tables of --out as it is"
+    )
     args = parser.parse_args()
     if not args.draw:
         _measured(args, parser)
     content = json.loads(args.out.read_text())
     print(table(content))
     if args.page:
-        text = marked_text.insert(args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page))
+        text = marked_text.insert(
+            args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page)
+        )
         args.page.write_text(text, "utf-8")
     for line in (bad := missed(content)):
         print(f"FAIL {line}")
@@ -326,7 +406,9 @@ def _measured(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None
             parser.error(f"{path} is no bundle; make skins PART=way SKINS={skin} makes it")
     if MEMORY.is_dir():
         tempfile.tempdir = str(MEMORY)
-    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    real_time = (
+        subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    )
     ran, begin = commit(), round(os.getloadavg()[2], 1)
     found = measure(bundles, args.minutes, args.rounds, REAL_TIME if real_time else (), args.disks)
     about = {

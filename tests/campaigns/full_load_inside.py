@@ -1,8 +1,9 @@
-"""A box that is counted apart from its own counters: `python -m tests.campaigns.full_load_inside FILE FOLDER COMMAND...`. In: the
-command line of `palpate`; a folder for recordings, "" for none. Out: what that gives; FILE, whose lines of JSON tell what
-came in and went out.
+"""A box that is counted apart from its own counters: `python -m tests.campaigns.full_load_inside
+FILE FOLDER COMMAND...`. In: the command line of `palpate`; a folder for recordings, "" for none.
+Out: what that gives; FILE, whose lines of JSON tell what came in and went out.
 
-The recording is that of `palpate record`; here a box records and classifies at once, which is more than any command asks of it.
+The recording is that of `palpate record`; here a box records and classifies at once, which is more
+than any command asks of it.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ EVERY_NS = 500_000_000
 
 
 class InsideCount(FrameCheck):
-    """Writes to `file`: a line of counts twice a second, and one for each answer. It is the first observer, so that an answer's
-    time is not that of the recordings after it."""
+    """Writes to `file`: a line of counts twice a second, and one for each answer. It is the first
+    observer, so that an answer's time is not that of the recordings after it."""
 
     def __init__(self, file: Path) -> None:
         super().__init__(SystemClock())
@@ -65,7 +66,9 @@ class InsideCount(FrameCheck):
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """As Observer."""
         super().sweep(sweep, verdict, circumstances)
-        self._write(sweep=sweep.id, status=self.statuses.pop(), answer_ms=round(self.answer_ms.pop(), 3))
+        self._write(
+            sweep=sweep.id, status=self.statuses.pop(), answer_ms=round(self.answer_ms.pop(), 3)
+        )
 
     def turn(self, health: Health) -> None:
         """As Observer."""
@@ -81,10 +84,15 @@ class InsideCount(FrameCheck):
         """All counts as they are now. turn_ms: the longest turn since the line before."""
         health = self._health
         self._write(
-            **self._counts, came=self.came, missing=self.missing, turn_ms=round(self._turn_ns / 1e6, 1),
-            counted=health.lost_frames if health else 0, dropped=health.dropped if health else 0,
-            found=health.enumerations if health else 0, loss_known=health.loss_known if health else True,
-        )  # fmt: skip
+            **self._counts,
+            came=self.came,
+            missing=self.missing,
+            turn_ms=round(self._turn_ns / 1e6, 1),
+            counted=health.lost_frames if health else 0,
+            dropped=health.dropped if health else 0,
+            found=health.enumerations if health else 0,
+            loss_known=health.loss_known if health else True,
+        )
         self._turn_ns = 0
 
     def _write(self, **line: Any) -> None:
@@ -96,18 +104,34 @@ def attach(file: Path, folder: str) -> None:
     plain = assembly.box
 
     def box(
-        settings: Config, bundle: Bundle, devices: Devices, port: SerialSink, stack: ExitStack, *,
-        observers: Sequence[Any] = (), **more: Any,
-    ) -> Box:  # fmt: skip
+        settings: Config,
+        bundle: Bundle,
+        devices: Devices,
+        port: SerialSink,
+        stack: ExitStack,
+        *,
+        observers: Sequence[Any] = (),
+        **more: Any,
+    ) -> Box:
         count = InsideCount(file)
         count.listen(port)
         stack.callback(count.write_counts)  # after what is open was answered
         recordings = []
         if folder:
             labels = Labels("wood", "p1", "load")
-            recordings.append(RecordingSession(Path(folder), bundle.format, labels, devices.clock, port.say))
+            recordings.append(
+                RecordingSession(Path(folder), bundle.format, labels, devices.clock, port.say)
+            )
             stack.callback(recordings[0].close)
-        return plain(settings, bundle, devices, port, stack, observers=[count, *observers, *recordings], **more)
+        return plain(
+            settings,
+            bundle,
+            devices,
+            port,
+            stack,
+            observers=[count, *observers, *recordings],
+            **more,
+        )
 
     assembly.box = box  # type: ignore[assignment]
 

@@ -1,5 +1,5 @@
-"""What came of a box under full load. In: the lines of its counts, phases, what its robot heard. Out: figures, targets that were
-missed in words, tables in Markdown."""
+"""What came of a box under full load. In: the lines of its counts, phases, what its robot heard.
+Out: figures, targets that were missed in words, tables in Markdown."""
 
 from __future__ import annotations
 
@@ -20,16 +20,24 @@ Phase = tuple[str, float, float]
 
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Median, 99th percentile and the largest."""
-    return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99, 100)} if len(values) else {}
+    return (
+        {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99, 100)}
+        if len(values)
+        else {}
+    )
 
 
 def figures(
-    lines: Sequence[Json], phases: Sequence[Phase], timed: Sequence[tuple[float, float]],
+    lines: Sequence[Json],
+    phases: Sequence[Phase],
+    timed: Sequence[tuple[float, float]],
     looks: Sequence[tuple[float, float, int]],
-) -> Json:  # fmt: skip
-    """Of one box: counts of the whole run; of the calm phase share, memory and times; of each kind of fault its counts.
+) -> Json:
+    """Of one box: counts of the whole run; of the calm phase share, memory and times; of each kind
+    of fault its counts.
 
-    timed: (when a sentence came, milliseconds in the box). looks: (when, processor seconds, KiB resident).
+    timed: (when a sentence came, milliseconds in the box). looks: (when, processor seconds, KiB
+    resident).
     """
     counts = [line for line in lines if "came" in line]
     answers = [line for line in lines if "sweep" in line]
@@ -40,25 +48,37 @@ def figures(
     (first_s, first_cpu_s, first_kib), (last_s, last_cpu_s, last_kib) = looked[0], looked[-1]
     return {
         **{name: counts[-1][name] for name in (*COUNTS, "found", "loss_known")},
-        "answers": len(answers), "seconds": round(end_s - begin_s, 1),
+        "answers": len(answers),
+        "seconds": round(end_s - begin_s, 1),
         "calm": {
-            **_between(counts, begin_s, end_s), "n": len(calm), "edge_ms": spread([line["answer_ms"] for line in calm]),
-            "in_box_ms": spread([ms for at_s, ms in timed if begin_s <= at_s < end_s]), "turn_ms": spread(turns),
+            **_between(counts, begin_s, end_s),
+            "n": len(calm),
+            "edge_ms": spread([line["answer_ms"] for line in calm]),
+            "in_box_ms": spread([ms for at_s, ms in timed if begin_s <= at_s < end_s]),
+            "turn_ms": spread(turns),
             "share": round((last_cpu_s - first_cpu_s) / (last_s - first_s), 4),
-            "first_mib": round(first_kib / 1024, 1), "last_mib": round(last_kib / 1024, 1),
+            "first_mib": round(first_kib / 1024, 1),
+            "last_mib": round(last_kib / 1024, 1),
             "most_mib": round(max(kib for *_, kib in looked) / 1024, 1),
         },
-        "faults": {name: _fault(counts, answers, name, phases) for name in dict.fromkeys(n for n, *_ in phases[1:])},
-    }  # fmt: skip
+        "faults": {
+            name: _fault(counts, answers, name, phases)
+            for name in dict.fromkeys(n for n, *_ in phases[1:])
+        },
+    }
 
 
 def _between(counts: Sequence[Json], begin_s: float, end_s: float) -> Json:
     """How much the counts grew in this time."""
-    before, after = ([line for line in counts if line["at_s"] <= at_s][-1] for at_s in (begin_s, end_s))
+    before, after = (
+        [line for line in counts if line["at_s"] <= at_s][-1] for at_s in (begin_s, end_s)
+    )
     return {name: after[name] - before[name] for name in COUNTS}
 
 
-def _fault(counts: Sequence[Json], answers: Sequence[Json], name: str, phases: Sequence[Phase]) -> Json:
+def _fault(
+    counts: Sequence[Json], answers: Sequence[Json], name: str, phases: Sequence[Phase]
+) -> Json:
     """What the box did about all faults of a kind."""
     total: Counter[str] = Counter()
     statuses: Counter[str] = Counter()
@@ -93,7 +113,9 @@ def missed(content: Json) -> list[str]:
 def _pairs(boxes: Sequence[Json]) -> Iterator[tuple[Json, Json]]:
     """The bare and the full box of each skin."""
     for skin in dict.fromkeys(box["skin"] for box in boxes):
-        bare, full = sorted((box for box in boxes if box["skin"] == skin), key=lambda box: bool(box["full"]))
+        bare, full = sorted(
+            (box for box in boxes if box["skin"] == skin), key=lambda box: bool(box["full"])
+        )
         yield bare, full
 
 
@@ -112,18 +134,23 @@ def _of_box(box: Json) -> Iterator[str]:
     if box["calm"]["dropped"]:
         yield f"{box['calm']['dropped']} sentences dropped in the time without faults"
     if box["full"]:
-        yield from (f"nothing in {kind}" for kind in ("recorded", "black_box", "compared") if not box[kind])
+        yield from (
+            f"nothing in {kind}" for kind in ("recorded", "black_box", "compared") if not box[kind]
+        )
         if "disk full" in box["faults"] and not box["kept"].get("full"):
             yield "the disk was never full for a recording"
 
 
 def told(box: Json) -> bool:
-    """Whether the box says of all missing frames that they are. A skin without a count, of which the box says that losses cannot
-    be seen, leaves only the time that they take: it may err by a frame in each stop of the processor, and by any number upwards,
-    where a machine that passes bytes on late makes good frames look lost."""
+    """Whether the box says of all missing frames that they are. A skin without a count, of which
+    the box says that losses cannot be seen, leaves only the time that they take: it may err by a
+    frame in each stop of the processor, and by any number upwards, where a machine that passes
+    bytes on late makes good frames look lost."""
     if box["loss_known"]:
         return bool(box["missing"] == box["counted"])
-    return bool(box["missing"] <= box["counted"] + box["faults"].get("processor away", {}).get("times", 0))
+    return bool(
+        box["missing"] <= box["counted"] + box["faults"].get("processor away", {}).get("times", 0)
+    )
 
 
 def table(content: Json) -> str:
@@ -141,7 +168,8 @@ def table(content: Json) -> str:
     for box in boxes:
         calm = box["calm"]
         edge, within = (
-            "{p50:.1f} / {p99:.1f} / {p100:.1f} ms".format(**calm[f"{kind}_ms"]) for kind in ("edge", "in_box")
+            "{p50:.1f} / {p99:.1f} / {p100:.1f} ms".format(**calm[f"{kind}_ms"])
+            for kind in ("edge", "in_box")
         )
         rows.append(
             f"| {box['skin']}, {box['format']} | {shown[box['full']]} | {calm['came']:,} | {calm['missing']:,}, {calm['counted']:,} | "
@@ -149,10 +177,12 @@ def table(content: Json) -> str:
             f"{calm['first_mib']}, {calm['most_mib']} MiB |"
         )
     rows += [
-        "", "Then faults, each with the 10 s after it:", "",
+        "",
+        "Then faults, each with the 10 s after it:",
+        "",
         "| fault | skin | box | times | frames missing, counted | stop edges, answers | sentences dropped | answers |",
         "|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for name in boxes[0]["faults"]:
         for box in boxes:
             one = box["faults"][name]
@@ -167,7 +197,9 @@ def table(content: Json) -> str:
 def _wholes(content: Json) -> Iterator[str]:
     """What holds of the whole run, in sentences."""
     boxes = content["boxes"]
-    said, heard, dropped = (sum(box[name] for box in boxes) for name in ("said", "heard", "dropped"))
+    said, heard, dropped = (
+        sum(box[name] for box in boxes) for name in ("said", "heard", "dropped")
+    )
     yield f"In the whole run {said:,} sentences were sent, {heard:,} came and {dropped:,} were counted as dropped.\n"
     for box in boxes:
         if box["full"]:

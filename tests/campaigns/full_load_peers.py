@@ -1,7 +1,9 @@
-"""All peers of one box: `python -m tests.campaigns.full_load_peers FEED TCP MODBUS PAGE` until its input ends. In: the feed's
-socket, the ports of the bridges and of the page. Out: one line of JSON, what each got.
+"""All peers of one box: `python -m tests.campaigns.full_load_peers FEED TCP MODBUS PAGE` until its
+input ends. In: the feed's socket, the ports of the bridges and of the page. Out: one line of JSON,
+what each got.
 
-Eight readers of the feed, of which one never reads; a robot at each bridge that asks some times a second; a browser at the page.
+Eight readers of the feed, of which one never reads; a robot at each bridge that asks some times a
+second; a browser at the page.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ def main(feed: str, tcp: int, modbus: int, page: int) -> None:
     quick = acts(READERS, feed, read)
     events: list[int] = []
     ended = threading.Event()
-    threading.Thread(target=browse, args=(PageAddress(f"http://127.0.0.1:{page}"), ended, events), daemon=True).start()
+    threading.Thread(
+        target=browse, args=(PageAddress(f"http://127.0.0.1:{page}"), ended, events), daemon=True
+    ).start()
     rounds = 0
     while not select.select([sys.stdin], [], [], 0)[0]:
         for act in quick + slow * (rounds % ROUNDS == 0):

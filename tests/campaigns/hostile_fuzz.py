@@ -1,9 +1,11 @@
-"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime and a run; and of fuzzed
-enrolments, beside the default bundle, through their check and the classifier.
+"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime
+and a run; and of fuzzed enrolments, beside the default bundle, through their check and the
+classifier.
 
-`python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a stopped one goes
-on where it was). Each model is opened in a child that may take 256 MB more than it had and ten seconds; what matters is
-how many hung it, killed it, or went beyond that memory. Seed and number identify a model.
+`python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a
+stopped one goes on where it was). Each model is opened in a child that may take 256 MB more than it
+had and ten seconds; what matters is how many hung it, killed it, or went beyond that memory. Seed
+and number identify a model.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ MOST_MORE = 256 << 20
 BATCH = 50
 """Models that a child takes one after another: a fork for each costs more than the model."""
 GROWN = 0.25
-"""Share of models that grow by the check's own rules instead of being one of ours that was changed: they reach farther."""
+"""Share of models that grow by the check's own rules instead of being one of ours that was changed:
+they reach farther."""
 ENROLLED = 0.1
 """Share of enrolments."""
 ENROLLING = Own("enrolment", b"", bundle.load(bundle.DEFAULT).manifest)
@@ -55,7 +58,8 @@ SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
 
 
 def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
-    """What becomes of one model in this process: outcome, why, processor milliseconds of the check, seconds, most MB more."""
+    """What becomes of one model in this process: outcome, why, processor milliseconds of the check,
+    seconds, most MB more."""
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
     begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -82,20 +86,29 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
     if any(word in why for word in ("bad_alloc", "bad allocation", "Failed to allocate")):
         outcome = "no memory"
     more = (memory("VmHWM") - before) / 1024
-    return {"outcome": outcome, "why": why[:200], "check_ms": 1e3 * checked_s, "mb": more, "s": took}
+    return {
+        "outcome": outcome,
+        "why": why[:200],
+        "check_ms": 1e3 * checked_s,
+        "mb": more,
+        "s": took,
+    }
 
 
 def checked(model: bytes, own: Own) -> Bundle | None:
-    """What the box does with it first; the bundle of an enrolment. Raises BundleError where it is refused."""
+    """What the box does with it first; the bundle of an enrolment. Raises BundleError where it is
+    refused."""
     if own is ENROLLING:
-        return bundle.from_files(mutated_enrolments.packaged() | {bundle.ENROLMENT: model}, "a campaign")
+        return bundle.from_files(
+            mutated_enrolments.packaged() | {bundle.ENROLMENT: model}, "a campaign"
+        )
     check.check(model, own.manifest)
     return None
 
 
 def run(opened: Any, rng: Random) -> None:
-    """Three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError where a classifier names a material
-    without a probability."""
+    """Three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError where a
+    classifier names a material without a probability."""
     if isinstance(opened, Classifier):
         classify(opened, rng)
         return
@@ -108,11 +121,21 @@ def run(opened: Any, rng: Random) -> None:
 
 
 def classify(classifier: Classifier, rng: Random) -> None:
-    """The same by a classifier, with the golden sweeps, which have contact and get as far as the class means."""
+    """The same by a classifier, with the golden sweeps, which have contact and get as far as the
+    class means."""
     f = classifier.format
-    noise = np.random.default_rng(rng.getrandbits(32)).integers(0, 255, (f.window, *f.shape)).astype(f.numpy_type)
+    noise = (
+        np.random.default_rng(rng.getrandbits(32))
+        .integers(0, 255, (f.window, *f.shape))
+        .astype(f.numpy_type)
+    )
     number = np.arange(f.window)
-    for window in (np.zeros_like(noise), np.full_like(noise, 255), noise, *classifier.bundle.golden):
+    for window in (
+        np.zeros_like(noise),
+        np.full_like(noise, 255),
+        noise,
+        *classifier.bundle.golden,
+    ):
         verdict = classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, window)))
         if verdict.label and not 0 <= verdict.probability <= 1:
             raise FloatingPointError(f"{verdict.label!r} with probability {verdict.probability}")
@@ -167,7 +190,14 @@ class Fuzz:
                     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                     pid = 0
                     outcome = f"died ({code})" if there else "hung"
-                    yield {"number": at, "outcome": outcome, "why": "", "check_ms": 0, "mb": 0, "s": DEADLINE_S}
+                    yield {
+                        "number": at,
+                        "outcome": outcome,
+                        "why": "",
+                        "check_ms": 0,
+                        "mb": 0,
+                        "s": DEADLINE_S,
+                    }
                     return
                 *lines, rest = (rest + more).split(b"\n")
                 for line in lines:
@@ -197,8 +227,14 @@ class Fuzz:
 def fresh(seed: int) -> dict[str, Any]:
     """A campaign in which nothing was done yet."""
     return provenance() | {
-        "seed": seed, "done": 0, "outcomes": {}, "finds": [], "slowest_check_ms": 0.0, "slowest_s": 0.0, "most_mb": 0.0,
-    }  # fmt: skip
+        "seed": seed,
+        "done": 0,
+        "outcomes": {},
+        "finds": [],
+        "slowest_check_ms": 0.0,
+        "slowest_s": 0.0,
+        "most_mb": 0.0,
+    }
 
 
 def note(record: dict[str, Any], result: dict[str, Any]) -> None:
@@ -227,7 +263,10 @@ def main() -> int:
         note(record, result)
         if record["done"] % BATCH == 0 or record["done"] == args.count:
             storage.put(args.out, (json.dumps(record, indent=1) + "\n").encode())
-            print(f"{record['done']} of {args.count}: {record['outcomes']}, finds {len(record['finds'])}", flush=True)
+            print(
+                f"{record['done']} of {args.count}: {record['outcomes']}, finds {len(record['finds'])}",
+                flush=True,
+            )
     return 1 if record["finds"] else 0
 
 

@@ -1,8 +1,10 @@
-"""What the page costs: `python -m tests.campaigns.page_load --seconds 60 --out docs/watch/load.json`. In: seconds for each number of
-browsers. Out: a table and JSON: memory and share of a core of `palpate watch --web`, with none, one and eight browsers.
+"""What the page costs: `python -m tests.campaigns.page_load --seconds 60 --out
+docs/watch/load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory and
+share of a core of `palpate watch --web`, with none, one and eight browsers.
 
-One box (`palpate run --sim skin`, in real time) and one page; the numbers of browsers take turns. A browser here is a connection
-that reads all events and asks for the picture of each sweep, as the page's script does; what a tablet spends is not measured.
+One box (`palpate run --sim skin`, in real time) and one page; the numbers of browsers take turns. A
+browser here is a connection that reads all events and asks for the picture of each sweep, as the
+page's script does; what a tablet spends is not measured.
 """
 
 from __future__ import annotations
@@ -33,8 +35,14 @@ RUN = [sys.executable, "-m", "appliance"]
 def used(pid: int) -> tuple[float, int, int]:
     """Seconds of processor, KiB resident and KiB in proportion of a process."""
     parts = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    kib = dict(re.findall(r"(?m)^(Rss|Pss):\s+(\d+) kB", Path(f"/proc/{pid}/smaps_rollup").read_text()))
-    return (int(parts[11]) + int(parts[12])) / os.sysconf("SC_CLK_TCK"), int(kib["Rss"]), int(kib["Pss"])
+    kib = dict(
+        re.findall(r"(?m)^(Rss|Pss):\s+(\d+) kB", Path(f"/proc/{pid}/smaps_rollup").read_text())
+    )
+    return (
+        (int(parts[11]) + int(parts[12])) / os.sysconf("SC_CLK_TCK"),
+        int(kib["Rss"]),
+        int(kib["Pss"]),
+    )
 
 
 def browse(page: PageAddress, ended: threading.Event, read: list[int]) -> None:
@@ -51,7 +59,10 @@ def browse(page: PageAddress, ended: threading.Event, read: list[int]) -> None:
 def measured(pid: int, page: PageAddress, browsers: int, seconds: float) -> dict[str, Any]:
     """What the process uses while so many browsers are there."""
     ended, read = threading.Event(), []
-    threads = [threading.Thread(target=browse, args=(page, ended, read), daemon=True) for _ in range(browsers)]
+    threads = [
+        threading.Thread(target=browse, args=(page, ended, read), daemon=True)
+        for _ in range(browsers)
+    ]
     for thread in threads:
         thread.start()
     time.sleep(SETTLE_S)
@@ -81,9 +92,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         feed = ["--set", f"feed.socket={folder}/feed.sock"]
         environ = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-        box = subprocess.Popen([*RUN, "run", "--sim", "skin", *feed], stdout=subprocess.DEVNULL, cwd=ROOT, env=environ)
+        box = subprocess.Popen(
+            [*RUN, "run", "--sim", "skin", *feed], stdout=subprocess.DEVNULL, cwd=ROOT, env=environ
+        )
         watch = subprocess.Popen(
-            [*RUN, "watch", "--web", "0", *feed], stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environ
+            [*RUN, "watch", "--web", "0", *feed],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=environ,
         )
         try:
             page = PageAddress(watch.stderr.readline().split("page: ")[1].strip())
@@ -96,7 +113,12 @@ def main() -> int:
         shown = f"{100 * one['share']:.1f} % of a core, {one['rss_kib'] / 1024:.0f} MiB resident, {one['pss_kib'] / 1024:.0f} MiB in proportion"
         print(f"{one['browsers']} browsers: {shown}, {one['events_s']:.0f} events a second")
     if args.out:
-        about = {"commit": commit(), "seconds": args.seconds, "cores": os.cpu_count(), "results": results}
+        about = {
+            "commit": commit(),
+            "seconds": args.seconds,
+            "cores": os.cpu_count(),
+            "results": results,
+        }
         storage.put(args.out, json.dumps(about, indent=1).encode())
     return 0
 

@@ -1,5 +1,5 @@
-"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m tests.cuts`, and whether that
-finds what is wrong on purpose.
+"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m
+tests.cuts`, and whether that finds what is wrong on purpose.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from tests.cuts import black_box, calls, delivery, recording, scene, tree
 from tests.cuts.calls import NotFollowed
 from tests.cuts.scene import CrashPoint, CutScene, Found, ScenePlay, SceneStep
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(calls.lacking()), reason=f"needs {calls.lacking()}"),
+]
 
 Makes = Callable[..., ScenePlay]
 
@@ -34,7 +37,9 @@ def work() -> Iterator[Path]:
 def play(work: Path) -> Makes:
     """Plays lines of Python, which find the folder in `f`, after others that have prepared it."""
 
-    def make(does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []) -> ScenePlay:
+    def make(
+        does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []
+    ) -> ScenePlay:
         code = "import os, sys; from pathlib import Path; from appliance.core import storage; f = Path(sys.argv[1])\n"
 
         def prepare(folder: Path) -> None:
@@ -48,7 +53,9 @@ def play(work: Path) -> Makes:
 
 def left(play: ScenePlay, call: str | None) -> list[tree.Tree]:
     """What a loss of power may leave before the first call of this name; None: at the end."""
-    return next(list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call)
+    return next(
+        list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call
+    )
 
 
 def wrong(points: list[CrashPoint]) -> list[str]:
@@ -57,54 +64,77 @@ def wrong(points: list[CrashPoint]) -> list[str]:
 
 
 def test_what_is_not_synced_may_be_there_or_not(play: Makes):
-    """A new file: no name, or a name with nothing, half, zeros or all; with its content synced, no name or all."""
+    """A new file: no name, or a name with nothing, half, zeros or all; with its content synced, no
+    name or all."""
     played = play("a = open(f / 'a', 'wb', 0); a.write(b'1234'); os.fsync(a.fileno())")
     contents = [b"", b"12", b"1234", bytes(4)]
     assert left(played, "fsync") == [{}] + [{"a": held} for held in (b"1234", b"", b"12", bytes(4))]
-    assert sorted(map(str, left(played, "fsync")[1:])) == sorted(str({"a": held}) for held in contents)
+    assert sorted(map(str, left(played, "fsync")[1:])) == sorted(
+        str({"a": held}) for held in contents
+    )
     assert left(played, None) == [{}, {"a": b"1234"}]
 
 
 def test_a_folder_that_is_synced_holds_its_names(play: Makes):
-    """A new name stays; the content that was never synced may be lost; what was there before stays as it was."""
+    """A new name stays; the content that was never synced may be lost; what was there before stays
+    as it was."""
     played = play("(f / 'a').write_bytes(b'1'); storage.sync(f)", "(f / 'b').write_bytes(b'2')")
     assert left(played, None) == [{"a": held, "b": b"2"} for held in (b"1", b"", b"\0")]
 
 
 def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
-    """Written over in place, and not synced: what was there may still be there, and half of the new."""
+    """Written over in place, and not synced: what was there may still be there, and half of the
+    new."""
     played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
     assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
     assert [found["a"] for found in left(played, "write")] == [b"", b"old"]
 
 
 def test_a_renaming_is_never_half_done(play: Makes):
-    """From folder to folder, and of two names that are exchanged: before or after; a sync of one folder is enough."""
+    """From folder to folder, and of two names that are exchanged: before or after; a sync of one
+    folder is enough."""
     before = "[storage.put(f / name, name.encode()) for name in 'ab']; (f / 'x').mkdir()"
     played = play(
-        "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); storage.exchange(f / 'b', f / 'x' / 'a')", before
+        "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); storage.exchange(f / 'b', f / 'x' / 'a')",
+        before,
     )
-    assert left(played, "fsync") == [{"a": b"a", "b": b"b", "x": None}, {"b": b"b", "x": None, "x/a": b"a"}]
-    assert left(played, None) == [{"b": b"b", "x": None, "x/a": b"a"}, {"b": b"a", "x": None, "x/a": b"b"}]
+    assert left(played, "fsync") == [
+        {"a": b"a", "b": b"b", "x": None},
+        {"b": b"b", "x": None, "x/a": b"a"},
+    ]
+    assert left(played, None) == [
+        {"b": b"b", "x": None, "x/a": b"a"},
+        {"b": b"a", "x": None, "x/a": b"b"},
+    ]
 
 
 def test_names_of_two_folders_come_in_any_order(play: Makes):
-    """The later of two changes may be on the disk without the earlier one, but not of the same folder."""
-    played = play("[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]", "(f / 'x').mkdir(); (f / 'y').mkdir()")
+    """The later of two changes may be on the disk without the earlier one, but not of the same
+    folder."""
+    played = play(
+        "[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]",
+        "(f / 'x').mkdir(); (f / 'y').mkdir()",
+    )
     found = [" ".join(sorted(found.keys() - {"x", "y"})) for found in left(played, None)]
     assert found == ["", "x/1", "x/1 x/2", "y/3", "x/1 y/3", "x/1 x/2 y/3"]
 
 
 def test_a_sync_takes_with_it_what_came_before(play: Makes):
-    """A folder's new name came from another folder, where it was not synced: it is in one of the two, not in both."""
-    played = play("(f / 'a').mkdir(); (f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x')", "(f / 'x').mkdir()")
+    """A folder's new name came from another folder, where it was not synced: it is in one of the
+    two, not in both."""
+    played = play(
+        "(f / 'a').mkdir(); (f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x')",
+        "(f / 'x').mkdir()",
+    )
     assert left(played, None) == [{"x": None, "x/a": None}]
 
 
 def test_a_symlink_is_swapped_in_one_step(play: Makes):
-    """disk.link: at every moment it leads to the old or the new, also where one of that name was left half done."""
+    """disk.link: at every moment it leads to the old or the new, also where one of that name was
+    left half done."""
     played = play(
-        "storage.link(f / 'current', 'new')", "storage.link(f / 'current', 'old'); (f / 'current.part').symlink_to('x')"
+        "storage.link(f / 'current', 'new')",
+        "storage.link(f / 'current', 'old'); (f / 'current.part').symlink_to('x')",
     )
     found = {found["current"] for moment in played.moments() for found in moment.disk.left()}
     assert found == {"old", "new"}
@@ -112,10 +142,14 @@ def test_a_symlink_is_swapped_in_one_step(play: Makes):
 
 
 def test_a_kill_comes_before_its_call(play: Makes):
-    """What is killed on entry to a renaming has not renamed; the judge gets what was said before."""
+    """What is killed on entry to a renaming has not renamed; the judge gets what was said
+    before."""
     judged = []
-    played = play("print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')", "(f / 'a').touch()",
-                  lambda found: judged.append((tree.read(found.folder), found.heard)) or [])  # fmt: skip
+    played = play(
+        "print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')",
+        "(f / 'a').touch()",
+        lambda found: judged.append((tree.read(found.folder), found.heard)) or [],
+    )
     (moment, end) = played.moments()
     played.kill(moment)
     assert judged == [({"a": b""}, "\nnow\n")]
@@ -136,13 +170,15 @@ def test_a_kill_comes_before_its_call(play: Makes):
     ids=["mapped", "allocated", "a child's", "nameless", "failed"],
 )
 def test_what_cannot_be_followed_is_told(play: Makes, does: str):
-    """A program that changes files in a way that is not understood, or fails, is not taken for one that changes none."""
+    """A program that changes files in a way that is not understood, or fails, is not taken for one
+    that changes none."""
     with pytest.raises(NotFollowed):
         play(does, "(f / 'a').write_bytes(b'0')")
 
 
 def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs, and some kills: all that was reported as stored is there."""
+    """The power is cut at every moment of two runs, and some kills: all that was reported as stored
+    is there."""
     played = ScenePlay(recording.scene(), work)
     points = [played.power(moment) for moment in played.moments()]
     points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]
@@ -154,11 +190,17 @@ def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work:
     """`palpate record` itself, killed and without power before some of its last calls."""
     played = ScenePlay(recording.palpate(), work)
     last = list(played.moments())[-8::2]
-    assert wrong([cut(moment) for moment in last for cut in (played.kill, played.power) if moment.call]) == []
+    assert (
+        wrong(
+            [cut(moment) for moment in last for cut in (played.kill, played.power) if moment.call]
+        )
+        == []
+    )
 
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
-    """Killed once it has made the folder and before it has synced that; the next run must not rely on it."""
+    """Killed once it has made the folder and before it has synced that; the next run must not rely
+    on it."""
     played = ScenePlay(recording.scene(), work)
     made = next(m for m in played.moments() if m.call and m.call.name == "fsync")
     assert wrong([played.kill_then_power(made)]) == []
@@ -172,14 +214,18 @@ def test_ways_that_are_wrong_are_found(work: Path, way: str):
 
 
 def test_a_kill_finds_what_is_written_under_its_own_name(work: Path):
-    """No loss of power is needed for that; and the judge sees it in what a killed program has left."""
+    """No loss of power is needed for that; and the judge sees it in what a killed program has
+    left."""
     played = ScenePlay(recording.scene("under its own name"), work)
-    half = next(m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy"))
+    half = next(
+        m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy")
+    )
     assert "not a recorded sweep" in str(played.kill(half).wrong)
 
 
 def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs: the last sweeps are there, and never many more."""
+    """The power is cut at every moment of two runs: the last sweeps are there, and never many
+    more."""
     played = ScenePlay(black_box.scene(), work)
     assert wrong([played.power(moment) for moment in played.moments()]) == []
 
@@ -201,9 +247,11 @@ def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
     ]
 
 
-def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: delivery.Shop, work: Path):
-    """Killed before it names the bundle's folder and the ledger, and without power before the link is swapped: the box
-    starts, answers, and takes the next bundle.
+def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
+    shop: delivery.Shop, work: Path
+):
+    """Killed before it names the bundle's folder and the ledger, and without power before the link
+    is swapped: the box starts, answers, and takes the next bundle.
     """
     played = ScenePlay(shop.alone("right"), work)
     points = cut_at_renames(played)
@@ -211,8 +259,11 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(shop: del
     assert wrong(points) == []
 
 
-def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(shop: delivery.Shop, work: Path):
-    """As a delivery: and at each moment what the box has of the label is signed, or it runs without it."""
+def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(
+    shop: delivery.Shop, work: Path
+):
+    """As a delivery: and at each moment what the box has of the label is signed, or it runs without
+    it."""
     played = ScenePlay(shop.learns("right"), work)
     points = cut_at_renames(played)
     assert [point.states for point in points] == [1, 1, 4]
@@ -220,8 +271,11 @@ def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_with
 
 
 @pytest.mark.parametrize("name", ["delivery", "enrolment"])
-def test_what_happens_to_a_box_in_between_is_as_the_scene_says(shop: delivery.Shop, work: Path, name: str):
-    """The power goes as each command has ended: the bundle that the scene names answers, and the next one is taken."""
+def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
+    shop: delivery.Shop, work: Path, name: str
+):
+    """The power goes as each command has ended: the bundle that the scene names answers, and the
+    next one is taken."""
     played = ScenePlay({"delivery": shop.scene, "enrolment": shop.enrolment}[name](), work)
     points = [played.power(moment) for moment in played.moments() if not moment.call]
     assert wrong(points) == []
@@ -231,34 +285,54 @@ def test_what_happens_to_a_box_in_between_is_as_the_scene_says(shop: delivery.Sh
 @pytest.mark.parametrize(
     ("way", "call", "what"),
     [
-        ("the link is gone for a moment", "symlink", r"first start: exit code 0, answers by \['\w+'\] instead"),
-        ("the ledger in place", "write", r"first start: exit code 78, .*ledger.json cannot be read"),
+        (
+            "the link is gone for a moment",
+            "symlink",
+            r"first start: exit code 0, answers by \['\w+'\] instead",
+        ),
+        (
+            "the ledger in place",
+            "write",
+            r"first start: exit code 78, .*ledger.json cannot be read",
+        ),
     ],
     ids=["link", "ledger"],
 )
-def test_deliveries_that_are_wrong_are_found(shop: delivery.Shop, work: Path, way: str, call: str, what: str):
+def test_deliveries_that_are_wrong_are_found(
+    shop: delivery.Shop, work: Path, way: str, call: str, what: str
+):
     """A store that is neither old nor new for a moment: a kill there finds it."""
     played = ScenePlay(shop.alone(way), work)
     (moment,) = [
-        m for m in played.moments()
+        m
+        for m in played.moments()
         if m.call and m.call.name == call and m.call.paths[0].endswith(("/current", "/ledger.json"))
-    ]  # fmt: skip
+    ]
     assert re.search(what, str(played.kill(moment).wrong))
 
 
 def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pytest.MonkeyPatch):
-    """Points that are in the file are not cut again, half a line there is; after a change of the box all of them are."""
+    """Points that are in the file are not cut again, half a line there is; after a change of the
+    box all of them are."""
     code = "import sys; from pathlib import Path; (Path(sys.argv[1]) / 'a').write_bytes(b'1')"
     step = SceneStep("it", lambda folder: [sys.executable, "-S", "-c", code, folder])
     lines = CutScene(
-        "lines", lambda folder: None, (step,), lambda found: ["empty"] if not any(found.folder.iterdir()) else []
+        "lines",
+        lambda folder: None,
+        (step,),
+        lambda found: ["empty"] if not any(found.folder.iterdir()) else [],
     )
     file = work / "cuts.jsonl"
     points = list(campaign.cut(lines, campaign.CrashPointLog(file)))
     assert [(p.how, p.moment, p.states, bool(p.wrong)) for p in points] == [
-        ("kill", 0, 1, True), ("kill", 1, 1, False), ("power", 0, 1, True), ("power", 1, 2, True), ("power", 2, 4, True),
-        ("kill_then_power", 0, 7, True), ("kill_then_power", 1, 6, True),
-    ]  # fmt: skip
+        ("kill", 0, 1, True),
+        ("kill", 1, 1, False),
+        ("power", 0, 1, True),
+        ("power", 1, 2, True),
+        ("power", 2, 4, True),
+        ("kill_then_power", 0, 7, True),
+        ("kill_then_power", 1, 6, True),
+    ]
     assert list(campaign.cut(lines, campaign.CrashPointLog(file))) == []
     assert campaign.CrashPointLog(file).points() == points
     file.write_text(file.read_text()[:-9])
@@ -266,7 +340,9 @@ def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pyt
     assert campaign.CrashPointLog(file).points() == points
     monkeypatch.setattr(campaign, "_head", lambda: {"source": "another"})
     assert campaign.CrashPointLog(file).points() == []
-    assert list(campaign.figures(points))[-1].startswith("all: kill at 2 moments, 2 folders, wrong 1; power at 3")
+    assert list(campaign.figures(points))[-1].startswith(
+        "all: kill at 2 moments, 2 folders, wrong 1; power at 3"
+    )
     assert list(campaign.figures(points[:2])) == [
         f"{of}: kill at 2 moments, 2 folders, wrong 1" for of in ("lines: it", "all")
     ]

@@ -1,4 +1,5 @@
-"""What the feed's campaign finds: each target missed by made-up figures, the packet's phase, and readers that do what they say."""
+"""What the feed's campaign finds: each target missed by made-up figures, the packet's phase, and
+readers that do what they say."""
 
 from __future__ import annotations
 
@@ -18,12 +19,20 @@ RATE = 750.0
 
 
 def kind(share: float, late_ms: float = 1.0, **more: object) -> Kind:
-    """Fifteen turns with forty answers, each so much later than the packet in which its stop edge came."""
+    """Fifteen turns with forty answers, each so much later than the packet in which its stop edge
+    came."""
     stops = np.arange(1000, 1000 + 40 * 2587, 2587)
     seen_s = (np.ceil((stops - 4) / PACKET) * PACKET + 4) / RATE
     answers = [(float(s) + late_ms / 1e3, int(stop)) for s, stop in zip(seen_s, stops, strict=True)]
-    values = {"wall_s": 300.0, "cpu_s": 300 * share, "shares": [share] * 15, "rss_kib": [70_000], "answers": answers,
-              "latency_ms": [1.2] * 40, "way_ms": [0.5] * 40}  # fmt: skip
+    values = {
+        "wall_s": 300.0,
+        "cpu_s": 300 * share,
+        "shares": [share] * 15,
+        "rss_kib": [70_000],
+        "answers": answers,
+        "latency_ms": [1.2] * 40,
+        "way_ms": [0.5] * 40,
+    }
     return Kind(**(values | more))
 
 
@@ -34,7 +43,8 @@ def kinds() -> dict[str, Kind]:
 
 
 def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) -> None:
-    """Differences are those that were put in, the quickest answer is the zero, and each kind has its row."""
+    """Differences are those that were put in, the quickest answer is the zero, and each kind has
+    its row."""
     figures = feed_load.result(kinds, 69_000)
     assert feed_load.missed(figures) == []
     assert figures["64"]["share_more"] == pytest.approx([0.007] * 3)
@@ -44,20 +54,27 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) 
     content = {"machine": "m", "real_time": True, "load": 1.5, "commit": "abc", "readers": figures}
     rows = feed_load.table(content).splitlines()
     assert len(rows) == 4 + len(kinds)
-    assert "300 s of each kind in turns of 20 s, on m, with real-time priority; load average 1.5" in rows[0]
+    assert (
+        "300 s of each kind in turns of 20 s, on m, with real-time priority; load average 1.5"
+        in rows[0]
+    )
     assert "+0.70 % [+0.70, +0.70]" in rows[6]
 
 
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        ({"shares": [0.07] * 15}, "2.00 % of a core at least"), ({"inside_s": 3.3}, "1.10 % of a core in the feed"),
+        ({"shares": [0.07] * 15}, "2.00 % of a core at least"),
+        ({"inside_s": 3.3}, "1.10 % of a core in the feed"),
         ({"rss_kib": [70_000, 73_000]}, "3.91 MiB more"),
-        ({"lost": 3}, "3 frames lost"), ({"dropped": 1}, "1 sentences dropped"),
+        ({"lost": 3}, "3 frames lost"),
+        ({"dropped": 1}, "1 sentences dropped"),
         ({"faults": Counter({"sweeps without an answer": 2})}, "sweeps without an answer"),
     ],
-)  # fmt: skip
-def test_each_target_can_be_missed(kinds: dict[str, Kind], change: dict[str, object], what: str) -> None:
+)
+def test_each_target_can_be_missed(
+    kinds: dict[str, Kind], change: dict[str, object], what: str
+) -> None:
     """One kind with one thing wrong is named, and nothing else."""
     worse = copy.deepcopy(kinds)
     worse["attacked"] = kind(0.059, **change)
@@ -120,7 +137,8 @@ def test_readers_read_all_but_one_of_them(tmp_path: Path, name: str) -> None:
 
 
 def test_attackers_attack_and_the_good_ones_are_served(tmp_path: Path) -> None:
-    """Wrong requests, floods and a storm of connections: eight readers get their lines all the same."""
+    """Wrong requests, floods and a storm of connections: eight readers get their lines all the
+    same."""
     offered, seen = Offered(tmp_path / "feed.sock"), Counter[str]()
     offered.turns()
     acts = feed_readers.acts("attacked", str(offered.path), seen)

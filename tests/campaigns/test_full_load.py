@@ -1,5 +1,5 @@
-"""What the campaign of full load finds: each target missed by made-up figures; a box that is counted from inside; a disk that
-fills; one box with all that can be attached, for some seconds."""
+"""What the campaign of full load finds: each target missed by made-up figures; a box that is
+counted from inside; a disk that fills; one box with all that can be attached, for some seconds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ PEERS = {"feed": {"verdict": 20, "frame": 900}, "page": 7, "tcp": 8, "modbus": 9
 
 
 def lines(lost: int = 150) -> list[dict[str, Any]]:
-    """A box that was counted every two seconds for 90: 100 frames and an answer a second, and `lost` frames at 62 s."""
+    """A box that was counted every two seconds for 90: 100 frames and an answer a second, and
+    `lost` frames at 62 s."""
     found: list[dict[str, Any]] = []
     for at in range(0, 92, 2):
         gone = lost * (at > 62)
@@ -40,7 +41,9 @@ def lines(lost: int = 150) -> list[dict[str, Any]]:
         found.append({"at_s": float(at), **STILL, **counts})
         status = "gap" if at == 62 else "unknown"
         found += [
-            {"at_s": at + 0.5 * i, "sweep": at + i, "status": status, "answer_ms": 5.0 + i} for i in (0, 1) if at < 90
+            {"at_s": at + 0.5 * i, "sweep": at + i, "status": status, "answer_ms": 5.0 + i}
+            for i in (0, 1)
+            if at < 90
         ]
     return found
 
@@ -49,7 +52,14 @@ def box(full: bool) -> dict[str, Any]:
     """The figures of one box in which all is well."""
     timed = [(float(at), 1.0 + at % 2) for at in range(90)]
     looks = [(float(at), 0.1 * at, 70_000 + at) for at in range(0, 90, 5)]
-    about = {"skin": "papillarray", "full": full, "format": "3x3x3", "heard": 900, "results": 90, "twice": 0}
+    about = {
+        "skin": "papillarray",
+        "full": full,
+        "format": "3x3x3",
+        "heard": 900,
+        "results": 90,
+        "twice": 0,
+    }
     kept = {"kept": {"full": 3}, "recorded": 80, "black_box": 70, "compared": 60, "reading": 0.07}
     return figures(lines(), PHASES, timed, looks) | about | kept
 
@@ -62,7 +72,8 @@ def content() -> dict[str, Any]:
 
 
 def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any]) -> None:
-    """Figures are those that were put in, of the time without faults and of each fault; each box has its rows."""
+    """Figures are those that were put in, of the time without faults and of each fault; each box
+    has its rows."""
     assert missed(content) == []
     calm = content["boxes"][1]["calm"]
     assert (calm["came"], calm["missing"], calm["stops"], calm["n"]) == (6000, 0, 60, 60)
@@ -70,11 +81,20 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
     assert calm["in_box_ms"]["p50"] == 1.5
     assert (calm["share"], calm["turn_ms"]["p100"]) == (0.1, 12.0)
     away = content["boxes"][1]["faults"]["processor away"]
-    assert (away["missing"], away["counted"], away["statuses"]) == (150, 150, {"unknown": 10, "gap": 2})
+    assert (away["missing"], away["counted"], away["statuses"]) == (
+        150,
+        150,
+        {"unknown": 10, "gap": 2},
+    )
     assert content["boxes"][1]["faults"]["disk full"]["missing"] == 0
     text = table(content)
-    assert "for 1 min without faults, on m, with real-time priority; load average 1.5 before, 2.5 after; seed 7" in text
-    assert "| papillarray, 3x3x3 | all attached | 6,000 | 0, 0 | 60, 60 | 5.5 / 6.0 / 6.0 ms |" in text
+    assert (
+        "for 1 min without faults, on m, with real-time priority; load average 1.5 before, 2.5 after; seed 7"
+        in text
+    )
+    assert (
+        "| papillarray, 3x3x3 | all attached | 6,000 | 0, 0 | 60, 60 | 5.5 / 6.0 / 6.0 ms |" in text
+    )
     assert (
         "| processor away | papillarray | nothing attached | 1 | 150, 150 | 12, 12 | 0 | `gap` 2, `unknown` 10 |"
         in text
@@ -83,8 +103,14 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
         "- papillarray: 10.0 % of a core here, of which reading 7.0 % by `palpate check`; 60 % of a core six times slower"
         in text
     )
-    assert "reading 42 %; 100 % of a core ten times slower, of which reading 70 %: `palpate check` fails there." in text
-    assert "In the whole run 1,800 sentences were sent, 1,800 came and 0 were counted as dropped." in text
+    assert (
+        "reading 42 %; 100 % of a core ten times slower, of which reading 70 %: `palpate check` fails there."
+        in text
+    )
+    assert (
+        "In the whole run 1,800 sentences were sent, 1,800 came and 0 were counted as dropped."
+        in text
+    )
 
 
 @pytest.mark.parametrize(
@@ -103,32 +129,41 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
         ({"kept": {"stored": 80}}, "the disk was never full for a recording"),
     ],
 )
-def test_each_target_can_be_missed(content: dict[str, Any], change: dict[str, Any], said: str) -> None:
+def test_each_target_can_be_missed(
+    content: dict[str, Any], change: dict[str, Any], said: str
+) -> None:
     """A box with one thing wrong is named, and nothing else."""
     content["boxes"][1] |= change
     assert missed(content) == [f"papillarray, all attached: {said}"]
 
 
-def test_drops_without_a_fault_late_answers_and_idle_peers_are_found(content: dict[str, Any]) -> None:
-    """Sentences that are dropped while a robot reads, two milliseconds more in the median, a peer that got nothing."""
+def test_drops_without_a_fault_late_answers_and_idle_peers_are_found(
+    content: dict[str, Any],
+) -> None:
+    """Sentences that are dropped while a robot reads, two milliseconds more in the median, a peer
+    that got nothing."""
     full = content["boxes"][1]
     full["calm"] |= {"dropped": 2, "in_box_ms": {"p50": 3.5}}
     content["peers"]["papillarray"] |= {"tcp": 0, "feed": {"frame": 900}}
     assert missed(content) == [
         "papillarray, all attached: 2 sentences dropped in the time without faults",
         "papillarray: 3.5 ms in the box in the median, bare 1.5 ms",
-        "papillarray: the peer at verdict got nothing", "papillarray: the peer at tcp got nothing",
-    ]  # fmt: skip
+        "papillarray: the peer at verdict got nothing",
+        "papillarray: the peer at tcp got nothing",
+    ]
 
 
 def test_a_skin_without_a_count_may_err_by_a_frame_in_each_stop(content: dict[str, Any]) -> None:
-    """It was stopped once: one frame too few is within what its times can tell, two are not; of a skin with a count none is."""
+    """It was stopped once: one frame too few is within what its times can tell, two are not; of a
+    skin with a count none is."""
     content["boxes"][0] |= {"loss_known": False, "missing": 151}
     assert missed(content) == []
     content["boxes"][0]["missing"] = 100
     assert missed(content) == []
     content["boxes"][1]["missing"] = 149
-    assert missed(content) == ["papillarray, all attached: 149 frames are missing, 150 are counted as lost"]
+    assert missed(content) == [
+        "papillarray, all attached: 149 frames are missing, 150 are counted as lost"
+    ]
     content["boxes"][1]["missing"] = 150
     content["boxes"][0]["missing"] = 152
     assert missed(content) == ["papillarray, bare: 152 frames are missing, 150 are counted as lost"]
@@ -162,7 +197,8 @@ def test_a_disk_fills_to_the_last_byte_and_goes(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
 @pytest.mark.slow
 def test_one_skin_under_full_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both boxes at work with real processes, through each fault: recorded, compared and served, and each sentence accounted for."""
+    """Both boxes at work with real processes, through each fault: recorded, compared and served,
+    and each sentence accounted for."""
     times = {"SETTLE_S": 3.0, "FULL_S": 4.0, "DEAF_S": 28.0, "REST_S": 4.0, "LOOK_S": 1.0}
     for name, seconds in times.items():
         monkeypatch.setattr(full_load, name, seconds)

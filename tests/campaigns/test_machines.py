@@ -1,7 +1,9 @@
-"""Other processors: the same bundle gives the same labels on x86 with and without VNNI, and on arm64.
+"""Other processors: the same bundle gives the same labels on x86 with and without VNNI, and on
+arm64.
 
-Emulated by qemu, which computes what the processor would, instruction by instruction. PALPATE_MACHINES=1 gets what this
-needs (see tests/factories/emulated_machines.py) and fails without it; else what is missing is skipped.
+Emulated by qemu, which computes what the processor would, instruction by instruction.
+PALPATE_MACHINES=1 gets what this needs (see tests/factories/emulated_machines.py) and fails without
+it; else what is missing is skipped.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ SHOWN_SWEEPS = 8
 
 @pytest.fixture(scope="session")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The default bundle with simulated sweeps, one freshly trained for each type of raw counts, and a network that overflows."""
+    """The default bundle with simulated sweeps, one freshly trained for each type of raw counts,
+    and a network that overflows."""
     if os.environ.get("PALPATE_MACHINES") == "1":
         emulated_machines.set_up()
     folder = tmp_path_factory.mktemp("given")
@@ -57,12 +60,18 @@ def _show(folder: Path, name: str) -> None:
     del model.graph.output[:]
     (folder / f"{name} inside").mkdir()
     names = [q.output[0] for q in parity.rounding_nodes(model)]
-    (folder / f"{name} inside" / "shown.onnx").write_bytes(parity.with_outputs(model, names).SerializeToString())
-    np.save(folder / f"{name} inside" / "sweeps.npy", np.load(folder / name / "sweeps.npy")[:SHOWN_SWEEPS])
+    (folder / f"{name} inside" / "shown.onnx").write_bytes(
+        parity.with_outputs(model, names).SerializeToString()
+    )
+    np.save(
+        folder / f"{name} inside" / "sweeps.npy",
+        np.load(folder / name / "sweeps.npy")[:SHOWN_SWEEPS],
+    )
 
 
 def overflowing(folder: Path) -> None:
-    """A convolution with weights of eight bits over bytes at their highest: no 16 bits hold two of its products."""
+    """A convolution with weights of eight bits over bytes at their highest: no 16 bits hold two of
+    its products."""
     folder.mkdir()
     taps = np.full((32, 32, 5), 127, np.int8)
     constants = {
@@ -80,10 +89,12 @@ def overflowing(folder: Path) -> None:
         helper.make_node("DequantizeLinear", ["q", "much", "none"], ["z"]),
     ]
     graph = helper.make_graph(
-        nodes, "overflowing", [helper.make_tensor_value_info("sweep", TensorProto.UINT8, [1, 32, 64])],
+        nodes,
+        "overflowing",
+        [helper.make_tensor_value_info("sweep", TensorProto.UINT8, [1, 32, 64])],
         [helper.make_tensor_value_info("q", TensorProto.UINT8, None)],
         [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
-    )  # fmt: skip
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     (folder / "shown.onnx").write_bytes(model.SerializeToString())
     np.save(folder / "sweeps.npy", np.full((1, 32, 64), 255, np.uint8))
@@ -111,23 +122,30 @@ def there(
         emulated_machines.command(request.param)
     except emulated_machines.Missing as e:
         (pytest.fail if insist else pytest.skip)(str(e))
-    args, env = emulated_machines.command(request.param, request.getfixturevalue("given"), results_file)
+    args, env = emulated_machines.command(
+        request.param, request.getfixturevalue("given"), results_file
+    )
     done = subprocess.run(args, env=env, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     with np.load(results_file) as z:
         return request.param, dict(z)
 
 
-def test_a_bundle_says_the_same_on_every_machine(here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]):
-    """Golden sweeps and others: the same labels, and probabilities within the tolerance of the box's self test."""
+def test_a_bundle_says_the_same_on_every_machine(
+    here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
+):
+    """Golden sweeps and others: the same labels, and probabilities within the tolerance of the
+    box's self test."""
     name, there_result = there
     assert there_result.keys() == here.keys()
     for what in here:
         if not what.endswith(("/golden", "/sweeps")):
             continue
         apart = np.abs(softmax(there_result[what]) - softmax(here[what])).max()
-        print(f"{name}: {what}: {len(here[what])} sweeps, probabilities {apart:.2g} apart, "
-              f"logits {np.abs(there_result[what] - here[what]).max():.2g}")  # fmt: skip
+        print(
+            f"{name}: {what}: {len(here[what])} sweeps, probabilities {apart:.2g} apart, "
+            f"logits {np.abs(there_result[what] - here[what]).max():.2g}"
+        )
         np.testing.assert_array_equal(there_result[what].argmax(1), here[what].argmax(1))
         assert apart <= bundle.GOLDEN_TOLERANCE
 
@@ -135,17 +153,23 @@ def test_a_bundle_says_the_same_on_every_machine(here: dict[str, np.ndarray], th
 def test_what_int8_computes_is_the_same_to_the_bit(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
-    """The tensors inside: hardly one in ten thousand is another, where float rounding before it fell the other way."""
+    """The tensors inside: hardly one in ten thousand is another, where float rounding before it
+    fell the other way."""
     name, there_result = there
     for what in here:
         if what.endswith(" inside/shown"):
             other = np.abs(there_result[what].astype(int) - here[what])
-            print(f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up to {other.max()}")
+            print(
+                f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up to {other.max()}"
+            )
             assert np.mean(other > 0) < 1e-4
 
 
 def test_an_x86_without_vnni_is_one(there: tuple[str, dict[str, np.ndarray]]):
-    """Eight-bit weights overflow there, and only there: the machine is what it is called, and would show a difference."""
+    """Eight-bit weights overflow there, and only there: the machine is what it is called, and would
+    show a difference."""
     name, there_result = there
     exact = round(32 * 5 * 127 * 255 / 2**15)
-    assert (there_result[f"{EIGHT_BITS}/shown"] == exact).all() == (name != "x86, AVX2 without VNNI")
+    assert (there_result[f"{EIGHT_BITS}/shown"] == exact).all() == (
+        name != "x86, AVX2 without VNNI"
+    )

@@ -1,4 +1,5 @@
-"""Modules of the virtual box, without a guest: names of images, levels that are held, replies that cross, the table."""
+"""Modules of the virtual box, without a guest: names of images, levels that are held, replies that
+cross, the table."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPatch):
-    """Whatever Python builds the virtual box: of packages that differ between 3.11 and 3.12 the guest gets those for 3.11."""
+    """Whatever Python builds the virtual box: of packages that differ between 3.11 and 3.12 the
+    guest gets those for 3.11."""
     lock = image.guest_lock()
     assert "numpy==2.4" in lock
     assert "numpy==2.5" not in lock
@@ -45,7 +47,8 @@ def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
-    """A step that fails names its command and output; no folder is left that looks like an image."""
+    """A step that fails names its command and output; no folder is left that looks like an
+    image."""
 
     def fail(part: Path) -> None:
         (part / "half").touch()
@@ -57,7 +60,8 @@ def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
 
 
 def test_the_table_keeps_the_longest_run(tmp_path: Path):
-    """Of several runs of a fault the one with most repetitions counts, and of equal ones the last."""
+    """Of several runs of a fault the one with most repetitions counts, and of equal ones the
+    last."""
     file = tmp_path / "faults.jsonl"
     for outcome, times in (("early", 100), ("late", 100), ("short", 6)):
         notes.write("tests/rig/test_a.py::test", "pulled", outcome, times, file)
@@ -67,7 +71,8 @@ def test_the_table_keeps_the_longest_run(tmp_path: Path):
 
 @pytest.fixture
 def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]], GuestClock]]:
-    """Lines on a socket that answers OK to everything, and the requests that it got, with times of this machine."""
+    """Lines on a socket that answers OK to everything, and the requests that it got, with times of
+    this machine."""
     ours, theirs = socket.socketpair()
     asked: list[tuple[float, str]] = []
     clock = GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)
@@ -84,7 +89,9 @@ def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]], GuestClock]]:
     theirs.close()
 
 
-def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tuple[float, str]], GuestClock]):
+def test_a_level_is_held_however_late_it_came(
+    qtest: tuple[GuestLines, list[tuple[float, str]], GuestClock],
+):
     """A pulse of nothing becomes one of HOLD_NS, its edges in their order."""
     lines, asked, clock = qtest
     now_ns = clock.now_ns()
@@ -101,7 +108,9 @@ def test_a_level_is_held_however_late_it_came(qtest: tuple[GuestLines, list[tupl
 def test_a_line_that_the_box_drives_is_seen():
     """Messages of the test socket become levels and a log."""
     ours, theirs = socket.socketpair()
-    threading.Thread(target=lambda: (theirs.recv(99), theirs.sendall(b"OK\nIRQ raise 1\n")), daemon=True).start()
+    threading.Thread(
+        target=lambda: (theirs.recv(99), theirs.sendall(b"OK\nIRQ raise 1\n")), daemon=True
+    ).start()
     clock = GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)
     lines = GuestLines(Qtest(ours), clock, "/chip", ["START", "READY"])
     assert lines.wait("READY", True, 10)
@@ -111,9 +120,11 @@ def test_a_line_that_the_box_drives_is_seen():
 
 
 class BusyHost:
-    """A host's clock that goes on only in waits, and the counter of a guest that gets a part of its time.
+    """A host's clock that goes on only in waits, and the counter of a guest that gets a part of its
+    time.
 
-    share: of the host's time that becomes the guest's. ticks: the counter as the guest's hardware shows it.
+    share: of the host's time that becomes the guest's. ticks: the counter as the guest's hardware
+    shows it.
     """
 
     def __init__(self, share: float, at: int = 0) -> None:
@@ -134,7 +145,8 @@ class BusyHost:
 
 @pytest.mark.parametrize("share", [1.0, 0.1, 1.7])
 def test_a_wait_is_as_long_as_the_guest_s_time(share: float):
-    """A guest that gets a tenth of the host's time is waited for ten times as long; the counter's wrap is no jump."""
+    """A guest that gets a tenth of the host's time is waited for ten times as long; the counter's
+    wrap is no jump."""
     host = BusyHost(share, at=WRAP - HZ)
     clock = GuestClock(host.ticks, host)
     begun_ns = clock.now_ns()
@@ -148,7 +160,8 @@ def test_a_wait_is_as_long_as_the_guest_s_time(share: float):
 
 
 def test_a_board_keeps_pace_with_a_guest_that_is_starved():
-    """A robot and a board by the guest's clock: a busy host makes them slow, and no frame is late or lost."""
+    """A robot and a board by the guest's clock: a busy host makes them slow, and no frame is late
+    or lost."""
     host = BusyHost(0.05)
     clock = GuestClock(host.ticks, host)
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
@@ -185,7 +198,9 @@ class QemuEnd:
         self._socket.settimeout(10)
         self.peer = UsbRedirPeer(far, SystemClock())
         assert self.hear(12)[0] == HELLO
-        self._socket.sendall(struct.pack("<III", HELLO, 68, 0) + bytes(64) + struct.pack("<I", 1 << 5 | 1 << 6))
+        self._socket.sendall(
+            struct.pack("<III", HELLO, 68, 0) + bytes(64) + struct.pack("<I", 1 << 5 | 1 << 6)
+        )
 
     def hear(self, head: int = 16) -> tuple[int, int, bytes]:
         """The next message: kind, id, body."""
@@ -214,7 +229,8 @@ class QemuEnd:
 
 
 def test_a_reply_that_crosses_a_cancellation_comes_again():
-    """A reply that QEMU discards is not lost: the next transfer has the same frames, the one after it the next ones."""
+    """A reply that QEMU discards is not lost: the next transfer has the same frames, the one after
+    it the next ones."""
     guest = QemuEnd()
     clock = SystemClock()
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
@@ -235,21 +251,30 @@ def test_a_reply_that_crosses_a_cancellation_comes_again():
 
 @pytest.fixture
 def shell(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[shell_lines.Shell, socket.socket]]:
-    """A shell whose agent is the test, at the other end of a socket; it waits 0.2 s beyond a line's own time."""
+    """A shell whose agent is the test, at the other end of a socket; it waits 0.2 s beyond a line's
+    own time."""
     monkeypatch.setattr(shell_lines, "REPLY_S", 0.2)
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        yield shell_lines.Shell(ours, GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)), theirs
+        yield (
+            shell_lines.Shell(
+                ours, GuestClock(lambda: time.monotonic_ns() * HZ // 1_000_000_000 % WRAP)
+            ),
+            theirs,
+        )
 
 
 def agent_says(port: socket.socket, *lines: tuple[int, str]) -> None:
     """Answers as the guest's agent gives them, in the order of the lines."""
     for rc, out in lines:
-        port.sendall(json.dumps({"rc": rc, "out": base64.b64encode(out.encode()).decode()}).encode() + b"\n")
+        port.sendall(
+            json.dumps({"rc": rc, "out": base64.b64encode(out.encode()).decode()}).encode() + b"\n"
+        )
 
 
 def test_a_late_answer_is_not_the_next_line_s(shell: tuple[shell_lines.Shell, socket.socket]):
-    """A line that the guest answers too late fails; the next one gets its own answer, not that one."""
+    """A line that the guest answers too late fails; the next one gets its own answer, not that
+    one."""
     lines, port = shell
     with pytest.raises(shell_lines.GuestFailed, match="sent nothing for 0 s to: slow"):
         lines.run("slow", timeout_s=0)
@@ -260,7 +285,8 @@ def test_a_late_answer_is_not_the_next_line_s(shell: tuple[shell_lines.Shell, so
 
 
 def test_a_line_that_fails_is_told(shell: tuple[shell_lines.Shell, socket.socket]):
-    """With check, an exit code other than 0 and what the line said are in the error; a guest that has left is told."""
+    """With check, an exit code other than 0 and what the line said are in the error; a guest that
+    has left is told."""
     lines, port = shell
     agent_says(port, (2, "no such file"))
     with pytest.raises(shell_lines.GuestFailed, match="rc 2 of: ls\nno such file"):

@@ -1,4 +1,5 @@
-"""The measurement of a box with everything attached and attacked: its judgement, its shared line, its attackers."""
+"""The measurement of a box with everything attached and attacked: its judgement, its shared line,
+its attackers."""
 
 from __future__ import annotations
 
@@ -21,9 +22,16 @@ from tests.robots.shared_line import SharedLine
 from tests.robots.side_by_side import worse
 
 GOOD: dict[str, Any] = {
-    "frames_lost": 0, "sentences_dropped": 0, "faults": {}, "share": 0.05, "before_mib": 66.0, "most_mib": 66.5, "answers": 9,
-    "seconds": 30, **{f"{name}_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0} for name in ("edge", "latency", "way")},
-}  # fmt: skip
+    "frames_lost": 0,
+    "sentences_dropped": 0,
+    "faults": {},
+    "share": 0.05,
+    "before_mib": 66.0,
+    "most_mib": 66.5,
+    "answers": 9,
+    "seconds": 30,
+    **{f"{name}_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0} for name in ("edge", "latency", "way")},
+}
 
 
 def test_a_box_that_fared_alike_is_no_worse():
@@ -52,20 +60,31 @@ def test_what_is_worse_is_named(bad: dict[str, Any], said: str):
 
 def test_the_table_has_both_boxes_and_the_peers():
     """One row each; how many attacks there were, and what good peers got."""
-    peers = {"tcp": {"attempts": 1500, "answers of the bridge": 20}, "feed": {"attempts": 7, "hello": 8}}
+    peers = {
+        "tcp": {"attempts": 1500, "answers of the bridge": 20},
+        "feed": {"attempts": 7, "hello": 8},
+    }
     content = {"machine": "m", "real_time": True, "load": 1.0, "commit": "c" * 40, "peers": peers}
-    text = side_by_side.table(content | {"boxes": {"alone": deepcopy(GOOD), "attacked": GOOD | {"frames_lost": 3}}})
+    text = side_by_side.table(
+        content | {"boxes": {"alone": deepcopy(GOOD), "attacked": GOOD | {"frames_lost": 3}}}
+    )
     assert "| nothing attached | 0 | 9 | 1.0 / 2.0 / 3.0 ms |" in text
     assert "| page, TCP, Modbus and feed, all attacked | 3 | 9 |" in text
-    assert text.endswith("connections: tcp 1,500, feed 7. Meanwhile one good peer of each got answers: tcp 20.")
+    assert text.endswith(
+        "connections: tcp 1,500, feed 7. Meanwhile one good peer of each got answers: tcp 20."
+    )
 
 
 def test_the_shared_line_carries_both_ways():
-    """What the box says is noted and reaches the bridge's end; what that says reaches the box; nobody there is no fault."""
+    """What the box says is noted and reaches the bridge's end; what that says reaches the box;
+    nobody there is no fault."""
     shared = SharedLine()
     with pseudo_terminal.pair() as (far, near), pseudo_terminal.pair() as (here, there):
         shared._far, shared._bridge, shared.line = far, here, there
-        shared._box, shared._robot = SimpleNamespace(poll=lambda: None), SimpleNamespace(hear=lambda *_: None)
+        shared._box, shared._robot = (
+            SimpleNamespace(poll=lambda: None),
+            SimpleNamespace(hear=lambda *_: None),
+        )
         box, peer = (os.open(name, os.O_RDWR | os.O_NOCTTY) for name in (near, there))
         os.write(box, state())
         assert [line for _, line in shared.heard(LONG_S)] == [state().decode().strip()]
@@ -83,7 +102,8 @@ def test_the_shared_line_carries_both_ways():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tcp", "modbus"])
 def test_attackers_attack_and_the_good_one_is_served(kind: str, tmp_path: Path):
-    """Floods, noise, endless lines, a storm of connections: a good peer gets answers all the same, and the bridge goes on."""
+    """Floods, noise, endless lines, a storm of connections: a good peer gets answers all the same,
+    and the bridge goes on."""
     seen: Counter[str] = Counter()
     with SpeakingBox(tmp_path / "line") as box, bridge(kind, "--port", box.path) as address:
         acts = attackers.acts(kind, address, seen)

@@ -1,4 +1,5 @@
-"""The soak: what its judge finds in records with one thing wrong, how it goes on after an interruption, what it draws."""
+"""The soak: what its judge finds in records with one thing wrong, how it goes on after an
+interruption, what it draws."""
 
 from __future__ import annotations
 
@@ -31,8 +32,8 @@ from train.reports.plot_style import SCHEMES
 
 RATE = skin.FORMAT.rate_hz
 SILENT_CPU_S, SILENT_S = 30, 300
-"""A box that starts says its first sentence after a second or two of a processor's time. Of the clock's it may take any,
-but none in which it gets no processor at all."""
+"""A box that starts says its first sentence after a second or two of a processor's time. Of the
+clock's it may take any, but none in which it gets no processor at all."""
 LATEST_S = 60
 """The first answer comes after six seconds of the box's time."""
 UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
@@ -40,9 +41,11 @@ UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
 
 
 class FakeBox:
-    """A box without fault on a clock of its own: each call of `heard` takes its wait. change: what becomes of its lines.
+    """A box without fault on a clock of its own: each call of `heard` takes its wait. change: what
+    becomes of its lines.
 
-    dropped: frames that it has lost and never says so, a function of its time. runs: how often it was started.
+    dropped: frames that it has lost and never says so, a function of its time. runs: how often it
+    was started.
     """
 
     name = "this machine"
@@ -69,7 +72,9 @@ class FakeBox:
         lines = []
         while self.states < self.now_s - self.begun_s:
             frames = round(self.states * RATE) - self.dropped(self.states)
-            state = sentence("STA", self.states, "streaming", 0, self.said, frames, 0, 0, 1, 0, "b", "sim")
+            state = sentence(
+                "STA", self.states, "streaming", 0, self.said, frames, 0, 0, 1, 0, "b", "sim"
+            )
             lines += self.changed(self.begun_s + self.states, state)
             self.states += 1
         while self.edges(self.now_s)[1] > self.said:
@@ -81,7 +86,9 @@ class FakeBox:
         """The RES of the sweep that was said last."""
         label = alone if alone in skin.MATERIALS else ""
         status = status if label else "unknown"
-        return sentence("RES", self.said, 1, status, label, 0.9, 0.8, 1, 0, 1.25, "b", "sim", "1.00", "")
+        return sentence(
+            "RES", self.said, 1, status, label, 0.9, 0.8, 1, 0, 1.25, "b", "sim", "1.00", ""
+        )
 
     def changed(self, at_s: float, line: bytes) -> list[tuple[float, str]]:
         """A line with its time, after `change`."""
@@ -150,17 +157,27 @@ def clean() -> soak_judge.SoakRun:
 
 
 def test_a_box_without_fault_reaches_every_target(clean):
-    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three minutes is not judged."""
+    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three
+    minutes is not judged."""
     result = sums(clean)
     assert result["due"] == result["answers"] > 40
-    assert (result["cut"], result["unanswered"], result["faults"], result["unaccounted"], result["differs"]) == (
+    assert (
+        result["cut"],
+        result["unanswered"],
+        result["faults"],
+        result["unaccounted"],
+        result["differs"],
+    ) == (
         1,
         0,
         0,
         0,
         0,
     )
-    assert result["right"]["n"] + result["refused"]["n"] + result["wrong"]["n"] == result["answers"] - 1
+    assert (
+        result["right"]["n"] + result["refused"]["n"] + result["wrong"]["n"]
+        == result["answers"] - 1
+    )
     assert [met for *_, met in soak_judge.targets(result)] == [True] * 5 + [None, True]
     assert clean.ended == "time"
     assert clean.length_s >= 150
@@ -174,7 +191,8 @@ def test_a_missing_answer_is_found():
 
 
 def test_a_missed_start_edge_is_found():
-    """A box that never saw a start edge numbers on without a gap, and has one answer too few in the end."""
+    """A box that never saw a start edge numbers on without a gap, and has one answer too few in the
+    end."""
     box = FakeBox()
     run = soaked(box)
     del run.answers[-1]
@@ -192,14 +210,16 @@ def test_a_double_answer_is_found():
 
 @pytest.mark.parametrize("number", [16, 18, 40])
 def test_a_wrong_number_is_found(number):
-    """An answer with the number of another sweep, before or after, is noted, and its own sweep has none."""
+    """An answer with the number of another sweep, before or after, is noted, and its own sweep has
+    none."""
     result = sums(soaked(FakeBox(on(17, lambda line: [renumbered(line, number)]))))
     assert UNANSWERED in missed(result)
     assert ORDER in missed(result)
 
 
 def test_a_number_too_many_makes_no_answer_wrong(clean):
-    """Where a missed edge made two answers of one sweep, the later ones are held against what was touched then."""
+    """Where a missed edge made two answers of one sweep, the later ones are held against what was
+    touched then."""
 
     def ahead(line: str) -> list[str]:
         number = int(line.split(",")[2]) if ",RES," in line else 0
@@ -220,7 +240,10 @@ def test_an_answer_that_nobody_asked_for_is_found():
     [
         ("$PPLP,STA,1,streaming,0,0,9,0,0,1,0,b,sim*00", "broken"),
         ("$PPLP,RES,1", "broken"),
-        (sentence("STA", 9, "absent", 0, 0, 9, 0, 0, 1, 0, "b", "sim").decode().strip(), "the skin is absent"),
+        (
+            sentence("STA", 9, "absent", 0, 0, 9, 0, 0, 1, 0, "b", "sim").decode().strip(),
+            "the skin is absent",
+        ),
     ],
 )
 def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
@@ -231,7 +254,8 @@ def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
 
 @pytest.mark.slow
 def test_frames_that_nobody_counted_are_found():
-    """Fifty frames that are gone without a word; the same behind for a while and then made up for is no loss."""
+    """Fifty frames that are gone without a word; the same behind for a while and then made up for
+    is no loss."""
     box, late = FakeBox(), FakeBox()
     box.dropped = lambda s: 50 * (s > 70)
     late.dropped = lambda s: 50 * (30 < s < 80 or 115 < s < 135)
@@ -260,7 +284,9 @@ def test_wrong_verdicts_beyond_the_network_by_itself_are_found(clean):
     assert sums(refused)["differs"] > 0
 
 
-@pytest.mark.parametrize(("column", "target"), [("dropped", DROPPED), ("files", FILES), ("threads", FILES)])
+@pytest.mark.parametrize(
+    ("column", "target"), [("dropped", DROPPED), ("files", FILES), ("threads", FILES)]
+)
 def test_counters_that_grow_are_found(clean, column, target):
     """Dropped sentences, and files or threads that become more, each miss their own target."""
     run = copy.deepcopy(clean)
@@ -271,12 +297,16 @@ def test_counters_that_grow_are_found(clean, column, target):
 def samples(rss_kib: np.ndarray, began_s: float = 0.0) -> dict:
     """A run that has only memory, a sample each ten seconds."""
     return {
-        "samples": [[began_s + 10.0 * i, float(k), 0, 0.0, 8, 1, 1, 0, 0, 1, 0, 0.0] for i, k in enumerate(rss_kib)]
+        "samples": [
+            [began_s + 10.0 * i, float(k), 0, 0.0, 8, 1, 1, 0, 0, 1, 0, 0.0]
+            for i, k in enumerate(rss_kib)
+        ]
     }
 
 
 def test_growing_memory_is_found_and_steady_memory_is_not():
-    """An hour with 1 MiB an hour grows; the same noise without it is flat; the interval holds the truth."""
+    """An hour with 1 MiB an hour grows; the same noise without it is flat; the interval holds the
+    truth."""
     noise = np.random.default_rng(1).normal(0, 40, 360)
     hours = np.arange(360) / 360
     grown, flat = (soak_judge.slope([samples(70_000 + noise + kib * hours)]) for kib in (1024, 0))
@@ -286,7 +316,8 @@ def test_growing_memory_is_found_and_steady_memory_is_not():
 
 
 def test_the_interval_knows_that_neighbours_are_alike():
-    """Steps that stay for minutes widen the interval against noise as large that changes with each sample."""
+    """Steps that stay for minutes widen the interval against noise as large that changes with each
+    sample."""
     rng = np.random.default_rng(2)
     steps, noise = np.repeat(rng.normal(0, 40, 18), 20), rng.normal(0, 40, 360)
     wide, narrow = (soak_judge.slope([samples(70_000 + values)]) for values in (steps, noise))
@@ -294,10 +325,13 @@ def test_the_interval_knows_that_neighbours_are_alike():
 
 
 def test_runs_have_a_level_each_and_one_slope():
-    """A process that was started anew on another level is no growth; two that grow are; two samples decide nothing."""
+    """A process that was started anew on another level is no growth; two that grow are; two samples
+    decide nothing."""
     flat = [samples(np.full(120, 70_000.0)), samples(np.full(120, 75_000.0), 1200)]
     grown = [samples(70_000 + np.arange(120)), samples(60_000 + np.arange(120), 1200)]
-    assert soak_judge.slope(flat) | {"kib_h": 0.0, "low": 0.0, "high": 0.0} == soak_judge.slope(flat)
+    assert soak_judge.slope(flat) | {"kib_h": 0.0, "low": 0.0, "high": 0.0} == soak_judge.slope(
+        flat
+    )
     assert soak_judge.slope(grown)["kib_h"] == pytest.approx(360)
     assert soak_judge.slope([samples(np.full(2, 7.0))])["high"] is None
     assert soak_judge.slope([])["high"] is None
@@ -313,7 +347,8 @@ def test_memory_is_judged_once_the_second_half_is_long_enough(clean):
 
 
 def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
-    """After a minute without a word the run ends; what was recorded is saved, and the box closed."""
+    """After a minute without a word the run ends; what was recorded is saved, and the box
+    closed."""
     box, saved = FakeBox(), []
     box.mute_s = box.now_s + 40
     run = soak_judge.SoakRun(seed=1)
@@ -326,7 +361,8 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
 
 @pytest.mark.slow
 def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
-    """The first run is kept as it was, a second one takes what is left with the next seed, a third has nothing to do."""
+    """The first run is kept as it was, a second one takes what is left with the next seed, a third
+    has nothing to do."""
     box, lines = FakeBox(), []
     settings = {"log": lines.append}
     path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **settings)
@@ -346,7 +382,8 @@ def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
 
 
 def test_a_soak_that_is_killed_leaves_a_whole_record():
-    """At any moment the sweeps that are due have their answers, though the run has not ended and one may be open."""
+    """At any moment the sweeps that are due have their answers, though the run has not ended and
+    one may be open."""
     box, run = FakeBox(), soak_judge.SoakRun(seed=1)
     recorder = soak.Recorder(box, run, Script(1))
     recorder.start()
@@ -367,10 +404,12 @@ def test_another_seed_begins_anew(tmp_path):
 
 
 def test_soaks_side_by_side_are_joined(tmp_path):
-    """Runs follow each other in time, each with its own counters; what went wrong in either counts."""
+    """Runs follow each other in time, each with its own counters; what went wrong in either
+    counts."""
     settings = {"log": lambda line: None}
     first, second = (
-        json.loads(soak.soak(FakeBox(), seed, 0.05, tmp_path / str(seed), **settings).read_text()) for seed in (7, 8)
+        json.loads(soak.soak(FakeBox(), seed, 0.05, tmp_path / str(seed), **settings).read_text())
+        for seed in (7, 8)
     )
     second["runs"][0]["faults"].append([12.0, "made up"])
     both = soak.joined([first, second])
@@ -380,7 +419,9 @@ def test_soaks_side_by_side_are_joined(tmp_path):
     assert moved["began_s"] == later_s
     assert moved["faults"] == [[round(12.0 + later_s, 2), "made up"]]
     for rows in ("answers", "samples"):
-        assert [row[0] for row in moved[rows]] == [round(row[0] + later_s, 2) for row in second["runs"][0][rows]]
+        assert [row[0] for row in moved[rows]] == [
+            round(row[0] + later_s, 2) for row in second["runs"][0][rows]
+        ]
     joined, alone = soak_judge.sums(both), [soak_judge.sums(record) for record in (first, second)]
     for name in ("hours", "due", "answers", "received", "faults"):
         assert joined[name] == pytest.approx(sum(one[name] for one in alone))
@@ -389,7 +430,10 @@ def test_soaks_side_by_side_are_joined(tmp_path):
 
 @pytest.mark.parametrize(
     ("other", "message"),
-    [({"commit": "b" * 12}, "commit is 'bbbbbbbbbbbb' in one record"), ({}, "two runs have the seed 7")],
+    [
+        ({"commit": "b" * 12}, "commit is 'bbbbbbbbbbbb' in one record"),
+        ({}, "two runs have the seed 7"),
+    ],
 )
 def test_soaks_that_do_not_belong_together_are_not_joined(tmp_path, other, message):
     """Of other code, or the same sweeps twice."""
@@ -412,29 +456,40 @@ def test_drawing_names_what_does_not_belong_together(tmp_path, monkeypatch, caps
 
 
 def test_edges_and_frames_are_reckoned_from_the_first_sentences():
-    """The first answer fixes the script, the first counted frames the board; before, nothing has happened."""
+    """The first answer fixes the script, the first counted frames the board; before, nothing has
+    happened."""
     sweeps = Script(1)
     robot = Reckoned(sweeps)
     assert robot.edges(1e9) == (0, 0)
     begun_s = 1000.0
     at = [begun_s + sweeps[k].stop / RATE for k in (1, 2)]
-    robot.hear(begun_s + 1, sentence("STA", 1, "streaming", 0, 0, 750, 0, 0, 1, 0, "b", "sim").decode())
-    robot.hear(at[0], sentence("RES", 1, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+    robot.hear(
+        begun_s + 1, sentence("STA", 1, "streaming", 0, 0, 750, 0, 0, 1, 0, "b", "sim").decode()
+    )
+    robot.hear(
+        at[0], sentence("RES", 1, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode()
+    )
     assert robot.edges(at[1] - 0.1) == (2, 1)
     assert robot.edges(at[1] + 0.1) == (2, 2)
     assert robot.taken(begun_s + 3) == pytest.approx(2250)
 
 
 def test_a_slow_first_answer_does_not_move_the_others():
-    """Each answer is judged by its own sweep when later ones come quicker; one with a wrong number moves nothing."""
+    """Each answer is judged by its own sweep when later ones come quicker; one with a wrong number
+    moves nothing."""
     sweeps, begun_s = Script(1), 1000.0
     robot = Reckoned(sweeps)
     for k, late_s in ((1, 0.12), (2, 0.03), (3, 0.001), (4, 0.02)):
         at_s = begun_s + sweeps[k].stop / RATE + late_s
-        robot.hear(at_s, sentence("RES", k, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+        robot.hear(
+            at_s,
+            sentence("RES", k, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode(),
+        )
         assert robot.edges(at_s)[1] == k
     at_s = begun_s + sweeps[5].stop / RATE
-    robot.hear(at_s, sentence("RES", 7, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode())
+    robot.hear(
+        at_s, sentence("RES", 7, 1, "ok", "wood", 1, 1, 1, 0, 1, "b", "sim", "1.00", "").decode()
+    )
     assert robot.edges(at_s + 0.01)[1] == 5
 
 
@@ -442,25 +497,34 @@ def test_the_script_tells_what_is_touched_and_what_the_network_says():
     """Labels and edges are those of the simulator's acts; the network by itself is mostly right."""
     sweeps, acts = Script(3), list(script.tubes(3, 12))
     assert [sweeps[k].label for k in range(1, 13)] == [act.label for act in acts]
-    assert [sweeps[k + 1].stop - sweeps[k + 1].start for k in range(12)] == [act.stop - act.start for act in acts]
+    assert [sweeps[k + 1].stop - sweeps[k + 1].start for k in range(12)] == [
+        act.stop - act.start for act in acts
+    ]
     assert sweeps[2].start == len(acts[0].frames) + acts[1].start
     assert sum(sweeps[k].alone == sweeps[k].label for k in range(1, 13)) >= 8
 
 
 @pytest.mark.slow
 def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
-    """Of twenty sweeps one act and no written line are held; the script has ended, and its end is known all the same."""
+    """Of twenty sweeps one act and no written line are held; the script has ended, and its end is
+    known all the same."""
     sim = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
     with ExitStack() as stack:
         settings = config.load(None, [], site=NO_SITE)
         box = assembly.box(settings, bundle.load(bundle.DEFAULT), sim, StdoutPort("sim"), stack)
         while not sim.finished(box.answered):
             box.step()
-    assert (sim.robot.acts, box.answered, len(sim.robot.played), len(sim.gpio.written)) == (20, 20, 1, 0)
+    assert (sim.robot.acts, box.answered, len(sim.robot.played), len(sim.gpio.written)) == (
+        20,
+        20,
+        1,
+        0,
+    )
 
 
 def test_a_process_is_read_from_proc():
-    """RSS and PSS in KiB, processor seconds, files and threads, also where the program's name has brackets and spaces."""
+    """RSS and PSS in KiB, processor seconds, files and threads, also where the program's name has
+    brackets and spaces."""
     stat = "12 (palpate (x) y) S " + " ".join(map(str, [*range(4, 14), 250, 50, 0, 0, 20, 0, 3, 0]))
     assert process("55 [rollup]\nRss:   70540 kB\nPss:  64586 kB\nPss_Dirty:  9 kB\n", stat, 8) == (
         70540,
@@ -472,13 +536,18 @@ def test_a_process_is_read_from_proc():
 
 
 def heard(box: ThisMachine) -> list[tuple[float, str]]:
-    """What a box says next. Raises AssertionError where it says nothing, although it has used a processor for SILENT_CPU_S or
-    done nothing at all for SILENT_S: however busy this machine is, a box that gets on is waited for."""
+    """What a box says next. Raises AssertionError where it says nothing, although it has used a
+    processor for SILENT_CPU_S or done nothing at all for SILENT_S: however busy this machine is, a
+    box that gets on is waited for."""
     begun_s, begun_cpu_s = time.monotonic(), box.process()[2]
     while not (lines := box.heard(0.2)):
         used_s = box.process()[2] - begun_cpu_s
-        assert used_s < SILENT_CPU_S, f"the box has said nothing in {used_s:.1f} s of processor time"
-        assert used_s or time.monotonic() - begun_s < SILENT_S, f"the box has done nothing for {SILENT_S} s"
+        assert used_s < SILENT_CPU_S, (
+            f"the box has said nothing in {used_s:.1f} s of processor time"
+        )
+        assert used_s or time.monotonic() - begun_s < SILENT_S, (
+            f"the box has done nothing for {SILENT_S} s"
+        )
     return lines
 
 
@@ -488,7 +557,8 @@ def states(lines: list[tuple[float, str]]) -> int:
 
 
 class Mute(FakeBox):
-    """A box that says nothing before look number `from_look`, and uses so much of a processor between two looks."""
+    """A box that says nothing before look number `from_look`, and uses so much of a processor
+    between two looks."""
 
     def __init__(self, step_s: float, from_look: int) -> None:
         super().__init__()
@@ -506,8 +576,9 @@ class Mute(FakeBox):
 
 
 def test_a_box_that_gets_on_is_waited_for_and_no_other(monkeypatch: pytest.MonkeyPatch):
-    """By processor time: one that uses much and says nothing has failed, as has one that gets none for minutes; one that
-    gets a little each time is waited for, however long that takes by the clock."""
+    """By processor time: one that uses much and says nothing has failed, as has one that gets none
+    for minutes; one that gets a little each time is waited for, however long that takes by the
+    clock."""
     monkeypatch.setattr(sys.modules[__name__], "SILENT_S", 0.0)
     assert heard(Mute(SILENT_CPU_S / 1000, 500)) == [(0.0, "there")]
     with pytest.raises(AssertionError, match=f"said nothing in {SILENT_CPU_S}"):
@@ -518,13 +589,16 @@ def test_a_box_that_gets_on_is_waited_for_and_no_other(monkeypatch: pytest.Monke
 
 @pytest.mark.slow
 def test_this_machine_sweeps_answers_and_ends():
-    """The installed command on a pseudo-terminal: an answer, a look at its process, and an orderly end."""
+    """The installed command on a pseudo-terminal: an answer, a look at its process, and an orderly
+    end."""
     box, sweeps, lines = ThisMachine(), Script(1), []
     try:
         box.start(1, sweeps)
         while not any(Answer.read(line) for _, line in lines):
             lines += heard(box)
-            assert states(lines) < LATEST_S, f"no answer in {LATEST_S} s of the box's time: {lines[-5:]}"
+            assert states(lines) < LATEST_S, (
+                f"no answer in {LATEST_S} s of the box's time: {lines[-5:]}"
+            )
         rss_kib, pss_kib, cpu_s, files, threads = box.process()
         assert 20_000 < rss_kib < 500_000
         assert 0 < pss_kib <= rss_kib
@@ -545,31 +619,57 @@ def result(clean) -> dict:
     """Results of two boxes, the second interrupted and with a fault, a third left out."""
     run, other = soak.asdict(clean), soak.asdict(copy.deepcopy(clean))
     other["faults"] = [[3.0, "answer 7 came again"]]
-    about = {"what": "a made-up box", "machine": "none", "versions": {"python": "3"}, "commit": "abc", "seed": 1,
-             "format": "4x4", "started": "2026-01-01T00:00:00+00:00"}  # fmt: skip
-    boxes = {
-        name: about | {"box": name, "runs": runs} for name, runs in (("this machine", [run]), ("virtual box", [other]))
+    about = {
+        "what": "a made-up box",
+        "machine": "none",
+        "versions": {"python": "3"},
+        "commit": "abc",
+        "seed": 1,
+        "format": "4x4",
+        "started": "2026-01-01T00:00:00+00:00",
     }
-    return {"left_out": {"third box": "it was not there"},
-            "boxes": {name: box | {"sums": soak_judge.sums(box)} for name, box in boxes.items()}}  # fmt: skip
+    boxes = {
+        name: about | {"box": name, "runs": runs}
+        for name, runs in (("this machine", [run]), ("virtual box", [other]))
+    }
+    return {
+        "left_out": {"third box": "it was not there"},
+        "boxes": {name: box | {"sums": soak_judge.sums(box)} for name, box in boxes.items()},
+    }
 
 
 def test_the_page_needs_nothing_else_and_tells_all(result):
-    """Both boxes, every target, the fault and what was left out; no address, no script; the picture is sound XML."""
+    """Both boxes, every target, the fault and what was left out; no address, no script; the picture
+    is sound XML."""
     html, svg = soak_page.render(result)
-    assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {"svg", "title", "path", "text"}
+    assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {
+        "svg",
+        "title",
+        "path",
+        "text",
+    }
     assert not re.search(
-        r"<script(?! type=\"application/json\")|<link|<img|@import|url\((?!#)|href=\"(?!#|\.\./)", html
+        r"<script(?! type=\"application/json\")|<link|<img|@import|url\((?!#)|href=\"(?!#|\.\./)",
+        html,
     )
-    for text in ("this machine", "virtual box", "third box; it was not there", "answer 7 came again", "missed",
-                 "growth of memory", "too short to judge", "abc"):  # fmt: skip
+    for text in (
+        "this machine",
+        "virtual box",
+        "third box; it was not there",
+        "answer 7 came again",
+        "missed",
+        "growth of memory",
+        "too short to judge",
+        "abc",
+    ):
         assert text in html, text
     assert svg.replace(SCHEMES, "") in html
     assert len(svg) < 60_000
     text = PageReader(html).text
     assert re.search(r"This machine: \d of 7 targets reached\.", text)
     assert re.search(
-        r"The virtual box: \d of 7 targets reached; missed: sentences out of order, broken or missing, 1", text
+        r"The virtual box: \d of 7 targets reached; missed: sentences out of order, broken or missing, 1",
+        text,
     )
 
 
@@ -586,7 +686,9 @@ def test_a_day_of_sweeps_stays_a_small_picture(result):
 
 def test_records_are_written_a_row_a_line_and_read_again(tmp_path):
     """What is written reads back the same, and a text with brackets is left alone."""
-    content = {"runs": [{"samples": [[1.5, "a, b", None], [2, "[ c ]", 0]], "empty": [], "n": {"x": 1}}]}
+    content = {
+        "runs": [{"samples": [[1.5, "a, b", None], [2, "[ c ]", 0]], "empty": [], "n": {"x": 1}}]
+    }
     soak.write(tmp_path / "sub" / "x.json", content)
     text = (tmp_path / "sub" / "x.json").read_text()
     assert json.loads(text) == content
@@ -594,9 +696,19 @@ def test_records_are_written_a_row_a_line_and_read_again(tmp_path):
 
 
 def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
-    """The whole command's end: page, picture and results are there; it fails for one missed target, and names it."""
-    record = {"box": "this machine", "what": "", "machine": "", "versions": {}, "commit": "c", "seed": 1, "format": "f",
-              "started": "now", "runs": [soak.asdict(clean)]}  # fmt: skip
+    """The whole command's end: page, picture and results are there; it fails for one missed target,
+    and names it."""
+    record = {
+        "box": "this machine",
+        "what": "",
+        "machine": "",
+        "versions": {},
+        "commit": "c",
+        "seed": 1,
+        "format": "f",
+        "started": "now",
+        "runs": [soak.asdict(clean)],
+    }
     soak.write(tmp_path / "this-machine.json", record)
     assert soak.draw([tmp_path], tmp_path / "page")
     first = (tmp_path / "page" / "index.html").read_text()
@@ -604,11 +716,18 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
     assert soak.draw([tmp_path / "no records"], tmp_path / "page")
     assert (tmp_path / "page" / "index.html").read_text() == first
     soak.write(tmp_path / "other" / "virtual-box.json", record | {"box": "virtual box"})
-    assert soak.draw([tmp_path / "other"], tmp_path / "page")  # the box that was not recorded again stays
+    assert soak.draw(
+        [tmp_path / "other"], tmp_path / "page"
+    )  # the box that was not recorded again stays
     kept = json.loads((tmp_path / "page" / "results.json").read_text())
     assert list(kept["boxes"]) == ["this machine", "virtual box"]
     record["runs"][0]["due"] += 1
     soak.write(tmp_path / "this-machine.json", record)
     assert not soak.draw([tmp_path], tmp_path / "page")
     assert "FAIL this machine  sweeps without an answer: 1" in capsys.readouterr().out
-    assert {p.name for p in (tmp_path / "page").iterdir()} == {"index.html", "README.md", "soak.svg", "results.json"}
+    assert {p.name for p in (tmp_path / "page").iterdir()} == {
+        "index.html",
+        "README.md",
+        "soak.svg",
+        "results.json",
+    }

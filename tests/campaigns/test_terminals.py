@@ -1,4 +1,5 @@
-"""Helpers of tests on terminals: whatever a program does, a wait for it ends, and says what was shown."""
+"""Helpers of tests on terminals: whatever a program does, a wait for it ends, and says what was
+shown."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from tests.factories import terminals
 
 
 @pytest.mark.parametrize(
-    "does", ["time.sleep(600)", "[print('again', flush=True) or time.sleep(.01) for _ in range(60000)]"]
+    "does",
+    ["time.sleep(600)", "[print('again', flush=True) or time.sleep(.01) for _ in range(60000)]"],
 )
 def test_a_program_that_hangs_fails_the_test_with_what_it_has_shown(does: str):
     """One that falls silent, and one that shows the same for ever; neither outlives the wait."""
@@ -21,14 +23,18 @@ def test_a_program_that_hangs_fails_the_test_with_what_it_has_shown(does: str):
     with subprocess.Popen([sys.executable, "-c", code], stdout=near) as run:
         os.close(near)
         shown = terminals.read(far, run, lambda shown: b"begun" in shown)
-        with pytest.raises(AssertionError, match=r"did not end within 0\.2 s; it has shown b'begun"):
+        with pytest.raises(
+            AssertionError, match=r"did not end within 0\.2 s; it has shown b'begun"
+        ):
             terminals.ended(run, shown, 0.2)
     assert run.returncode == -9
     os.close(far)
     far, near = os.openpty()
     with subprocess.Popen([sys.executable, "-c", code], stdout=near) as run:
         os.close(near)
-        with pytest.raises(AssertionError, match=r"not done within 2 s; it has shown b'.*(begun|again)"):
+        with pytest.raises(
+            AssertionError, match=r"not done within 2 s; it has shown b'.*(begun|again)"
+        ):
             terminals.read(far, run, limit_s=2)
     assert run.returncode == -9
     os.close(far)

@@ -1,7 +1,9 @@
-"""Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`. In: scenes by name. Out: a line for each command,
-and in build/cuts.jsonl one for each crash point, with the machine and the commit.
+"""Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`. In: scenes by name.
+Out: a line for each command, and in build/cuts.jsonl one for each crash point, with the machine and
+the commit.
 
-An interrupted run is continued as long as neither the box nor the scenes have changed. Exit code 1 if anything is wrong.
+An interrupted run is continued as long as neither the box nor the scenes have changed. Exit code 1
+if anything is wrong.
 """
 
 from __future__ import annotations
@@ -34,11 +36,19 @@ HOWS = ("kill", "power", "kill_then_power")
 
 def main() -> int:
     """Cut the named scenes, or all."""
-    parser = argparse.ArgumentParser(prog="python -m tests.cuts", description=__doc__.split("\n\n")[0])
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"from {', '.join(SCENES)}; all by default")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "cuts.jsonl", help="points (%(default)s)")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.cuts", description=__doc__.split("\n\n")[0]
+    )
     parser.add_argument(
-        "--twice", action="store_true", help="also kill each command and start it again, and then cut the power (hours)"
+        "scenes", nargs="*", metavar="SCENE", help=f"from {', '.join(SCENES)}; all by default"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "build" / "cuts.jsonl", help="points (%(default)s)"
+    )
+    parser.add_argument(
+        "--twice",
+        action="store_true",
+        help="also kill each command and start it again, and then cut the power (hours)",
     )
     given = parser.parse_args()
     if wrong := set(given.scenes) - set(SCENES):
@@ -51,19 +61,25 @@ def main() -> int:
             for point in cut(SCENES[name](Path(beside)), ledger, HOWS if given.twice else HOWS[:2]):
                 print(".", end="", flush=True)
                 for wrong in point.wrong:
-                    print(f"\n{point.scene}: {point.step}: {point.how} before {point.call}: {wrong}", flush=True)
+                    print(
+                        f"\n{point.scene}: {point.step}: {point.how} before {point.call}: {wrong}",
+                        flush=True,
+                    )
     print("", *figures(ledger.points()), sep="\n")
     return 1 if any(point.wrong for point in ledger.points()) else 0
 
 
 class CrashPointLog:
-    """Points by their moments; one line of a file each, under a first line that says what was cut, where."""
+    """Points by their moments; one line of a file each, under a first line that says what was cut,
+    where."""
 
     def __init__(self, path: Path) -> None:
         self._path, head = path, json.dumps(_head())
         path.parent.mkdir(parents=True, exist_ok=True)
         first, *lines = path.read_text().splitlines() if path.exists() else [""]
-        lines = [line for line in lines if first == head and line.endswith("}")]  # the last one may be cut off
+        lines = [
+            line for line in lines if first == head and line.endswith("}")
+        ]  # the last one may be cut off
         path.write_text("".join(f"{line}\n" for line in (head, *lines)))
         self._points = [_point(json.loads(line)) for line in lines]
 
@@ -87,15 +103,22 @@ def _head() -> dict[str, str]:
     git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     sources = (tree.read(ROOT / folder) for folder in ("appliance", "tests/cuts"))
-    digests = [tree.digest({name: held for name, held in s.items() if "__pycache__" not in name}) for s in sources]
+    digests = [
+        tree.digest({name: held for name, held in s.items() if "__pycache__" not in name})
+        for s in sources
+    ]
     return {
-        "commit": commit, "source": "".join(d[:16] for d in digests), "kernel": platform.platform(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "python": platform.python_version(),
-    }  # fmt: skip
+        "commit": commit,
+        "source": "".join(d[:16] for d in digests),
+        "kernel": platform.platform(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+    }
 
 
 def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
-    """All points of a scene that are not in the ledger yet, cut in these ways; each is written down."""
+    """All points of a scene that are not in the ledger yet, cut in these ways; each is written
+    down."""
     done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
     with stage() as work:
         play = ScenePlay(scene, Path(work))
@@ -118,8 +141,13 @@ def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
         for how in HOWS:
             if not (of_it := [point for point in steps[name] if point.how == how]):
                 continue
-            states, wrong = sum(point.states for point in of_it), sum(bool(point.wrong) for point in of_it)
-            reported.append(f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}")
+            states, wrong = (
+                sum(point.states for point in of_it),
+                sum(bool(point.wrong) for point in of_it),
+            )
+            reported.append(
+                f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}"
+            )
         yield f"{name}: {'; '.join(reported)}"
 
 

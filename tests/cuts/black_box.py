@@ -1,7 +1,8 @@
-"""The black box, cut short. In: a program that keeps the last sweeps in service. Out: a scene, whose judge finds what is
-lost of these beyond the sweep in progress.
+"""The black box, cut short. In: a program that keeps the last sweeps in service. Out: a scene,
+whose judge finds what is lost of these beyond the sweep in progress.
 
-`python -m tests.cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each sweep when it is kept.
+`python -m tests.cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each
+sweep when it is kept.
 """
 
 from __future__ import annotations
@@ -59,7 +60,10 @@ def scene() -> CutScene:
     """Two runs that keep sweeps, the second one in what the first has left."""
 
     def step(name: str) -> SceneStep:
-        return SceneStep(name, lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT])
+        return SceneStep(
+            name,
+            lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT],
+        )
 
     return CutScene("black-box", lambda folder: None, (step("first"), step("second")), judge)
 

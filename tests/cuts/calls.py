@@ -1,9 +1,9 @@
-"""The system calls of a command, in their order, seen by strace; and the command killed at one of them. In: a command.
-Out: the calls with their paths and data, and how it ended.
+"""The system calls of a command, in their order, seen by strace; and the command killed at one of
+them. In: a command. Out: the calls with their paths and data, and how it ended.
 
-strace delivers the SIGKILL on entry, and Linux does not carry out a call that a killed process has only entered: so a
-kill at call k leaves the disk as it is after call k-1 and before call k. (strace 6.1 delivers no signal where its seccomp
-filter is in use, so killed runs do without it.)
+strace delivers the SIGKILL on entry, and Linux does not carry out a call that a killed process has
+only entered: so a kill at call k leaves the disk as it is after call k-1 and before call k. (strace
+6.1 delivers no signal where its seccomp filter is in use, so killed runs do without it.)
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class NotFollowed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SystemCall:
-    """One system call. nth: which one of its name in its process, from 1, as strace counts. paths: what it is about,
-    absolute. data: what it writes, or where a symlink leads. words: its arguments as strace shows them. result: None
-    where the process was killed in it.
+    """One system call. nth: which one of its name in its process, from 1, as strace counts. paths:
+    what it is about, absolute. data: what it writes, or where a symlink leads. words: its arguments
+    as strace shows them. result: None where the process was killed in it.
     """
 
     process: int
@@ -60,7 +60,8 @@ class SystemCall:
 
 @dataclass(frozen=True, slots=True)
 class TracedRun:
-    """How a command went: its calls, all that it wrote to standard output and standard error, its exit code."""
+    """How a command went: its calls, all that it wrote to standard output and standard error, its
+    exit code."""
 
     calls: tuple[SystemCall, ...]
     output: str
@@ -72,11 +73,18 @@ def lacking() -> str:
     if not shutil.which("strace"):
         return "strace (apt-get install strace)"
     tried = subprocess.run(["strace", "-o", os.devnull, "true"], capture_output=True, check=False)
-    return "" if tried.returncode == 0 else "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
+    return (
+        ""
+        if tried.returncode == 0
+        else "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
+    )
 
 
 def run(
-    command: Sequence[str | Path], log: Path, at: SystemCall | None = None, env: dict[str, str] | None = None
+    command: Sequence[str | Path],
+    log: Path,
+    at: SystemCall | None = None,
+    env: dict[str, str] | None = None,
 ) -> TracedRun:
     """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
 
@@ -84,25 +92,55 @@ def run(
     """
     how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
     done = subprocess.run(
-        ["strace", "-f", "-y", "-xx", "-s", str(MOST_BYTES), "-e", "signal=none", "-e", f"trace=/^({WATCHED})",
-         *how, "-o", log, *command],
-        cwd=log.parent, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"} | (env or {}),
-        stdin=subprocess.DEVNULL, capture_output=True, timeout=DEADLINE_S, check=False,
-    )  # fmt: skip
+        [
+            "strace",
+            "-f",
+            "-y",
+            "-xx",
+            "-s",
+            str(MOST_BYTES),
+            "-e",
+            "signal=none",
+            "-e",
+            f"trace=/^({WATCHED})",
+            *how,
+            "-o",
+            log,
+            *command,
+        ],
+        cwd=log.parent,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"} | (env or {}),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
-    if at and not any(c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth) for c in calls):
-        raise NotFollowed(f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}")
+    if at and not any(
+        c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth)
+        for c in calls
+    ):
+        raise NotFollowed(
+            f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}"
+        )
     return TracedRun(calls, "".join(map(output, calls)), done.returncode)
 
 
 def output(call: SystemCall) -> str:
-    """What the command writes to standard output or standard error by this call; its children do not count."""
-    heard = call.process == 0 and call.name in ("write", "writev") and call.descriptor in (1, 2) and call.result
+    """What the command writes to standard output or standard error by this call; its children do
+    not count."""
+    heard = (
+        call.process == 0
+        and call.name in ("write", "writev")
+        and call.descriptor in (1, 2)
+        and call.result
+    )
     return call.data[: call.result].decode("utf-8", "replace") if heard else ""
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
-    """The calls in the order in which they ended; last those that did not, since the process was killed in them."""
+    """The calls in the order in which they ended; last those that did not, since the process was
+    killed in them."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
     for line in _joined(lines):
@@ -113,7 +151,15 @@ def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
         counts[process, name] += 1
         rank = ranks.setdefault(process, len(ranks))
         paths, data = _arguments(name, words, folder)
-        yield SystemCall(rank, name, counts[process, name], paths, data, words, None if result == "?" else int(result))
+        yield SystemCall(
+            rank,
+            name,
+            counts[process, name],
+            paths,
+            data,
+            words,
+            None if result == "?" else int(result),
+        )
 
 
 def _joined(lines: list[str]) -> Iterator[str]:
@@ -130,7 +176,8 @@ def _joined(lines: list[str]) -> Iterator[str]:
 
 
 def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], bytes]:
-    """Paths and data among the arguments of a call: a path is relative to the descriptor before it, or to `folder`."""
+    """Paths and data among the arguments of a call: a path is relative to the descriptor before it,
+    or to `folder`."""
     paths: list[str] = []
     data, base = b"", folder
     of_data = name.startswith(("write", "pwrite"))
@@ -145,7 +192,11 @@ def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], byt
         elif of_data or (name.startswith("symlink") and not data):
             data += _bytes(match[1])
         else:
-            paths.append(os.path.normpath(os.path.join(base, _bytes(match[1]).decode("utf-8", "surrogateescape"))))
+            paths.append(
+                os.path.normpath(
+                    os.path.join(base, _bytes(match[1]).decode("utf-8", "surrogateescape"))
+                )
+            )
             base = folder
     return tuple(paths), data
 

@@ -1,8 +1,9 @@
-"""Delivery and enrolment, cut short. In: signed bundles that are copied to the box, taken, started, committed and left again,
-and labels that it learns. Out: scenes, whose judge finds each box that does not come back with the old bundle or the new one,
-whole.
+"""Delivery and enrolment, cut short. In: signed bundles that are copied to the box, taken, started,
+committed and left again, and labels that it learns. Out: scenes, whose judge finds each box that
+does not come back with the old bundle or the new one, whole.
 
-`python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is wrong on purpose.
+`python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is
+wrong on purpose.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ STORE, INCOMING = "store", "store/incoming"
 ENROLMENT = "enrolment"
 """Folder of the key of the box, beside the shop's bundles."""
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
-"""What is copied, until it is installed, and what is in the folders that are not complete: nobody reads that."""
+"""What is copied, until it is installed, and what is in the folders that are not complete: nobody
+reads that."""
 PROBATION = 2
 """Sweeps."""
 ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6}([0-9a-f]{8}),")
@@ -58,13 +60,14 @@ import shutil, sys; from pathlib import Path; old, new = map(Path, sys.argv[1:])
 shutil.rmtree(new, ignore_errors=True); new.mkdir()
 for path in sorted(old.iterdir()): (new / path.name).write_bytes(path.read_bytes())
 """
-"""Somebody's program that copies a bundle to the box, in place of what an earlier attempt left; it syncs nothing."""
+"""Somebody's program that copies a bundle to the box, in place of what an earlier attempt left; it
+syncs nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shop:
-    """What the box gets, in a folder beside it: bundles of these NAMES, one counter higher each, signed by one key. There lies
-    its own key for enrolments, too."""
+    """What the box gets, in a folder beside it: bundles of these NAMES, one counter higher each,
+    signed by one key. There lies its own key for enrolments, too."""
 
     folder: Path
 
@@ -77,7 +80,9 @@ class Shop:
         enrolment_key(folder / ENROLMENT)
         for counter, name in enumerate(NAMES[1:], 1):
             shutil.copytree(bundle.DEFAULT, folder / name)
-            manifest = replace(bundle.load(folder / name).manifest, name=name, counter=counter, schema=SCHEMA).json()
+            manifest = replace(
+                bundle.load(folder / name).manifest, name=name, counter=counter, schema=SCHEMA
+            ).json()
             (folder / name / bundle.MANIFEST).write_bytes(manifest)
             (folder / name / bundle.SIGNATURE).write_bytes(signature.sign(manifest, key))
         return cls(folder)
@@ -90,14 +95,21 @@ class Shop:
         """A command of the box in `folder`. @: where bundles are copied to."""
         output = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
         where = f"store.folder={folder / STORE}", f"store.signers={self.folder / 'signers'}"
-        how = "store.status=", f"store.trial_sweeps={PROBATION}", f"store.enrolment_key={self.folder / ENROLMENT}"
+        how = (
+            "store.status=",
+            f"store.trial_sweeps={PROBATION}",
+            f"store.enrolment_key={self.folder / ENROLMENT}",
+        )
         return output + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
-        """A command of the box, in one of WAYS or as it is. code: how it ends, if not as its way does."""
+        """A command of the box, in one of WAYS or as it is. code: how it ends, if not as its way
+        does."""
         program = ["tests.cuts.delivery", way] if way else ["appliance"]
         ends = code if code is not None else DIED if way == "crash" else 0
-        return SceneStep(name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], ends)
+        return SceneStep(
+            name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], ends
+        )
 
     def copy(self, name: str) -> SceneStep:
         """Somebody copies a bundle to the box."""
@@ -105,7 +117,8 @@ class Shop:
         return SceneStep(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
     def steps(self) -> Iterator[tuple[str, SceneStep]]:
-        """What happens to a box; before each command, which bundles may run if that is cut short."""
+        """What happens to a box; before each command, which bundles may run if that is cut
+        short."""
         do = self.palpate
         yield "packaged", self.copy("first")
         yield "packaged first", do("install the first ever", "install", "@first")
@@ -137,13 +150,23 @@ class Shop:
         return self._scene("delivery", _bare, list(self.steps()))
 
     def enrolment(self) -> CutScene:
-        """A box that runs the first bundle learns LABELS, one after the other, gives one up, and gets another bundle; each
-        command is cut short."""
+        """A box that runs the first bundle learns LABELS, one after the other, gives one up, and
+        gets another bundle; each command is cut short."""
         return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
 
     def enrols(self, label: str, way: str = "right", name: str = "") -> SceneStep:
         """The box learns a label from a sweep of the simulated skin, and signs it."""
-        words = ("enrol", label, "--sweeps", "1", "--sim", "skin", "--virtual", "--seed", str(LABELS.index(label) + 1))
+        words = (
+            "enrol",
+            label,
+            "--sweeps",
+            "1",
+            "--sim",
+            "skin",
+            "--virtual",
+            "--seed",
+            str(LABELS.index(label) + 1),
+        )
         return self.palpate(name or f"enrol {label}", *words, way=way, code=0)
 
     def learns(self, way: str) -> CutScene:
@@ -167,15 +190,24 @@ class Shop:
         yield "felt second", do("install another", "install", "@second")
 
     def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
-        """The id that the bundle has with each of the labels: the same sweeps give the same bytes."""
+        """The id that the bundle has with each of the labels: the same sweeps give the same
+        bytes."""
         with TemporaryDirectory() as aside:
             self._delivered(folder := Path(aside))
             ids = {}
             for label in labels:
-                done = run(self.enrols(label).command(folder), cwd=ROOT, capture_output=True, text=True, check=False)
+                done = run(
+                    self.enrols(label).command(folder),
+                    cwd=ROOT,
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                )
                 ids[label] = _promised(done.stdout + done.stderr)
                 if not ids[label]:
-                    raise NotFollowed(f"{label} cannot be enrolled: {_end(done.stdout + done.stderr)}")
+                    raise NotFollowed(
+                        f"{label} cannot be enrolled: {_end(done.stdout + done.stderr)}"
+                    )
         return ids
 
     def alone(self, way: str) -> CutScene:
@@ -184,15 +216,20 @@ class Shop:
         return self._scene("delivery", self._delivered, [("first second", step)])
 
     def _scene(
-        self, name: str, prepare: Callable[[Path], None], reported: list[tuple[str, SceneStep]],
+        self,
+        name: str,
+        prepare: Callable[[Path], None],
+        reported: list[tuple[str, SceneStep]],
         learned: Mapping[str, str] = MappingProxyType({}),
-    ) -> CutScene:  # fmt: skip
+    ) -> CutScene:
         may = {step.name: names.split() for names, step in reported}
         ids = {name: bundle.load(self.at(name)).id for name in NAMES} | learned
 
         def judge(found: Found) -> list[str]:
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
-            return self._comes_back(found.folder, ran) or self._takes_another(found.folder, ids["last"])
+            return self._comes_back(found.folder, ran) or self._takes_another(
+                found.folder, ids["last"]
+            )
 
         return CutScene(name, prepare, tuple(step for _, step in reported), judge, APART, _promised)
 
@@ -206,13 +243,19 @@ class Shop:
 
     def _comes_back(self, folder: Path, ids: set[str]) -> list[str]:
         """What is wrong with the box when it starts twice."""
-        return [wrong for time in ("first", "second") for wrong in self._answers(folder, f"{time} start", ids)]
+        return [
+            wrong
+            for time in ("first", "second")
+            for wrong in self._answers(folder, f"{time} start", ids)
+        ]
 
     def _answers(self, folder: Path, when: str, ids: set[str]) -> list[str]:
         code, output = _apart(self.words(folder, *START))
         names = ANSWER.findall(output)
         if code or len(names) != 1 or not set(names) <= ids:
-            return [f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(output)}"]
+            return [
+                f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(output)}"
+            ]
         return []
 
     def _takes_another(self, folder: Path, last: str) -> list[str]:
@@ -223,8 +266,14 @@ class Shop:
         if code:
             return [f"the next delivery ends with {code}: {_end(output)}"]
         left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]
-        left += [path.name for path in (folder / STORE / "bundles").iterdir() if not SHA.fullmatch(path.name)]
-        return [f"{name} is left" for name in left] + self._answers(folder, "after the next delivery", {last})
+        left += [
+            path.name
+            for path in (folder / STORE / "bundles").iterdir()
+            if not SHA.fullmatch(path.name)
+        ]
+        return [f"{name} is left" for name in left] + self._answers(
+            folder, "after the next delivery", {last}
+        )
 
 
 def _bare(folder: Path) -> None:
@@ -232,7 +281,8 @@ def _bare(folder: Path) -> None:
 
 
 def _promised(output: str) -> str:
-    """The bundle that is to run from the next start on, where the command that is cut has just said so."""
+    """The bundle that is to run from the next start on, where the command that is cut has just said
+    so."""
     reported = PROMISE.fullmatch(output.splitlines()[-1])
     return reported[1] or reported[2] if reported else ""
 
@@ -276,7 +326,8 @@ WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
     "the link is gone for a moment": (storage, "link", _gone_for_a_moment),
     "the ledger in place": (storage, "put", Path.write_bytes),
 }
-"""What is put in place of what; after the first two wrong on purpose, and the judge must find that."""
+"""What is put in place of what; after the first two wrong on purpose, and the judge must find
+that."""
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
-"""A disk that keeps for certain only what was synced. In: a folder, and the calls that change it. Out: all the folders that
-may be found when the power comes back.
+"""A disk that keeps for certain only what was synced. In: a folder, and the calls that change it.
+Out: all the folders that may be found when the power comes back.
 
-What a program has written is on the disk for sure only once it was synced: a file's content by an fsync of the file, a
-name (new, moved, gone) by an fsync of the folder it stands in. As long as it was not, it may be there or not:
+What a program has written is on the disk for sure only once it was synced: a file's content by an
+fsync of the file, a name (new, moved, gone) by an fsync of the folder it stands in. As long as it
+was not, it may be there or not:
 
 - names: those of one folder are kept in their order; those of different folders in any order. A rename is never half
   done, also from folder to folder, and a folder's fsync takes with it whatever had to happen before.
 - contents: all of it, what was last synced, nothing, the first half, or as many zeros; each file by itself, too.
 
-That is less than ext4 promises (there a sync of one file takes all earlier names with it), and about what POSIX does. A
-symlink leads where it leads as soon as its name is there. Modes and owners are not looked at.
+That is less than ext4 promises (there a sync of one file takes all earlier names with it), and
+about what POSIX does. A symlink leads where it leads as soon as its name is there. Modes and owners
+are not looked at.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ MOST_STATES = 4096
 
 @dataclass(eq=False, slots=True)
 class File:
-    """A file. synced: its content as the disk has it for sure. at: where the next write goes, None for the end."""
+    """A file. synced: its content as the disk has it for sure. at: where the next write goes, None
+    for the end."""
 
     data: bytes = b""
     synced: bytes = b""
@@ -67,7 +70,13 @@ class Disk:
         self._root = Folder()
         self._open: list[Change] = []
         for name, held in sorted(there.items()):
-            inode = Folder() if held is None else Link(held) if isinstance(held, str) else File(held, held)
+            inode = (
+                Folder()
+                if held is None
+                else Link(held)
+                if isinstance(held, str)
+                else File(held, held)
+            )
             above, last, _ = self._find(str(self._path / name))
             above.names[last] = above.synced[last] = inode
 
@@ -86,7 +95,9 @@ class Disk:
         if not any(self._inside(path) for path in call.paths):
             return None
         if call.process:
-            raise NotFollowed(f"a process that the command started calls {call.name} on {call.paths}")
+            raise NotFollowed(
+                f"a process that the command started calls {call.name} on {call.paths}"
+            )
         return self._effect(call)
 
     def _effect(self, call: SystemCall) -> Callable[[], None] | None:
@@ -119,7 +130,9 @@ class Disk:
             case "mkdir" | "mkdirat":
                 return lambda: self._change((here, name, Folder()))
             case "symlink" | "symlinkat":
-                return lambda: self._change((here, name, Link(call.data.decode("utf-8", "surrogateescape"))))
+                return lambda: self._change(
+                    (here, name, Link(call.data.decode("utf-8", "surrogateescape")))
+                )
             case "unlink" | "unlinkat" | "rmdir":
                 return lambda: self._change((here, name, None))
             case "link" | "linkat":
@@ -132,7 +145,9 @@ class Disk:
 
     def _opened(self, call: SystemCall) -> Callable[[], None] | None:
         above, name, there = self._find(call.paths[0], follow="O_NOFOLLOW" not in call.words)
-        if call.name != "creat" and not any(flag in call.words for flag in ("O_CREAT", "O_WRONLY", "O_RDWR")):
+        if call.name != "creat" and not any(
+            flag in call.words for flag in ("O_CREAT", "O_WRONLY", "O_RDWR")
+        ):
             return None
         at = None if "O_APPEND" in call.words else 0
         if there is None:
@@ -152,7 +167,13 @@ class Disk:
 
         def write() -> None:
             alone = call.name == "pwrite64"
-            at = int(call.words.rsplit(", ", 1)[1]) if alone else len(file.data) if file.at is None else file.at
+            at = (
+                int(call.words.rsplit(", ", 1)[1])
+                if alone
+                else len(file.data)
+                if file.at is None
+                else file.at
+            )
             file.data = file.data[:at].ljust(at, b"\0") + call.data[:n] + file.data[at + n :]
             if not alone and file.at is not None:
                 file.at = at + n
@@ -161,14 +182,20 @@ class Disk:
 
     def _resized(self, call: SystemCall) -> Callable[[], None] | None:
         file, size = self._at(call.paths[0]), int(call.words.rsplit(", ", 1)[1])
-        return (lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0"))) if isinstance(file, File) else None
+        return (
+            (lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0")))
+            if isinstance(file, File)
+            else None
+        )
 
     def _inside(self, path: str) -> bool:
         return PurePosixPath(path).is_relative_to(self._path)
 
-    def _find(self, path: str, follow: bool = False, depth: int = 0) -> tuple[Folder, str, Inode | None]:
-        """The folder that `path` stands in, its name there, and what it is. Symlinks on the way are followed; at its
-        end only where that is wanted.
+    def _find(
+        self, path: str, follow: bool = False, depth: int = 0
+    ) -> tuple[Folder, str, Inode | None]:
+        """The folder that `path` stands in, its name there, and what it is. Symlinks on the way are
+        followed; at its end only where that is wanted.
         """
         if depth > 40 or not self._inside(path):
             raise NotFollowed(f"{path} leads out of {self._path}")
@@ -178,7 +205,9 @@ class Disk:
             there = folder.names.get(name)
             if isinstance(there, Link) and (follow or i < len(way)):
                 rest = (*way, last)[i + 1 :]
-                return self._find(os.path.normpath(done.joinpath(there.target, *rest)), follow, depth + 1)
+                return self._find(
+                    os.path.normpath(done.joinpath(there.target, *rest)), follow, depth + 1
+                )
             if i < len(way):
                 if not isinstance(there, Folder):
                     raise NotFollowed(f"{path} goes through {name}, which is no folder")
@@ -217,7 +246,9 @@ class Disk:
 
     def seen(self) -> Tree:
         """The folder as programs see it."""
-        return {path: _held(inode, "all") for path, inode in _walk(self._root, _overlay(self._open))}
+        return {
+            path: _held(inode, "all") for path, inode in _walk(self._root, _overlay(self._open))
+        }
 
     def left(self) -> Iterator[Tree]:
         """Each folder that may be found if the power goes now, once."""
@@ -225,29 +256,41 @@ class Disk:
         for happened in self._happened():
             there = list(_walk(self._root, _overlay(happened)))
             unsure = [
-                inode for path, inode in there
-                if isinstance(inode, File) and inode.data != inode.synced and not self._apart.fullmatch(path)
-            ]  # fmt: skip
-            ways = [dict.fromkeys(map(id, unsure), how) for how in ("all", "synced", "none", "half", "zeros")]
+                inode
+                for path, inode in there
+                if isinstance(inode, File)
+                and inode.data != inode.synced
+                and not self._apart.fullmatch(path)
+            ]
+            ways = [
+                dict.fromkeys(map(id, unsure), how)
+                for how in ("all", "synced", "none", "half", "zeros")
+            ]
             for one in unsure if len(unsure) > 1 else ():
                 ways += [ways[0] | {id(one): "synced"}, ways[1] | {id(one): "all"}]
             for way in ways if unsure else [{}]:
-                found: Tree = {path: _held(inode, way.get(id(inode), "all")) for path, inode in there}
+                found: Tree = {
+                    path: _held(inode, way.get(id(inode), "all")) for path, inode in there
+                }
                 if (name := digest(found, self._apart)) not in reported:
                     reported.add(name)
                     yield found
 
     def _happened(self) -> list[tuple[Change, ...]]:
-        """Each set of the changes not synced yet that may have reached the disk: none without those before it that have
-        a folder in common with it.
+        """Each set of the changes not synced yet that may have reached the disk: none without those
+        before it that have a folder in common with it.
         """
         sets: list[tuple[int, ...]] = [()]
         for i, change in enumerate(self._open):
             folders = {id(folder) for folder, _, _ in change}
-            before = [j for j in range(i) if any(id(folder) in folders for folder, _, _ in self._open[j])]
+            before = [
+                j for j in range(i) if any(id(folder) in folders for folder, _, _ in self._open[j])
+            ]
             sets += [(*there, i) for there in sets if set(before) <= set(there)]
             if len(sets) > MOST_STATES:
-                raise NotFollowed(f"{len(self._open)} names are not synced, too many to try what may be left")
+                raise NotFollowed(
+                    f"{len(self._open)} names are not synced, too many to try what may be left"
+                )
         return [tuple(self._open[i] for i in there) for there in sets]
 
 
@@ -273,9 +316,13 @@ def _overlay(changes: list[Change] | tuple[Change, ...]) -> dict[int, dict[str, 
     return over
 
 
-def _walk(folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = "") -> Iterator[tuple[str, Inode]]:
+def _walk(
+    folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = ""
+) -> Iterator[tuple[str, Inode]]:
     """Paths and inodes below a folder: its synced names, and what lies over them."""
-    for name, inode in sorted({**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]):
+    for name, inode in sorted(
+        {**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]
+    ):
         if inode is not None:
             yield f"{at}{name}", inode
             if isinstance(inode, Folder):
@@ -289,5 +336,11 @@ def _held(inode: Inode, how: str) -> bytes | str | None:
         case Link():
             return inode.target
     data = inode.data
-    ways = {"all": data, "synced": inode.synced, "none": b"", "half": data[: len(data) // 2], "zeros": bytes(len(data))}
+    ways = {
+        "all": data,
+        "synced": inode.synced,
+        "none": b"",
+        "half": data[: len(data) // 2],
+        "zeros": bytes(len(data)),
+    }
     return ways[how]

@@ -1,8 +1,8 @@
-"""Recording, cut short. In: programs that record sweeps, that of the box and some that are wrong on purpose. Out: scenes,
-whose judge finds what is lost beyond the sweep in progress.
+"""Recording, cut short. In: programs that record sweeps, that of the box and some that are wrong on
+purpose. Out: scenes, whose judge finds what is lost beyond the sweep in progress.
 
-`python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder, says what a robot would hear,
-and which sweep it is asked to discard.
+`python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder,
+says what a robot would hear, and which sweep it is asked to discard.
 """
 
 from __future__ import annotations
@@ -36,9 +36,12 @@ Files = Mapping[Path, bytes]
 
 
 def record(way: str, folder: Path, session: str) -> None:
-    """Record two sweeps, discard the second, record a third; way: how the files get onto the disk."""
+    """Record two sweeps, discard the second, record a third; way: how the files get onto the
+    disk."""
     storage.put_all = WAYS[way]
-    running = recording(folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True))
+    running = recording(
+        folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True)
+    )
     running.sweep(*taken(1, SHORT), {})
     running.sweep(*taken(2, SHORT), {})
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
@@ -49,7 +52,9 @@ def record(way: str, folder: Path, session: str) -> None:
     running.close()
 
 
-def recording(folder: Path, fmt: SweepFormat, session: str, say: Callable[[bytes], None]) -> RecordingSession:
+def recording(
+    folder: Path, fmt: SweepFormat, session: str, say: Callable[[bytes], None]
+) -> RecordingSession:
     """The observer of the box that records sweeps."""
     labels = Labels("plastic rough", "1", session)
     return RecordingSession(folder, fmt, labels, SystemClock(), say)
@@ -60,11 +65,16 @@ def taken(number: int, fmt: SweepFormat) -> tuple[Sweep, Verdict]:
     n = fmt.window
     digits = np.full((n, *fmt.shape), number, fmt.numpy_type)
     sweep = Sweep(number, 0, n, Status.OK, Frames(np.arange(n), np.arange(n), digits))
-    return sweep, Verdict(number, n, Status.OK, "steel", 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 0, "0" * 8)
+    return sweep, Verdict(
+        number, n, Status.OK, "steel", 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 0, "0" * 8
+    )
 
 
-def _aside(files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]) -> None:
-    """Write all files aside, then give them their names; settle: what is done with each name then."""
+def _aside(
+    files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]
+) -> None:
+    """Write all files aside, then give them their names; settle: what is done with each name
+    then."""
     for path, data in files.items():
         write(path.with_name(path.name + storage.PART), data)
     for path in files:
@@ -86,24 +96,32 @@ def _late(path: Path) -> None:
 
 WAYS: dict[str, Callable[[Files], None]] = {
     "right": storage.put_all,
-    "no sync of the file": lambda files: _aside(files, Path.write_bytes, lambda path: storage.sync(path.parent)),
+    "no sync of the file": lambda files: _aside(
+        files, Path.write_bytes, lambda path: storage.sync(path.parent)
+    ),
     "no sync of the folder": lambda files: _aside(files, storage.write, lambda path: None),
     "sync after the rename": lambda files: _aside(files, Path.write_bytes, _late),
     "under its own name": _in_place,
     "description last": lambda files, put=storage.put_all: put(dict(reversed(files.items()))),
 }
-"""How files get onto the disk: all but the first are wrong on purpose, and the judge must find that."""
+"""How files get onto the disk: all but the first are wrong on purpose, and the judge must find
+that."""
 
 
 def judge(fmt: SweepFormat, found: Found) -> list[str]:
-    """What is wrong with the sweeps of this form that were found, and with what the next run makes of them."""
+    """What is wrong with the sweeps of this form that were found, and with what the next run makes
+    of them."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
     owed, gone = reported(found.heard)
     for name, which in owed.items():
         if there.get(name) != which:
             wrong.append(f"{name}, {which} was stored, and {there.get(name, 'nothing')} is there")
-    wrong += [f"{name}, {which} was discarded and is there" for name, which in gone.items() if there.get(name) == which]
+    wrong += [
+        f"{name}, {which} was discarded and is there"
+        for name, which in gone.items()
+        if there.get(name) == which
+    ]
     return wrong or _goes_on(folder, fmt)
 
 
@@ -121,8 +139,8 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
-    """What a robot has heard: session and number of the sweeps that are stored, and of the discarded ones. What is being
-    discarded is neither.
+    """What a robot has heard: session and number of the sweeps that are stored, and of the
+    discarded ones. What is being discarded is neither.
     """
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
@@ -148,26 +166,38 @@ def _goes_on(folder: Path, fmt: SweepFormat) -> list[str]:
     if not {"later 1", "later 2"} <= set(there.values()):
         wrong.append("the next run does not store its two sweeps")
     wrong += [f"the next run leaves {path.name}" for path in folder.glob(f"*{storage.PART}")]
-    wrong += [f"the next run changes {path.name}" for path, data in before.items() if path.read_bytes() != data]
+    wrong += [
+        f"the next run changes {path.name}"
+        for path, data in before.items()
+        if path.read_bytes() != data
+    ]
     return wrong
 
 
 def scene(way: str = "right") -> CutScene:
     """Two runs that record, the second one in what the first has left."""
-    return _sessions("recording", SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name])
+    return _sessions(
+        "recording", SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name]
+    )
 
 
 def palpate() -> CutScene:
     """The same with the box's command."""
     words = ("appliance", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
-    return _sessions("palpate-record", skin.FORMAT, lambda kept, name: [*words, kept, "--session", name])
+    return _sessions(
+        "palpate-record", skin.FORMAT, lambda kept, name: [*words, kept, "--session", name]
+    )
 
 
-def _sessions(title: str, fmt: SweepFormat, words: Callable[[Path, str], list[str | Path]]) -> CutScene:
+def _sessions(
+    title: str, fmt: SweepFormat, words: Callable[[Path, str], list[str | Path]]
+) -> CutScene:
     def session(name: str) -> SceneStep:
         return SceneStep(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
 
-    return CutScene(title, lambda folder: None, (session("first"), session("second")), partial(judge, fmt))
+    return CutScene(
+        title, lambda folder: None, (session("first"), session("second")), partial(judge, fmt)
+    )
 
 
 if __name__ == "__main__":

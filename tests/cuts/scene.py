@@ -1,9 +1,11 @@
-"""Plays a scene and cuts it short. In: commands that change a folder, one after another, and a judge of what may be found
-in it. Out: one point for each moment, with all that the judge has found wrong.
+"""Plays a scene and cuts it short. In: commands that change a folder, one after another, and a
+judge of what may be found in it. Out: one point for each moment, with all that the judge has found
+wrong.
 
-The scene is first played to its end, and its calls are noted. A moment lies before each call that changes the folder or
-syncs something in it, and after the last one of each command: after a call is before the next one. At each moment the
-command is killed there, or the power is cut there. What is found then goes to the judge.
+The scene is first played to its end, and its calls are noted. A moment lies before each call that
+changes the folder or syncs something in it, and after the last one of each command: after a call is
+before the next one. At each moment the command is killed there, or the power is cut there. What is
+found then goes to the judge.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from tests.cuts.disk import Disk
 from tests.factories.paths import ROOT
 
 MEMORY = Path("/dev/shm")
-"""Where scenes are best played: what a sync does is known here, and on a real disk it takes its time."""
+"""Where scenes are best played: what a sync does is known here, and on a real disk it takes its
+time."""
 BETWEEN = "\n"
 """Said before each command, so that the last line is its own."""
 ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
@@ -34,7 +37,8 @@ def stage() -> TemporaryDirectory[str]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a judge gets: the folder, which it may change; the command that was cut; what it hears of all that was said."""
+    """What a judge gets: the folder, which it may change; the command that was cut; what it hears
+    of all that was said."""
 
     folder: Path
     step: str
@@ -43,8 +47,8 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class SceneStep:
-    """A command, for the folder that it gets. code: how it ends, None for any way. killed: the call that it does not get
-    beyond.
+    """A command, for the folder that it gets. code: how it ends, None for any way. killed: the call
+    that it does not get beyond.
     """
 
     name: str
@@ -55,8 +59,8 @@ class SceneStep:
 
 @dataclass(frozen=True, slots=True)
 class CutScene:
-    """prepare: makes the folder as it is before the first command. judge: what is wrong. apart: paths that it does not
-    look at. hears: what it needs of what was said.
+    """prepare: makes the folder as it is before the first command. judge: what is wrong. apart:
+    paths that it does not look at. hears: what it needs of what was said.
     """
 
     name: str
@@ -69,8 +73,9 @@ class CutScene:
 
 @dataclass(frozen=True, slots=True)
 class CrashPoint:
-    """A scene that was cut at one moment. how: a method of Play. call: the one that was not carried out any more. states:
-    how many different folders it may have left. wrong: what the judge said of them.
+    """A scene that was cut at one moment. how: a method of Play. call: the one that was not carried
+    out any more. states: how many different folders it may have left. wrong: what the judge said of
+    them.
     """
 
     scene: str
@@ -95,8 +100,9 @@ class Moment:
 
 @dataclass(slots=True)
 class ScenePlay:
-    """A scene that was played to its end in `work`. said: what had been said before. before: what was in the folder before
-    each command. runs: how these went. Raises NotFollowed where the folder is not what the calls must have made of it.
+    """A scene that was played to its end in `work`. said: what had been said before. before: what
+    was in the folder before each command. runs: how these went. Raises NotFollowed where the folder
+    is not what the calls must have made of it.
     """
 
     scene: CutScene
@@ -123,7 +129,8 @@ class ScenePlay:
         return self.work / "folder"
 
     def moments(self) -> Iterator[Moment]:
-        """All moments in their order. What the command before the last one has done is on the disk by then."""
+        """All moments in their order. What the command before the last one has done is on the disk
+        by then."""
         output = self.output
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
@@ -155,8 +162,8 @@ class ScenePlay:
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
-        """The command is killed there, and started again: it goes on with what is left, and at each of its moments the
-        power goes. Raises NotFollowed.
+        """The command is killed there, and started again: it goes on with what is left, and at each
+        of its moments the power goes. Raises NotFollowed.
         """
         step, before = self.scene.steps[moment.step], self.before[moment.step]
         steps = replace(step, killed=moment.call), replace(step, code=None)
@@ -171,17 +178,25 @@ class ScenePlay:
             )
             for point in (play.power(later) for later in play.moments() if later.step):
                 states += point.states
-                wrong += [f"{text} (before its {point.call}, when it was started again)" for text in point.wrong]
+                wrong += [
+                    f"{text} (before its {point.call}, when it was started again)"
+                    for text in point.wrong
+                ]
         return self._point("kill_then_power", moment, states, wrong)
 
     def _run(self, step: SceneStep, at: SystemCall | None) -> TracedRun:
-        """Run a command, and compare what it leaves with what its calls must have made of the folder."""
+        """Run a command, and compare what it leaves with what its calls must have made of the
+        folder."""
         disk = Disk(self.folder, tree.read(self.folder))
         run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
         disk.follow(run.calls)
         if (seen := disk.seen()) != (there := tree.read(self.folder)):
-            differ = sorted(name for name in seen | there if seen.get(name, "") != there.get(name, ""))
-            raise NotFollowed(f"{step.name}: {', '.join(differ)} not as its calls must have left it")
+            differ = sorted(
+                name for name in seen | there if seen.get(name, "") != there.get(name, "")
+            )
+            raise NotFollowed(
+                f"{step.name}: {', '.join(differ)} not as its calls must have left it"
+            )
         return run
 
     def _restore(self, held: tree.Tree) -> None:
@@ -206,4 +221,6 @@ class ScenePlay:
         names = [str(Path(path).relative_to(self.folder)) for path in call.paths] if call else []
         reported = " ".join([call.name, *names]) if call else "the end"
         step = self.scene.steps[moment.step].name
-        return CrashPoint(self.scene.name, step, how, moment.number, reported, states, tuple(dict.fromkeys(wrong)))
+        return CrashPoint(
+            self.scene.name, step, how, moment.number, reported, states, tuple(dict.fromkeys(wrong))
+        )

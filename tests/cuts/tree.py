@@ -1,4 +1,5 @@
-"""A folder as a value. In: a folder. Out: all that is in it, which can be compared, hashed, and written again."""
+"""A folder as a value. In: a folder. Out: all that is in it, which can be compared, hashed, and
+written again."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ def read(folder: Path) -> Tree:
     found: Tree = {}
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))
-        found[name] = os.readlink(path) if path.is_symlink() else None if path.is_dir() else path.read_bytes()
+        found[name] = (
+            os.readlink(path) if path.is_symlink() else None if path.is_dir() else path.read_bytes()
+        )
     return found
 
 
@@ -34,11 +37,15 @@ def write(found: Tree, folder: Path) -> None:
 
 
 def digest(found: Tree, apart: re.Pattern[str] = NOTHING) -> str:
-    """The same for the same. Paths that are `apart` do not count, nor do the names that tempfile makes up."""
+    """The same for the same. Paths that are `apart` do not count, nor do the names that tempfile
+    makes up."""
     digested = hashlib.sha256()
     for name, held in sorted(
         (MADE_UP.sub("-*", name), held) for name, held in found.items() if not apart.fullmatch(name)
     ):
         data = held if isinstance(held, bytes) else repr(held).encode()
-        digested.update(f"{name}\0{type(held).__name__}\0{len(data)}\0".encode("utf-8", "surrogateescape") + data)
+        digested.update(
+            f"{name}\0{type(held).__name__}\0{len(data)}\0".encode("utf-8", "surrogateescape")
+            + data
+        )
     return digested.hexdigest()

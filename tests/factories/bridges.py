@@ -21,7 +21,9 @@ LONG_S = 30.0
 
 def page_blocks(page: str, language: str) -> list[str]:
     """The blocks in this language of a page in docs/robots."""
-    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S)
+    return re.findall(
+        rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S
+    )
 
 
 def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
@@ -36,7 +38,15 @@ def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     """A running bridge; where it listens."""
-    command = [sys.executable, "-m", "appliance.bridges", kind, "--listen", "127.0.0.1:0", *map(str, options)]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance.bridges",
+        kind,
+        "--listen",
+        "127.0.0.1:0",
+        *map(str, options),
+    ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = []

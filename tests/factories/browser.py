@@ -11,18 +11,29 @@ from typing import Any
 
 import pytest
 
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+BROWSERS = (
+    "chromium-headless-shell",
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+)
 WAIT_S = 10
 
 
 @contextmanager
 def launched() -> Iterator[Any]:
-    """A browser of this system, else the one that playwright has installed; skips the test where there is none."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (make test installs it)")
+    """A browser of this system, else the one that playwright has installed; skips the test where
+    there is none."""
+    api = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed (make test installs it)"
+    )
     with api.sync_playwright() as tool:
         path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
         if not Path(path).exists():
-            pytest.skip("no browser: apt-get install chromium-headless-shell, or playwright install chromium")
+            pytest.skip(
+                "no browser: apt-get install chromium-headless-shell, or playwright install chromium"
+            )
         one = tool.chromium.launch(executable_path=path)
         yield one
         one.close()
@@ -50,11 +61,13 @@ COLOURS = """() => {
   }
   return found;
 }"""
-"""Each text that is seen, with its colour and that behind it; but counts of taxels, whose colour changes."""
+"""Each text that is seen, with its colour and that behind it; but counts of taxels, whose colour
+changes."""
 
 
 class BrowsedPage:
-    """The page as a person sees it. errors: messages of the browser. requests: addresses that it asked for."""
+    """The page as a person sees it. errors: messages of the browser. requests: addresses that it
+    asked for."""
 
     def __init__(self, context: Any, address: str) -> None:
         self.page, self.errors, self.requests = context.new_page(), [], []
@@ -73,14 +86,19 @@ class BrowsedPage:
 
     def legibility(self) -> tuple[int, list[tuple[str, float]]]:
         """The number of texts, and those whose contrast is below 4.5 (WCAG 2.1, 1.4.3), with it."""
-        texts = [(text, round(contrast(front, back), 2)) for text, front, back in self.page.evaluate(COLOURS)]
+        texts = [
+            (text, round(contrast(front, back), 2))
+            for text, front, back in self.page.evaluate(COLOURS)
+        ]
         return len(texts), [(text, ratio) for text, ratio in texts if ratio < 4.5]
 
 
 def luminance(colour: Sequence[float]) -> float:
     """Relative luminance of red, green and blue of 0 to 255 (WCAG 2.1): 0 to 1."""
     parts = [part / 255 for part in colour]
-    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    linear = [
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    ]
     return sum(w * part for w, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 

@@ -5,16 +5,41 @@ from __future__ import annotations
 from typing import Any
 
 
-def dot(method: str, precision: str, ms: float, speed: float, lopo: float | None = None, **more: Any) -> dict[str, Any]:
+def dot(
+    method: str, precision: str, ms: float, speed: float, lopo: float | None = None, **more: Any
+) -> dict[str, Any]:
     """One dot with an interval of two points each way; bigger where it is slower."""
-    accuracy = {key: {"mean": mean, "low": round(mean - 0.02, 4), "high": round(mean + 0.02, 4), "n": 100, "seeds": [1]}
-                for key, mean in (("speed", speed), ("lopo", lopo)) if mean is not None}  # fmt: skip
+    accuracy = {
+        key: {
+            "mean": mean,
+            "low": round(mean - 0.02, 4),
+            "high": round(mean + 0.02, 4),
+            "n": 100,
+            "seeds": [1],
+        }
+        for key, mean in (("speed", speed), ("lopo", lopo))
+        if mean is not None
+    }
     return {
-        "method": method, "precision": precision, "runtime": "onnx", "weights": round(1e5 * ms), "macs": round(5e7 * ms),
-        "file_kb": 1000 * ms, "bundle_kb": 1000 * ms + 25, "rss_mb": 60 - ms, "ms_p50": ms, "ms_p99": 2 * ms,
-        "touch_s": 2.0, "runs_on_box": True, "family": "Palpate", "accuracy": accuracy, "seeds": [1], "set": "sim:T-REAL:1",
-        "commit": "abc", "machine": "x86_64, 2 cores",
-    } | more  # fmt: skip
+        "method": method,
+        "precision": precision,
+        "runtime": "onnx",
+        "weights": round(1e5 * ms),
+        "macs": round(5e7 * ms),
+        "file_kb": 1000 * ms,
+        "bundle_kb": 1000 * ms + 25,
+        "rss_mb": 60 - ms,
+        "ms_p50": ms,
+        "ms_p99": 2 * ms,
+        "touch_s": 2.0,
+        "runs_on_box": True,
+        "family": "Palpate",
+        "accuracy": accuracy,
+        "seeds": [1],
+        "set": "sim:T-REAL:1",
+        "commit": "abc",
+        "machine": "x86_64, 2 cores",
+    } | more
 
 
 DOTS = [
@@ -29,4 +54,5 @@ DOTS = [
 FRONT = {"speed": [0, 2, 6], "lopo": [0, 2, 3]}
 """Numbers of the dots on the front over ms_p50, cheapest first."""
 SHOWN = [0, 2, 4, 3, 6]
-"""Numbers of the dots that stand for a network over ms_p50 and speed, cheapest first: each network where it costs least."""
+"""Numbers of the dots that stand for a network over ms_p50 and speed, cheapest first: each network
+where it costs least."""

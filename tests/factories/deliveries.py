@@ -1,4 +1,5 @@
-"""Bundles as they are delivered, for tests. In: a folder. Out: keys, signed bundles, a store that believes one signer."""
+"""Bundles as they are delivered, for tests. In: a folder. Out: keys, signed bundles, a store that
+believes one signer."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ from appliance.inference import enrolment
 from tests.factories.install_scripts import enrolment_key
 
 SIGNER = "anna@lab"
-NEEDED = pytest.mark.skipif(not shutil.which("ssh-keygen"), reason="ssh-keygen is missing: apt install openssh-client")
+NEEDED = pytest.mark.skipif(
+    not shutil.which("ssh-keygen"), reason="ssh-keygen is missing: apt install openssh-client"
+)
 
 
 def key(folder: Path, name: str = "key", kind: str = "ed25519") -> Path:
@@ -39,21 +42,32 @@ def line(key: Path, name: str = SIGNER, options: str = "") -> str:
 
 def files(counter: int, key: Path | None, **changes: object) -> dict[str, bytes]:
     """The files of the default bundle with another counter, signed; changes: of its manifest."""
-    held = {name: data for name, data in bundle.files(bundle.DEFAULT).items() if name != bundle.SIGNATURE}
-    manifest = replace(Manifest.parse(held[bundle.MANIFEST]), counter=counter, schema=SCHEMA, **changes)  # type: ignore[arg-type]
+    held = {
+        name: data
+        for name, data in bundle.files(bundle.DEFAULT).items()
+        if name != bundle.SIGNATURE
+    }
+    manifest = replace(
+        Manifest.parse(held[bundle.MANIFEST]), counter=counter, schema=SCHEMA, **changes
+    )  # type: ignore[arg-type]
     held[bundle.MANIFEST] = manifest.json()
     return signed(held, key) if key else held
 
 
 def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
     """The files of a bundle with the manifest that they need, and its signature."""
-    entries = {name: bundle.file_entry(data) for name, data in held.items() if name != bundle.MANIFEST}
+    entries = {
+        name: bundle.file_entry(data) for name, data in held.items() if name != bundle.MANIFEST
+    }
     text = replace(Manifest.parse(held[bundle.MANIFEST]), files=entries).json()
     return held | {bundle.MANIFEST: text, bundle.SIGNATURE: signature.sign(text, key)}
 
 
-def enrolled(held: dict[str, bytes], key: EnrolmentKey | None, label: str = "cork") -> dict[str, bytes]:
-    """The files of a bundle with one more label, learned from the first golden sweep, as the box makes them."""
+def enrolled(
+    held: dict[str, bytes], key: EnrolmentKey | None, label: str = "cork"
+) -> dict[str, bytes]:
+    """The files of a bundle with one more label, learned from the first golden sweep, as the box
+    makes them."""
     made = bundle.from_files(held, "a test")
     new = enrolment.enrol(made, label, made.golden[:1])
     return enrolment.files(held, new, key.sign(new.file) if key else None)
@@ -70,12 +84,17 @@ def put(folder: Path, files: dict[str, bytes]) -> Path:
 class Delivery:
     """A box's store, and somebody who delivers bundles to it."""
 
-    def __init__(self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None) -> None:
+    def __init__(
+        self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None
+    ) -> None:
         self.folder = folder
         self.key = key(folder / "keys")
         self.enrolment_key = enrolment_key(folder / "enrolment")
         self.how = StoreConfig(
-            str(folder / "store"), str(folder / "allowed_signers"), str(folder / "enrolment"), trial_sweeps=5
+            str(folder / "store"),
+            str(folder / "allowed_signers"),
+            str(folder / "enrolment"),
+            trial_sweeps=5,
         )
         Path(self.how.folder).mkdir()
         Path(self.how.signers).write_text(line(self.key))

@@ -1,9 +1,11 @@
-"""Runs the classifier of the box on other processors. In: folders with bundles and sweeps. Out: its outputs there.
+"""Runs the classifier of the box on other processors. In: folders with bundles and sweeps. Out: its
+outputs there.
 
-`python -m tests.factories.emulated_machines` gets an arm64 userland, once, into ~/.cache/palpate/machines: Debian's
-packages unpacked, the wheels of appliance/requirements.lock beside them. qemu's user mode runs it, and x86 processors
-older than this one; nothing needs root, and nothing outside that folder is changed. With two arguments, FROM TO, the
-module is the program that runs on each machine, this one too.
+`python -m tests.factories.emulated_machines` gets an arm64 userland, once, into
+~/.cache/palpate/machines: Debian's packages unpacked, the wheels of appliance/requirements.lock
+beside them. qemu's user mode runs it, and x86 processors older than this one; nothing needs root,
+and nothing outside that folder is changed. With two arguments, FROM TO, the module is the program
+that runs on each machine, this one too.
 """
 
 from __future__ import annotations
@@ -30,19 +32,25 @@ MACHINES = {
     "Raspberry Pi 5": ("aarch64", "cortex-a76"),
     "Arm with all that qemu knows": ("aarch64", "max"),
 }
-"""Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi 4 has not."""
+"""Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi
+4 has not."""
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
 PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
 ARM_WHEELS = (
-    "--no-deps", "--only-binary", ":all:", "--implementation", "cp",
+    "--no-deps",
+    "--only-binary",
+    ":all:",
+    "--implementation",
+    "cp",
     *(f"--platform=manylinux{tag}_aarch64" for tag in ("_2_28", "_2_27", "_2_17", "2014")),
-)  # fmt: skip
+)
 CPUINFO = (
     "processor\t: 0\nFeatures\t: fp asimd\nCPU implementer\t: 0x41\n"
     "CPU architecture: 8\nCPU variant\t: 0x0\nCPU part\t: 0xd08\nCPU revision\t: 3\n"
 )
-"""onnxruntime counts cores there and crashes on an x86's; what the processor can do it asks the kernel, here qemu."""
+"""onnxruntime counts cores there and crashes on an x86's; what the processor can do it asks the
+kernel, here qemu."""
 
 
 class Missing(Exception):
@@ -56,9 +64,12 @@ def folder() -> Path:
 
 
 def qemu(kind: str) -> str:
-    """The emulator of an architecture: this machine's, else the one that `set_up` got. Raises Missing."""
+    """The emulator of an architecture: this machine's, else the one that `set_up` got. Raises
+    Missing."""
     for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
-        if found := shutil.which(name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"):
+        if found := shutil.which(
+            name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"
+        ):
             return found
     raise Missing(
         f"no qemu-{kind} here; apt-get install qemu-user-static, or run python -m tests.factories.emulated_machines"
@@ -71,7 +82,9 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     if platform.machine() != "x86_64":
         raise Missing("other processors are compared with an x86")
     run = [qemu(kind), "-cpu", processor]
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")}  # of this processor
+    kept = {
+        name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")
+    }  # of this processor
     env = kept | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     if kind == platform.machine():
         return [*run, sys.executable, __file__, *map(str, args)], env
@@ -85,7 +98,8 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
 
 
 def whole(target: Path, make: Callable[[Path], None]) -> Path:
-    """The folder `target`, made whole or not at all where it is not there: `make` fills an empty one beside it.
+    """The folder `target`, made whole or not at all where it is not there: `make` fills an empty
+    one beside it.
 
     Raises Missing with what the failed command said.
     """
@@ -99,7 +113,9 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
         with suppress(OSError):  # somebody else was quicker
             part.rename(target)
     except subprocess.CalledProcessError as e:
-        raise Missing(f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}") from e
+        raise Missing(
+            f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}"
+        ) from e
     except FileNotFoundError as e:
         raise Missing(f"no {e.filename} here: this needs Debian's tools") from e
     finally:
@@ -108,7 +124,8 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
 
 
 def set_up() -> Path:
-    """The folder of the arm64 userland, made if it is not there. Raises Missing if apt or pip fail."""
+    """The folder of the arm64 userland, made if it is not there. Raises Missing if apt or pip
+    fail."""
     return whole(folder(), _make)
 
 
@@ -137,15 +154,25 @@ def _unpack(part: Path) -> None:
         wanted["qemu"] = [f"qemu-user-static:{mine}"]
     with_apt = apt(part, "arm64", *([mine] if "qemu" in wanted else []))
     for where, names in wanted.items():
-        run(*with_apt, "apt-get", "-qq", "install", "-y", "--download-only", "--no-install-recommends", *names)
+        run(
+            *with_apt,
+            "apt-get",
+            "-qq",
+            "install",
+            "-y",
+            "--download-only",
+            "--no-install-recommends",
+            *names,
+        )
         for package in (part / "archives").glob("*.deb"):
             run("dpkg-deb", "-x", package, part / where)
             package.unlink()
 
 
 def apt(part: Path, *known: str) -> tuple[str, str]:
-    """What to put before a command of apt, so that it sees these architectures, knows nothing as installed, and keeps
-    what it fetches in `part`. The lists are fetched here; apt checks their signatures with this machine's keys.
+    """What to put before a command of apt, so that it sees these architectures, knows nothing as
+    installed, and keeps what it fetches in `part`. The lists are fetched here; apt checks their
+    signatures with this machine's keys.
     """
     for made in ("lists/partial", "archives/partial"):
         (part / made).mkdir(parents=True, exist_ok=True)
@@ -166,12 +193,14 @@ def _install(site: Path) -> None:
 
 
 def wheel(out: Path, source: Path) -> None:
-    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put what an older build left
-    behind into the wheel, and leaves its own behind.
+    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put what an
+    older build left behind into the wheel, and leaves its own behind.
     """
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    shutil.copytree(ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "appliance", source / "appliance", ignore=shutil.ignore_patterns("__pycache__")
+    )
     run(*PIP, "wheel", "--no-deps", "-w", out, source)
 
 
@@ -181,10 +210,11 @@ def run(*args: str | Path) -> str:
 
 
 def work(given: Path, target: Path) -> None:
-    """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy, into one .npz.
+    """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy,
+    into one .npz.
 
-    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all that it gives for the
-    sweeps, one after another.
+    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all
+    that it gives for the sweeps, one after another.
     """
     import numpy as np
 
@@ -197,12 +227,16 @@ def work(given: Path, target: Path) -> None:
         sweeps = np.load(path / "sweeps.npy")
         if (path / bundle.MANIFEST).exists():
             box = classifier.Classifier(bundle.load(path), clock.SystemClock())
-            outputs[f"{path.name}/golden"] = np.stack([box.logits(sweep) for sweep in box.bundle.golden])
+            outputs[f"{path.name}/golden"] = np.stack(
+                [box.logits(sweep) for sweep in box.bundle.golden]
+            )
             outputs[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
         if (path / "shown.onnx").exists():
             shown = session.session((path / "shown.onnx").read_bytes())
             each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
-            outputs[f"{path.name}/shown"] = np.stack([np.concatenate([x.ravel() for x in one]) for one in each])
+            outputs[f"{path.name}/shown"] = np.stack(
+                [np.concatenate([x.ravel() for x in one]) for one in each]
+            )
     np.savez(target, **outputs)
 
 

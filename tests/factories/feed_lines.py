@@ -1,4 +1,5 @@
-"""Lines of the feed as the box writes them (PROTOCOL.md, part 4), of a shift that a test makes up."""
+"""Lines of the feed as the box writes them (PROTOCOL.md, part 4), of a shift that a test makes
+up."""
 
 from __future__ import annotations
 
@@ -15,25 +16,66 @@ PLACE = {"pitch_mm": 4.0, "rows_mm": [6.0, 6.4, 6.8], "cols_mm": [6.0, 5.8, 6.2]
 FORMAT = {"rows": 4, "cols": 4, "rate_hz": RATE_HZ, "window": FRAMES, "dtype": "uint8"}
 
 
-def hello(pid: int = 71, bundle: str = "9f3c2a1b", source: str = "usb", **other: Any) -> dict[str, Any]:
+def hello(
+    pid: int = 71, bundle: str = "9f3c2a1b", source: str = "usb", **other: Any
+) -> dict[str, Any]:
     """The first line."""
-    alignment = {"contact": 5.0, "place": PLACE, "unloaded": [[0.0] * 4] * 4, "fingertip": "first-row"}
+    alignment = {
+        "contact": 5.0,
+        "place": PLACE,
+        "unloaded": [[0.0] * 4] * 4,
+        "fingertip": "first-row",
+    }
     return {
-        "type": "hello", "schema": 1, "version": "0.2.0", "pid": pid, "source": source, "bundle": bundle,
-        "labels": list(LABELS), "skin": "palpate", "format": FORMAT, "window_s": FRAMES / RATE_HZ, "frames_hz": 20.0,
-        "alignment": alignment, **other,
-    }  # fmt: skip
+        "type": "hello",
+        "schema": 1,
+        "version": "0.2.0",
+        "pid": pid,
+        "source": source,
+        "bundle": bundle,
+        "labels": list(LABELS),
+        "skin": "palpate",
+        "format": FORMAT,
+        "window_s": FRAMES / RATE_HZ,
+        "frames_hz": 20.0,
+        "alignment": alignment,
+        **other,
+    }
 
 
 def health(at_s: float, **other: Any) -> dict[str, Any]:
     """The state of each second."""
     return {
-        "type": "health", "time_ns": round(at_s * SECOND), "since_ns": 0, "skin": "streaming", "trouble": "", "streams": True,
-        "sweeping": False, "ready": True, "answered": round(at_s / 6), "frames": round(at_s * RATE_HZ), "lost_frames": 0,
-        "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "9f3c2a1b", "source": "usb", "stale_frames": 0,
-        "overflows": 0, "fifo_overflows": 0, "glitches": 0, "lost_edges": 0, "storms": 0, "loss_known": True, "pid": 71,
-        "version": "0.2.0", "model": "tubes 3, 6 labels", "trial": "on trial: 12 of 20 sweeps", "shadow": "", **other,
-    }  # fmt: skip
+        "type": "health",
+        "time_ns": round(at_s * SECOND),
+        "since_ns": 0,
+        "skin": "streaming",
+        "trouble": "",
+        "streams": True,
+        "sweeping": False,
+        "ready": True,
+        "answered": round(at_s / 6),
+        "frames": round(at_s * RATE_HZ),
+        "lost_frames": 0,
+        "garbage_bytes": 0,
+        "enumerations": 1,
+        "dropped": 0,
+        "bundle": "9f3c2a1b",
+        "source": "usb",
+        "stale_frames": 0,
+        "overflows": 0,
+        "fifo_overflows": 0,
+        "glitches": 0,
+        "lost_edges": 0,
+        "storms": 0,
+        "loss_known": True,
+        "pid": 71,
+        "version": "0.2.0",
+        "model": "tubes 3, 6 labels",
+        "trial": "on trial: 12 of 20 sweeps",
+        "shadow": "",
+        **other,
+    }
 
 
 def state(skin: str = "streaming", trouble: str = "", *, sweeping: bool = False) -> dict[str, Any]:
@@ -42,17 +84,32 @@ def state(skin: str = "streaming", trouble: str = "", *, sweeping: bool = False)
     return {"type": "state", "skin": skin, "trouble": trouble, "sweeping": sweeping, "ready": ready}
 
 
-def verdict(sweep: int, at_s: float, label: str = "plastic rough", status: str = "ok", **other: Any) -> dict[str, Any]:
+def verdict(
+    sweep: int, at_s: float, label: str = "plastic rough", status: str = "ok", **other: Any
+) -> dict[str, Any]:
     """The answer to a sweep; the probability goes down with a status that is not ok."""
     p = 0.962 if status == "ok" else 0.481
     scores = [p if name == label else (1 - p) / (len(LABELS) - 1) for name in LABELS]
     without = status not in ("ok", "unsure", "undecided")
     return {
-        "type": "verdict", "sweep": sweep, "time_ns": round(at_s * SECOND), "status": status, "label": "" if without else label,
-        "probability": 0.0 if without else p, "margin": 0.0 if without else p - (1 - p) / 5, "scores": [] if without else scores,
-        "fused": 1, "lost": 0, "latency_ns": 1_200_000 + 10_000 * (sweep % 37), "bundle": "9f3c2a1b", "detail": "", "share": 1.0,
-        "own": [] if without else scores, "moved": "", **other,
-    }  # fmt: skip
+        "type": "verdict",
+        "sweep": sweep,
+        "time_ns": round(at_s * SECOND),
+        "status": status,
+        "label": "" if without else label,
+        "probability": 0.0 if without else p,
+        "margin": 0.0 if without else p - (1 - p) / 5,
+        "scores": [] if without else scores,
+        "fused": 1,
+        "lost": 0,
+        "latency_ns": 1_200_000 + 10_000 * (sweep % 37),
+        "bundle": "9f3c2a1b",
+        "detail": "",
+        "share": 1.0,
+        "own": [] if without else scores,
+        "moved": "",
+        **other,
+    }
 
 
 def load(row: float, col: float, strength: float = 120.0) -> NDArray[np.float64]:
@@ -73,6 +130,10 @@ def sweep(number: int, hz: float = 55.0) -> dict[str, Any]:
     counts = load(1.5, 1.5) * (1 + 0.15 * np.sin(2 * np.pi * hz * t) * np.sin(2 * np.pi * 0.7 * t))
     data = np.clip(np.round(counts), 0, 255).astype(np.uint8)
     return {
-        "type": "sweep", "sweep": number, "start_ns": 0, "shape": list(data.shape), "dtype": "uint8",
+        "type": "sweep",
+        "sweep": number,
+        "start_ns": 0,
+        "shape": list(data.shape),
+        "dtype": "uint8",
         "data": b64encode(data.tobytes()).decode(),
-    }  # fmt: skip
+    }

@@ -1,4 +1,5 @@
-"""A feed on a virtual clock, and plain sockets that read it: what a test does to the one is seen at the other."""
+"""A feed on a virtual clock, and plain sockets that read it: what a test does to the one is seen at
+the other."""
 
 from __future__ import annotations
 
@@ -17,14 +18,41 @@ from appliance.sim import rig, skin
 from tests.factories.simulated_box import SECOND, numbered
 
 HEALTH = Health(
-    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
-    garbage_bytes=0, enumerations=1, dropped=0, bundle="9f3c2a1b", source="usb", stale_frames=0, overflows=0,
-    fifo_overflows=0, glitches=0, lost_edges=0, storms=0, ready=True,
-)  # fmt: skip
+    time_ns=0,
+    skin="streaming",
+    trouble="",
+    streams=True,
+    sweeping=False,
+    answered=7,
+    frames=5_000_000,
+    lost_frames=3,
+    garbage_bytes=0,
+    enumerations=1,
+    dropped=0,
+    bundle="9f3c2a1b",
+    source="usb",
+    stale_frames=0,
+    overflows=0,
+    fifo_overflows=0,
+    glitches=0,
+    lost_edges=0,
+    storms=0,
+    ready=True,
+)
 OK = Verdict(
-    sweep=7, time_ns=0, status=Status.OK, label="plastic rough", probability=0.987, margin=0.9,
-    scores=np.array([0.987, 0.013]), fused=1, lost=0, latency_ns=1_200_000, bundle="9f3c2a1b", moved="moved 2 mm",
-)  # fmt: skip
+    sweep=7,
+    time_ns=0,
+    status=Status.OK,
+    label="plastic rough",
+    probability=0.987,
+    margin=0.9,
+    scores=np.array([0.987, 0.013]),
+    fused=1,
+    lost=0,
+    latency_ns=1_200_000,
+    bundle="9f3c2a1b",
+    moved="moved 2 mm",
+)
 
 
 def frames(n: int = 6, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> Frames:
@@ -71,11 +99,18 @@ class Offered:
 
     def __init__(self, path: Path, fmt: SweepFormat = skin.FORMAT, **facts: Any) -> None:
         self.path, self.clock = path, rig.VirtualClock()
-        known = {"source": "usb", "bundle": "9f3c2a1b", "labels": ["plastic rough", "wood"], "skin": "palpate"}
+        known = {
+            "source": "usb",
+            "bundle": "9f3c2a1b",
+            "labels": ["plastic rough", "wood"],
+            "skin": "palpate",
+        }
         self.cost_ns = self._spent_ns = 0
         self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts, self._spent)
 
-    def turns(self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND) -> None:
+    def turns(
+        self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND
+    ) -> None:
         """Take turns, `step_s` apart: so that each is one in which the feed does its work."""
         for _ in range(n):
             self.feed.turn(health)

@@ -39,10 +39,15 @@ class Sprout:
         rng, n = self.rng, prod(shape)
         if kind == "float32":
             usual = rng.choice((rng.choice(FLOATS), rng.uniform(-2, 2)))
-            values = [usual if rng.random() < 0.8 else rng.choice((*FLOATS, rng.uniform(-9, 9))) for _ in range(n)]
+            values = [
+                usual if rng.random() < 0.8 else rng.choice((*FLOATS, rng.uniform(-9, 9)))
+                for _ in range(n)
+            ]
         else:
             low = 0 if kind == "uint8" else -3
-            values = [rng.choice((0, 1, 2, rng.randint(low, 8), rng.choice(SIZES))) for _ in range(n)]
+            values = [
+                rng.choice((0, 1, 2, rng.randint(low, 8), rng.choice(SIZES))) for _ in range(n)
+            ]
         name = f"c{len(self.constants)}"
         array = np.array(values, kind).reshape(shape)
         self.constants.append(numpy_helper.from_array(array, name))
@@ -69,14 +74,21 @@ class Sprout:
             return self.rng.choice(there) if there else ""
         kind = self.rng.choice(made)
         if kind == "int64" and self.rng.random() < 0.8:  # what decides sizes
-            return self.constant(kind, self.rng.choice(((), (1,), (1,), (1,), (2,), (len(like) or 1,))))
+            return self.constant(
+                kind, self.rng.choice(((), (1,), (1,), (1,), (2,), (len(like) or 1,)))
+            )
         shape = self.shape(like)
         return self.constant(kind, shape if prod(shape) <= 4096 else ())
 
     def setting(self, name: str, code: int, first: Value) -> Any:
         """A value for a setting."""
         rng, rank = self.rng, max(len(first.shape) - 2, 1)
-        texts = {"reduction": "add", "metric": "euclidean", "post_transform": "NONE", "kernel_type": "RBF"}
+        texts = {
+            "reduction": "add",
+            "metric": "euclidean",
+            "post_transform": "NONE",
+            "kernel_type": "RBF",
+        }
         if name == "value":
             return helper.make_tensor("v", 1, [1], [rng.choice(FLOATS)])
         if code == operators.TEXT:
@@ -102,7 +114,11 @@ class Sprout:
         """A node of this operator, where its rule takes what chance gives it."""
         operator = OPERATORS[domain, op]
         names: list[str] = []
-        most = operator.least if "axes" in operator.settings else min(operator.most, operator.least + 2)
+        most = (
+            operator.least
+            if "axes" in operator.settings
+            else min(operator.most, operator.least + 2)
+        )
         for i in range(self.rng.randint(operator.least, most)):
             like = self.known[names[0]].shape if names and names[0] else ()
             names.append(self.input(operator.kinds[min(i, len(operator.kinds) - 1)], like))
@@ -110,7 +126,9 @@ class Sprout:
             return False
         inputs = [self.known[name] for name in names]
         given = {
-            k: self.setting(k, code, inputs[0]) for k, code in operator.settings.items() if self.rng.random() < 0.7
+            k: self.setting(k, code, inputs[0])
+            for k, code in operator.settings.items()
+            if self.rng.random() < 0.7
         }
         return self.add(domain, op, names, {k: v for k, v in given.items() if v != []})
 
@@ -125,36 +143,53 @@ class Sprout:
         except BundleError:
             return False
         outs = outs if isinstance(outs, list) else [outs]
-        if any(min(shape, default=1) < 1 or prod(shape) > MOST_NUMBERS or len(shape) > 8 for _, shape in outs):
+        if any(
+            min(shape, default=1) < 1 or prod(shape) > MOST_NUMBERS or len(shape) > 8
+            for _, shape in outs
+        ):
             return False
         made = [f"t{len(self.nodes)}_{i}" for i in range(len(outs))]
         self.nodes.append(helper.make_node(op, names, made, domain=domain, **given))
         moved = any(x.moved for x in inputs)
         for name, (kind, shape) in zip(made, outs, strict=True):
-            self.known[name] = Value("int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE)
+            self.known[name] = Value(
+                "int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE
+            )
         return True
 
     def model(self) -> bytes:
         """The finished model: what has grown, and two logits of it."""
-        ends = [name for name, value in self.known.items() if value.moved and value.kind == "float32"][-6:]
+        ends = [
+            name for name, value in self.known.items() if value.moved and value.kind == "float32"
+        ][-6:]
         flat = self.constant("int64", (1,))
         self.constants[-1].CopyFrom(numpy_helper.from_array(np.array([1, -1]), flat))
         for i, name in enumerate(ends):
             self.nodes.append(helper.make_node("Reshape", [name, flat], [f"flat{i}"]))
-        self.nodes.append(helper.make_node("Concat", [f"flat{i}" for i in range(len(ends))], ["all"], axis=1))
+        self.nodes.append(
+            helper.make_node("Concat", [f"flat{i}" for i in range(len(ends))], ["all"], axis=1)
+        )
         for name in "Max", "Min":
             self.nodes.append(helper.make_node(f"Reduce{name}", ["all"], [name], axes=[1]))
         self.nodes.append(helper.make_node("Concat", ["Max", "Min"], ["logits"], axis=1))
         value = helper.make_tensor_value_info
         graph = helper.make_graph(
-            self.nodes, "grown", [value("sweep", onnx.TensorProto.UINT8, self.known["sweep"].shape)],
-            [value("logits", onnx.TensorProto.FLOAT, [1, 2])], self.constants,
-        )  # fmt: skip
+            self.nodes,
+            "grown",
+            [value("sweep", onnx.TensorProto.UINT8, self.known["sweep"].shape)],
+            [value("logits", onnx.TensorProto.FLOAT, [1, 2])],
+            self.constants,
+        )
         used = {name for node in self.nodes for name in node.input}
         del graph.initializer[:]
         graph.initializer.extend(c for c in self.constants if c.name in used)
-        opsets = [helper.make_opsetid(*pair) for pair in (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))]
-        return bytes(helper.make_model(graph, opset_imports=opsets, ir_version=8).SerializeToString())
+        opsets = [
+            helper.make_opsetid(*pair)
+            for pair in (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))
+        ]
+        return bytes(
+            helper.make_model(graph, opset_imports=opsets, ir_version=8).SerializeToString()
+        )
 
 
 def grown(rng: Random) -> bytes:

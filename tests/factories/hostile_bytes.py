@@ -1,7 +1,8 @@
-"""Models of a wrong form: no protobuf, ambiguous to two readers, types and outputs that no bundle has.
+"""Models of a wrong form: no protobuf, ambiguous to two readers, types and outputs that no bundle
+has.
 
-In: nothing. Out: (name, model, regular expression that its refusal must match). The tools of hostile_models.py are here,
-too.
+In: nothing. Out: (name, model, regular expression that its refusal must match). The tools of
+hostile_models.py are here, too.
 """
 
 from __future__ import annotations
@@ -23,19 +24,32 @@ FLOATS = node("Cast", ["sweep"], ["x"], to=TensorProto.FLOAT)
 
 
 def model(
-    nodes: Sequence[onnx.NodeProto], constants: Mapping[str, Any] = {}, last: str = "y", opsets: Any = OPSETS
+    nodes: Sequence[onnx.NodeProto],
+    constants: Mapping[str, Any] = {},
+    last: str = "y",
+    opsets: Any = OPSETS,
 ) -> onnx.ModelProto:
-    """A model of these nodes: `sweep` -> `x` -> ... -> `last` -> its largest number, twice, as `logits`."""
+    """A model of these nodes: `sweep` -> `x` -> ... -> `last` -> its largest number, twice, as
+    `logits`."""
     held = {"flat": [1, -1]} | constants
     ends = [
-        node("Reshape", [last, "flat"], ["row"]), node("ReduceMax", ["row"], ["most"], axes=[1]),
+        node("Reshape", [last, "flat"], ["row"]),
+        node("ReduceMax", ["row"], ["most"], axes=[1]),
         node("Concat", ["most", "most"], ["logits"], axis=1),
-    ]  # fmt: skip
+    ]
     graph = helper.make_graph(
-        [FLOATS, *nodes, *ends], "hostile", [info("sweep", TensorProto.UINT8, SWEEP)], [info("logits", 1, [1, 2])],
-        [v if isinstance(v, TensorProto) else numpy_helper.from_array(np.array(v), k) for k, v in held.items()],
-    )  # fmt: skip
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid(*o) for o in opsets], ir_version=8)
+        [FLOATS, *nodes, *ends],
+        "hostile",
+        [info("sweep", TensorProto.UINT8, SWEEP)],
+        [info("logits", 1, [1, 2])],
+        [
+            v if isinstance(v, TensorProto) else numpy_helper.from_array(np.array(v), k)
+            for k, v in held.items()
+        ],
+    )
+    return helper.make_model(
+        graph, opset_imports=[helper.make_opsetid(*o) for o in opsets], ir_version=8
+    )
 
 
 def number(n: int) -> bytes:
@@ -87,13 +101,25 @@ def misfits() -> Models:
     twice = TensorProto(name="w", data_type=1, dims=[1], float_data=[1.0], raw_data=bytes(4))
     yield "numbers twice", model([node("Add", ["x", "w"], ["y"])], {"w": twice}), "numbers twice"
     other = TensorProto(name="w", data_type=1, dims=[1], int32_data=[1], raw_data=bytes(4))
-    yield "numbers of another type", model([node("Add", ["x", "w"], ["y"])], {"w": other}), "of another type"
+    yield (
+        "numbers of another type",
+        model([node("Add", ["x", "w"], ["y"])], {"w": other}),
+        "of another type",
+    )
     off = TensorProto(name="w", data_type=TensorProto.INT8, dims=[1], int32_data=[200])
-    yield "a number that does not fit", model([node("Add", ["x", "w"], ["y"])], {"w": off}), "no int8"
+    yield (
+        "a number that does not fit",
+        model([node("Add", ["x", "w"], ["y"])], {"w": off}),
+        "no int8",
+    )
     off = TensorProto(name="w", data_type=1, dims=[4], float_data=[1.0, 2.0])
     yield "too few floats", model([node("Add", ["x", "w"], ["y"])], {"w": off}), "2 numbers, not 4"
     short = TensorProto(name="w", data_type=1, dims=[4], raw_data=bytes(4))
-    yield "too few numbers", model([node("Add", ["x", "w"], ["y"])], {"w": short}), "4 bytes, not 16"
+    yield (
+        "too few numbers",
+        model([node("Add", ["x", "w"], ["y"])], {"w": short}),
+        "4 bytes, not 16",
+    )
     made = model([node("Relu", ["x"], ["y"])])
     made.ir_version = 3
     yield "old file", made, "IR version 3"
@@ -107,7 +133,11 @@ def misfits() -> Models:
     made.graph.node[1].attribute.add().CopyFrom(made.graph.node[1].attribute[0])
     yield "setting twice", made, "'axis' is set twice"
     flat = {"w": np.ones((96, 2), np.float32)}
-    yield "setting without end", model([node("Gemm", ["x", "w"], ["y"], alpha=float("inf"))], flat), "alpha = inf"
+    yield (
+        "setting without end",
+        model([node("Gemm", ["x", "w"], ["y"], alpha=float("inf"))], flat),
+        "alpha = inf",
+    )
     yield "an input too many", model([node("Relu", ["x", "x"], ["y"])]), "it has 2 inputs"
     made = model([node("Relu", ["x"], ["y"])])
     made.graph.input[0].type.Clear()
@@ -135,10 +165,18 @@ def broken() -> Models:
     yield "a group", good[:2] + number(2 << 3 | 3) + number(2 << 3 | 4) + good[2:], "wire type 3"
     yield "wire type 7", number(1 << 3 | 7) + good, "wire type 7"
     yield "a number that ends early", b"\x08", "a number is cut off"
-    yield "a length without end", part(1, 8) + number(7 << 3 | 2) + b"\xff" * 9 + b"\x01", "bytes are announced"
+    yield (
+        "a length without end",
+        part(1, 8) + number(7 << 3 | 2) + b"\xff" * 9 + b"\x01",
+        "bytes are announced",
+    )
     yield "a number without end", part(1, 8) + b"\xff" * 100, "more bytes than it needs"
     yield "a number in two bytes", b"\x08\x88\x00" + good[2:], "more bytes than it needs"
-    yield "a float that ends early", part(7, part(1, part(5, number(2 << 3 | 5) + b"\0"))), "a number is cut off"
+    yield (
+        "a float that ends early",
+        part(7, part(1, part(5, number(2 << 3 | 5) + b"\0"))),
+        "a number is cut off",
+    )
     yield "floats that are none", part(7, part(5, part(4, b"\0" * 5))), "5 bytes are no floats"
     yield "a version of 64 bits", part(1, 8 + 2**32) + good[2:], "no code or version"
     deep = b""

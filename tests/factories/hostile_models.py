@@ -1,8 +1,9 @@
-"""Harmful models. In: nothing. Out: each by name, as bytes, with a regular expression that its refusal must match.
+"""Harmful models. In: nothing. Out: each by name, as bytes, with a regular expression that its
+refusal must match.
 
-They ask for unlimited memory or time, for files beside the model, for other code, or are no model at all
-(hostile_bytes.py). Some are made with onnx, some byte by byte, since onnx would not write them. All declare the sweep of
-`grown_models.FORM` as their input.
+They ask for unlimited memory or time, for files beside the model, for other code, or are no model
+at all (hostile_bytes.py). Some are made with onnx, some byte by byte, since onnx would not write
+them. All declare the sweep of `grown_models.FORM` as their input.
 """
 
 from __future__ import annotations
@@ -11,7 +12,18 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from tests.factories.grown_models import FORM
-from tests.factories.hostile_bytes import OPSETS, SWEEP, Models, broken, declared, info, misfits, model, node, part
+from tests.factories.hostile_bytes import (
+    OPSETS,
+    SWEEP,
+    Models,
+    broken,
+    declared,
+    info,
+    misfits,
+    model,
+    node,
+    part,
+)
 
 MILLION = 10**6
 GIANT = 1_500_000_000
@@ -22,13 +34,17 @@ def tiny() -> bytes:
     """At most 152 bytes that ask for 6 GB: one ConstantOfShape."""
     graph = part(1, part(1, b"n") + part(2, b"logits") + part(4, b"ConstantOfShape"))
     graph += part(5, part(1, 1) + part(2, TensorProto.INT64) + part(7, GIANT) + part(8, b"n"))
-    graph += part(11, declared(b"sweep", TensorProto.UINT8, SWEEP)) + part(12, declared(b"logits", 1, [GIANT]))
+    graph += part(11, declared(b"sweep", TensorProto.UINT8, SWEEP)) + part(
+        12, declared(b"logits", 1, [GIANT])
+    )
     return part(1, 8) + part(7, graph) + part(8, part(1, b"") + part(2, 17))
 
 
 def every() -> dict[str, tuple[bytes, str]]:
     """All of them by name: bytes, and what the message must say (a regular expression)."""
-    found: dict[str, tuple[bytes, str]] = {"152 bytes for 6 GB": (tiny(), "node 0 .*ConstantOfShape")}
+    found: dict[str, tuple[bytes, str]] = {
+        "152 bytes for 6 GB": (tiny(), "node 0 .*ConstantOfShape")
+    }
     for kind in (outside, foreign, endless, giant, busy, crooked, dangerous, misfits, broken):
         for name, made, words in kind():
             assert name not in found
@@ -38,12 +54,24 @@ def every() -> dict[str, tuple[bytes, str]]:
 
 def outside() -> Models:
     """Weights in files beside the model, or anywhere."""
-    for how, place in {"above": "../../etc/shadow", "absolute": "/etc/shadow", "beside": "weights.bin"}.items():
+    for how, place in {
+        "above": "../../etc/shadow",
+        "absolute": "/etc/shadow",
+        "beside": "weights.bin",
+    }.items():
         tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
         tensor.external_data.add(key="location", value=place)
-        yield f"external data {how}", model([node("Add", ["x", "w"], ["y"])], {"w": tensor}), "tensor: external_data"
+        yield (
+            f"external data {how}",
+            model([node("Add", ["x", "w"], ["y"])], {"w": tensor}),
+            "tensor: external_data",
+        )
     tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
-    yield "external data without a place", model([node("Add", ["x", "w"], ["y"])], {"w": tensor}), "data_location"
+    yield (
+        "external data without a place",
+        model([node("Add", ["x", "w"], ["y"])], {"w": tensor}),
+        "data_location",
+    )
 
 
 def foreign() -> Models:
@@ -58,12 +86,30 @@ def foreign() -> Models:
         model([node("Add", ["x", "x"], ["y"], domain="evil")]),
         "no such operator of domain 'evil'",
     )
-    yield "custom operator", model([node("Frobnicate", ["x"], ["y"])]), "'Frobnicate'.*no such operator"
-    yield "other operator of onnxruntime", model([node("Gelu", ["x"], ["y"], domain="com.microsoft")]), "'Gelu'"
-    yield "old operators", model([node("Relu", ["x"], ["y"])], opsets=[("", 7)]), "domain '', version 7"
-    yield "operators twice", model([node("Relu", ["x"], ["y"])], opsets=[("", 17), ("", 18)]), "each once"
+    yield (
+        "custom operator",
+        model([node("Frobnicate", ["x"], ["y"])]),
+        "'Frobnicate'.*no such operator",
+    )
+    yield (
+        "other operator of onnxruntime",
+        model([node("Gelu", ["x"], ["y"], domain="com.microsoft")]),
+        "'Gelu'",
+    )
+    yield (
+        "old operators",
+        model([node("Relu", ["x"], ["y"])], opsets=[("", 7)]),
+        "domain '', version 7",
+    )
+    yield (
+        "operators twice",
+        model([node("Relu", ["x"], ["y"])], opsets=[("", 17), ("", 18)]),
+        "each once",
+    )
     made = model([node("Relu", ["x"], ["y"])])
-    made.functions.append(helper.make_function("evil", "F", ["a"], ["b"], [node("Relu", ["a"], ["b"])], []))
+    made.functions.append(
+        helper.make_function("evil", "F", ["a"], ["b"], [node("Relu", ["a"], ["b"])], [])
+    )
     yield "function", made, "model: functions"
     made = model([node("Relu", ["x"], ["y"])])
     made.training_info.add()
@@ -77,9 +123,16 @@ def endless() -> Models:
     """Control flow."""
     true = helper.make_tensor("go", TensorProto.BOOL, [], [True])
     body = helper.make_graph(
-        [node("Identity", ["c"], ["d"])], "body", [info("i", 7, []), info("c", 9, [])], [info("d", 9, [])]
+        [node("Identity", ["c"], ["d"])],
+        "body",
+        [info("i", 7, []), info("c", 9, [])],
+        [info("d", 9, [])],
     )
-    yield "loop without end", model([node("Loop", ["", "go"], ["y"], body=body)], {"go": true}), "graph in the graph"
+    yield (
+        "loop without end",
+        model([node("Loop", ["", "go"], ["y"], body=body)], {"go": true}),
+        "graph in the graph",
+    )
     branch = helper.make_graph([node("Relu", ["x"], ["z"])], "branch", [], [info("z", 1, None)])
     yield (
         "branch",
@@ -89,17 +142,24 @@ def endless() -> Models:
     scan = node("Scan", ["x"], ["y"], body=body, num_scan_inputs=1)
     yield "scan", model([scan]), "graph in the graph"
     counted = [
-        node("Reshape", ["x", "flat"], ["all"]), node("ReduceMax", ["all"], ["top"], axes=[1], keepdims=0),
-        node("Sub", ["top", "rest"], ["over"]), node("Relu", ["over"], ["times"]), node("Cast", ["times"], ["n"], to=7),
-        node("Mul", ["n", "many"], ["all times"]), node("Squeeze", ["all times"], ["trips"]),
-    ]  # fmt: skip
+        node("Reshape", ["x", "flat"], ["all"]),
+        node("ReduceMax", ["all"], ["top"], axes=[1], keepdims=0),
+        node("Sub", ["top", "rest"], ["over"]),
+        node("Relu", ["over"], ["times"]),
+        node("Cast", ["times"], ["n"], to=7),
+        node("Mul", ["n", "many"], ["all times"]),
+        node("Squeeze", ["all times"], ["trips"]),
+    ]
     body = helper.make_graph(
-        [node("Identity", ["c"], ["d"]), node("Add", ["v", "v"], ["w"])], "body",
-        [info("i", 7, []), info("c", 9, []), info("v", 1, [1])], [info("d", 9, []), info("w", 1, [1])],
-    )  # fmt: skip
+        [node("Identity", ["c"], ["d"]), node("Add", ["v", "v"], ["w"])],
+        "body",
+        [info("i", 7, []), info("c", 9, []), info("v", 1, [1])],
+        [info("d", 9, []), info("w", 1, [1])],
+    )
     loop = node("Loop", ["trips", "", "top"], ["y"], body=body)
     held = {"rest": np.float32([254]), "many": [2**60]}
-    # onnxruntime opens this one and runs golden sweeps; the first sweep with a count of 255 never ends
+    # onnxruntime opens this one and runs golden sweeps; the first sweep with a count of 255 never
+    # ends
     yield "loop that waits for a sweep", model([*counted, loop], held), "graph in the graph"
     yield "loop without a body", model([node("Loop", ["", "go"], ["y"])]), "no such operator"
 
@@ -109,7 +169,11 @@ def giant() -> Models:
     large, column = [3 * MILLION, 1000], np.zeros((MILLION // 10, 1), np.float32)
     limit = r"bytes \(limit"
     one = helper.make_tensor("one", 1, [1], [1.0])
-    yield "ConstantOfShape", model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": large}), limit
+    yield (
+        "ConstantOfShape",
+        model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": large}),
+        limit,
+    )
     yield (
         "ConstantOfShape beyond 63 bits",
         model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": [2**62, 2**62]}),
@@ -122,54 +186,104 @@ def giant() -> Models:
     )
     yield "Expand", model([node("Expand", ["x", "n"], ["y"])], {"n": [MILLION, *SWEEP]}), limit
     ends = {"a": np.int64(0), "b": np.int64(2**31 - 1), "c": np.int64(1)}
-    yield "Range", model([node("Range", ["a", "b", "c"], ["r"]), node("Cast", ["r"], ["y"], to=1)], ends), limit
+    yield (
+        "Range",
+        model([node("Range", ["a", "b", "c"], ["r"]), node("Cast", ["r"], ["y"], to=1)], ends),
+        limit,
+    )
     yield "Range without end", model([node("Range", ["a", "b", "a"], ["y"])], ends), "steps of 0"
-    yield "outer product", model([node("MatMul", ["c", "r"], ["y"])], {"c": column, "r": column.T}), limit
+    yield (
+        "outer product",
+        model([node("MatMul", ["c", "r"], ["y"])], {"c": column, "r": column.T}),
+        limit,
+    )
     yield "outer sum", model([node("Add", ["c", "r"], ["y"])], {"c": column, "r": column.T}), limit
     yes = node("Greater", ["c", "c"], ["b"])
-    yield "outer choice", model([yes, node("Where", ["b", "c", "r"], ["y"])], {"c": column, "r": column.T}), limit
+    yield (
+        "outer choice",
+        model([yes, node("Where", ["b", "c", "r"], ["y"])], {"c": column, "r": column.T}),
+        limit,
+    )
     yield (
         "Gather",
-        model([node("Gather", ["c", "i"], ["y"])], {"c": column.T, "i": np.zeros((40, 50), np.int64)}),
+        model(
+            [node("Gather", ["c", "i"], ["y"])], {"c": column.T, "i": np.zeros((40, 50), np.int64)}
+        ),
         limit,
     )
     yield (
         "distances",
-        model([node("CDist", ["c", "c"], ["y"], domain="com.microsoft", metric=b"euclidean")], {"c": column}),
+        model(
+            [node("CDist", ["c", "c"], ["y"], domain="com.microsoft", metric=b"euclidean")],
+            {"c": column},
+        ),
         limit,
     )
     wide = [node("Concat", [f"x{i}"] * 2, [f"x{i + 1}"], axis=0) for i in range(40)]
     yield "doubled forty times", model([node("Identity", ["x"], ["x0"]), *wide], last="x40"), limit
-    yield "Tile", model([node("Tile", ["x", "n"], ["y"])], {"n": [MILLION] * 4}), "'Tile'.*no such operator"
+    yield (
+        "Tile",
+        model([node("Tile", ["x", "n"], ["y"])], {"n": [MILLION] * 4}),
+        "'Tile'.*no such operator",
+    )
     fan = [node("Expand", ["s", "n"], [f"f{i}"]) for i in range(200)]
     first = node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0)
     yield "fanned out", model([first, *fan], {"n": [MILLION]}, "f0"), r"bytes of memory \(limit"
     yield (
         "pads",
-        model([node("Conv", ["x", "w"], ["y"], pads=[2**40] * 4)], {"w": np.ones((1, FORM.window, 1, 1), np.float32)}),
+        model(
+            [node("Conv", ["x", "w"], ["y"], pads=[2**40] * 4)],
+            {"w": np.ones((1, FORM.window, 1, 1), np.float32)},
+        ),
         "pads",
     )
-    for name, dims in {"beyond 63 bits": [2**32, 2**32], "negative": [-1, -4], "empty": [0], "nine": [1] * 9}.items():
-        tensor = TensorProto(name="w", data_type=1, dims=dims, raw_data=bytes(4 * abs(int(np.prod(dims)))))
-        yield f"constant of sizes {name}", model([node("Add", ["x", "w"], ["y"])], {"w": tensor}), "'w'"
+    for name, dims in {
+        "beyond 63 bits": [2**32, 2**32],
+        "negative": [-1, -4],
+        "empty": [0],
+        "nine": [1] * 9,
+    }.items():
+        tensor = TensorProto(
+            name="w", data_type=1, dims=dims, raw_data=bytes(4 * abs(int(np.prod(dims))))
+        )
+        yield (
+            f"constant of sizes {name}",
+            model([node("Add", ["x", "w"], ["y"])], {"w": tensor}),
+            "'w'",
+        )
 
 
 def busy() -> Models:
     """Work without end, in little memory."""
     wide = {"w": np.zeros((1000, 1000), np.float32), "n": [4000, 1000]}
-    start = [node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0), node("Expand", ["s", "n"], ["m0"])]
+    start = [
+        node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0),
+        node("Expand", ["s", "n"], ["m0"]),
+    ]
     cascade = [node("MatMul", [f"m{i}", "w"], [f"m{i + 1}"]) for i in range(20)]
-    yield "cascade of products", model([*start, *cascade], wide | {"n": [1000, 1000]}, "m20"), r"products \(limit"
+    yield (
+        "cascade of products",
+        model([*start, *cascade], wide | {"n": [1000, 1000]}, "m20"),
+        r"products \(limit",
+    )
     kernel = {"w": np.zeros((1, 1, 60_000), np.float32), "n": [1, 1, 120_000]}
     yield "long kernel", model([*start, node("Conv", ["m0", "w"], ["y"])], kernel), r"\(limit"
     pool = node("MaxPool", ["m0"], ["y"], kernel_shape=[60_000], strides=[1])
     yield "long pool", model([*start, pool], {"n": [1, 1, 120_000]}), r"products \(limit"
     again = [node("ReduceMax", ["m0"], [f"r{i}"], axes=[0, 1]) for i in range(900)]
     yield "read again and again", model([*start, *again], wide, "r0"), r"products \(limit"
-    yield "10,000 nodes", model([node("Relu", ["x"], [f"y{i}"]) for i in range(10_000)], last="y0"), "(nodes|values)"
+    yield (
+        "10,000 nodes",
+        model([node("Relu", ["x"], [f"y{i}"]) for i in range(10_000)], last="y0"),
+        "(nodes|values)",
+    )
     many = {f"c{i}": np.float32(1) for i in range(3000)}
     yield "3,000 constants", model([node("Relu", ["x"], ["y"])], many), "constants"
-    yield "a million empty nodes", part(1, 8) + part(7, part(1, b"") * MILLION), "more than 50000 values"
+    yield (
+        "a million empty nodes",
+        part(1, 8) + part(7, part(1, b"") * MILLION),
+        "more than 50000 values",
+    )
     yield "100,000 inputs", model([node("Concat", ["x"] * 100_000, ["y"], axis=0)]), "values"
 
 
@@ -180,10 +294,22 @@ def crooked() -> Models:
         model([node("Add", ["x", "b"], ["a"]), node("Relu", ["a"], ["b"])], last="b"),
         "no node before it gives 'b'",
     )
-    yield "wrong order", model([node("Relu", ["a"], ["y"]), node("Relu", ["x"], ["a"])]), "no node before it gives 'a'"
+    yield (
+        "wrong order",
+        model([node("Relu", ["a"], ["y"]), node("Relu", ["x"], ["a"])]),
+        "no node before it gives 'a'",
+    )
     yield "undefined", model([node("Add", ["x", "nothing"], ["y"])]), "'nothing'"
-    yield "made twice", model([node("Relu", ["x"], ["y"]), node("Abs", ["x"], ["y"])]), "'y' is made twice"
-    yield "made over the sweep", model([node("Relu", ["x"], ["sweep"])], last="x"), "'sweep' is made twice"
+    yield (
+        "made twice",
+        model([node("Relu", ["x"], ["y"]), node("Abs", ["x"], ["y"])]),
+        "'y' is made twice",
+    )
+    yield (
+        "made over the sweep",
+        model([node("Relu", ["x"], ["sweep"])], last="x"),
+        "'sweep' is made twice",
+    )
     yield "left out", model([node("Clip", ["x", "", ""], ["y"])]), "''"
     yield "no outputs", model([node("Relu", ["x"], [])], last="x"), "0 outputs"
     made = model([node("Relu", ["x"], ["y"])], {"w": [1]})
@@ -199,13 +325,22 @@ def crooked() -> Models:
 
 
 def dangerous() -> Models:
-    """Numbers at which onnxruntime would divide by zero or read beside an array, and sizes that a sweep would decide."""
+    """Numbers at which onnxruntime would divide by zero or read beside an array, and sizes that a
+    sweep would decide."""
     ints = [node("Cast", ["x"], ["i"], to=7)]
     back = node("Cast", ["j"], ["y"], to=1)
     for by in ([0], [-1]):
-        yield f"rest of {by[0]}", model([*ints, node("Mod", ["i", "d"], ["j"]), back], {"d": by}), "divisors"
+        yield (
+            f"rest of {by[0]}",
+            model([*ints, node("Mod", ["i", "d"], ["j"]), back], {"d": by}),
+            "divisors",
+        )
     yield "rest of a sweep", model([*ints, node("Mod", ["i", "i"], ["j"]), back]), "no constant"
-    yield "quotient of integers", model([*ints, node("Div", ["i", "d"], ["j"]), back], {"d": [0]}), "int64, not float32"
+    yield (
+        "quotient of integers",
+        model([*ints, node("Div", ["i", "d"], ["j"]), back], {"d": [0]}),
+        "int64, not float32",
+    )
     weights = {"w": np.ones((1, FORM.window, 1, 1), np.float32)}
     for setting in (
         {"strides": [0, 0]},
@@ -215,7 +350,11 @@ def dangerous() -> Models:
         {"group": 0},
     ):
         name = next(iter(setting))
-        yield f"convolution with {setting}", model([node("Conv", ["x", "w"], ["y"], **setting)], weights), name
+        yield (
+            f"convolution with {setting}",
+            model([node("Conv", ["x", "w"], ["y"], **setting)], weights),
+            name,
+        )
     yield "no kernel", model([node("MaxPool", ["x"], ["y"], kernel_shape=[0, 0])]), "kernel_shape"
     yield "k of all", model([node("TopK", ["x", "k"], ["y", "at"])], {"k": [3]}), "cannot be chosen"
     yield "k of a sweep", model([*ints, node("TopK", ["x", "i"], ["y", "at"])]), "no constant"
@@ -223,11 +362,27 @@ def dangerous() -> Models:
     yield "place beyond", model([node("Gather", ["x", "n"], ["y"])], {"n": [1]}), "out of 1"
     pick = node("ArrayFeatureExtractor", ["t", "i"], ["j"], domain="ai.onnx.ml")
     yield "places of a sweep", model([*ints, pick, back], {"t": [1, 2]}), "TopK or ArgMax"
-    tables = {"classlabels_ints": [0, 1], "vectors_per_class": [1, 1], "coefficients": [1.0, 1.0], "rho": [0.0],
-              "kernel_params": [1.0, 0.0, 3.0], "support_vectors": [1.0] * 192, "kernel_type": "RBF",
-              "post_transform": "NONE"}  # fmt: skip
+    tables = {
+        "classlabels_ints": [0, 1],
+        "vectors_per_class": [1, 1],
+        "coefficients": [1.0, 1.0],
+        "rho": [0.0],
+        "kernel_params": [1.0, 0.0, 3.0],
+        "support_vectors": [1.0] * 192,
+        "kernel_type": "RBF",
+        "post_transform": "NONE",
+    }
     row = node("Reshape", ["x", "flat"], ["f"])
-    for name, wrong in {"support_vectors": [1.0], "coefficients": [1.0], "rho": [0.0] * 9, "vectors_per_class": [2**40, 1],
-                        "classlabels_ints": [0], "kernel_params": [1.0], "kernel_type": "POLY"}.items():  # fmt: skip
-        svm = node("SVMClassifier", ["f"], ["l", "y"], domain="ai.onnx.ml", **tables | {name: wrong})
+    for name, wrong in {
+        "support_vectors": [1.0],
+        "coefficients": [1.0],
+        "rho": [0.0] * 9,
+        "vectors_per_class": [2**40, 1],
+        "classlabels_ints": [0],
+        "kernel_params": [1.0],
+        "kernel_type": "POLY",
+    }.items():
+        svm = node(
+            "SVMClassifier", ["f"], ["l", "y"], domain="ai.onnx.ml", **tables | {name: wrong}
+        )
         yield f"machine with {name} {wrong}"[:60], model([row, svm]), "SVMClassifier"

@@ -1,9 +1,11 @@
-"""Real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare user.
+"""Real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare
+user.
 
-In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried on, and with
-`python -m tests.factories.hosts figures` how long both take. Their Debian is made once, in ~/.cache/palpate/hosts: bare, with the packages
-that an install wants in apt's cache as from a mirror; and ready, with these installed. What happens on a host is gone
-with it. The skin is simulated there, by a drop-in for the unit.
+In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried
+on, and with `python -m tests.factories.hosts figures` how long both take. Their Debian is made
+once, in ~/.cache/palpate/hosts: bare, with the packages that an install wants in apt's cache as
+from a mirror; and ready, with these installed. What happens on a host is gone with it. The skin is
+simulated there, by a drop-in for the unit.
 """
 
 from __future__ import annotations
@@ -52,16 +54,25 @@ def check() -> None:
 
 
 def set_up() -> Path:
-    """The folder with the two Debians, `bare` and `ready`, made where it is not there. Raises Missing."""
+    """The folder with the two Debians, `bare` and `ready`, made where it is not there. Raises
+    Missing."""
     check()
     return whole(folder(), _make)
 
 
 def _make(part: Path) -> None:
     bare, ready = part / "bare", part / "ready"
-    run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
+    run(
+        "mmdebstrap",
+        "--variant=minbase",
+        f"--include={','.join(PACKAGES)}",
+        "--aptopt=Acquire::Languages none",
         *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
-        "--skip=cleanup/apt", "--format=directory", nspawn.SUITE, bare)  # fmt: skip
+        "--skip=cleanup/apt",
+        "--format=directory",
+        nspawn.SUITE,
+        bare,
+    )
     _inside(bare, "useradd", "--create-home", "--shell", "/bin/sh", USER)
     (bare / "etc/sudoers.d/user").write_text(f"{USER} ALL=(ALL) NOPASSWD: ALL\n")
     install = ("apt-get", "install", "-y", "-qq", "--no-install-recommends")
@@ -82,7 +93,8 @@ fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], pl
 
 
 def _fetch_wheels() -> None:
-    """Have the wheels for such a host here: a desktop inside a host's own network has no way to where they come from."""
+    """Have the wheels for such a host here: a desktop inside a host's own network has no way to
+    where they come from."""
     python = f"{nspawn.PYTHON}.2"
     run("env", f"PYTHONPATH={ROOT / 'systemd'}:{ROOT}", sys.executable, "-c", FETCH, python)
 
@@ -90,8 +102,8 @@ def _fetch_wheels() -> None:
 class Host:
     """A host that has booted and answers on its ssh port.
 
-    number: from 1 to 250, its own on this machine. work: an empty folder. key: whose owner may log in.
-    Raises Missing where it cannot be had.
+    number: from 1 to 250, its own on this machine. work: an empty folder. key: whose owner may log
+    in. Raises Missing where it cannot be had.
     """
 
     def __init__(self, root: Path, number: int, work: Path, key: Path) -> None:
@@ -152,12 +164,17 @@ def desktop(
     """Run systemd/COMMAND.py as the user with this home; where: a command before it."""
     return subprocess.run(
         [*where, sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
-        env=os.environ | {"HOME": str(home)}, capture_output=True, text=True, timeout=limit_s, check=False,
-    )  # fmt: skip
+        env=os.environ | {"HOME": str(home)},
+        capture_output=True,
+        text=True,
+        timeout=limit_s,
+        check=False,
+    )
 
 
 class Hosts:
-    """Several hosts side by side, and a desktop that may log in on them. kind: "bare" or "ready"."""
+    """Several hosts side by side, and a desktop that may log in on them. kind: "bare" or
+    "ready"."""
 
     def __init__(self, count: int, work: Path, kind: str = "ready") -> None:
         self._stack = ExitStack()
@@ -174,16 +191,22 @@ class Hosts:
 
     def inventory(self) -> Path:
         """An inventory of all."""
-        shared = {"ssh_user": USER, "ssh_key": str(self.work / ".ssh/id_ed25519"),
-                  "ssh_known_hosts_file": str(self.work / ".ssh/known_hosts")}  # fmt: skip
+        shared = {
+            "ssh_user": USER,
+            "ssh_key": str(self.work / ".ssh/id_ed25519"),
+            "ssh_known_hosts_file": str(self.work / ".ssh/known_hosts"),
+        }
         file = self.work / "inventory.py"
-        file.write_text(f"hosts = ({[(h.name, {'ssh_hostname': h.address}) for h in self.hosts]!r}, {shared!r})\n")
+        file.write_text(
+            f"hosts = ({[(h.name, {'ssh_hostname': h.address}) for h in self.hosts]!r}, {shared!r})\n"
+        )
         return file
 
     def desktop(
         self, command: str, *args: str | Path, inside: Host | None = None, limit_s: float = 600
     ) -> subprocess.CompletedProcess[str]:
-        """Run systemd/COMMAND.py as a user of the desktop who has the key; `inside` a host's own network, or here."""
+        """Run systemd/COMMAND.py as a user of the desktop who has the key; `inside` a host's own
+        network, or here."""
         where = ("nsenter", "-t", inside.pid, "-n") if inside else ()
         return desktop(self.work, command, *args, where=where, limit_s=limit_s)
 
@@ -191,8 +214,11 @@ class Hosts:
         """The same, killed so long after it has said something."""
         with subprocess.Popen(
             [sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
-            env=os.environ | {"HOME": str(self.work)}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        ) as process:  # fmt: skip
+            env=os.environ | {"HOME": str(self.work)},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
             while words not in (line := process.stderr.readline()):
                 if not line:
                     raise AssertionError(f"ended without {words!r}")
@@ -215,44 +241,66 @@ def figures(repeats: int = 5, many: int = 8) -> dict[str, Any]:
         wheel(work / "dist", work / "source")
         key = deliveries.key(work / "keys")
         (work / "signers").write_text(deliveries.line(key))
-        install = ("--signers", work / "signers", "--board", "rpi5", "--wheel", next((work / "dist").glob("*.whl")))
+        install = (
+            "--signers",
+            work / "signers",
+            "--board",
+            "rpi5",
+            "--wheel",
+            next((work / "dist").glob("*.whl")),
+        )
         bundles = (deliveries.put(work / f"bundle-{n}", deliveries.files(n, key)) for n in count(1))
         result: dict[str, Any] = {"commit": commit(), "machine": _machine()}
         with Hosts(1, work / "one") as one:
             at = ("--host", f"{USER}@127.0.0.1")
-            result["loopback"] = _measured(one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0])
+            result["loopback"] = _measured(
+                one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0]
+            )
         with Hosts(many, work / "many") as several:
             at = ("--hosts", several.inventory())
-            result["many"] = _measured(several, at, install, [next(bundles) for _ in range(repeats)])
+            result["many"] = _measured(
+                several, at, install, [next(bundles) for _ in range(repeats)]
+            )
         result["load_after"] = os.getloadavg()[0]
     return result
 
 
 def _measured(
-    place: Hosts, at: Sequence[str | Path], install: Sequence[str | Path], bundles: Sequence[Path],
+    place: Hosts,
+    at: Sequence[str | Path],
+    install: Sequence[str | Path],
+    bundles: Sequence[Path],
     inside: Host | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Seconds of an install, and of each bundle's delivery, as the commands say and as a clock beside them."""
+) -> dict[str, Any]:
+    """Seconds of an install, and of each bundle's delivery, as the commands say and as a clock
+    beside them."""
 
     def timed(command: str, *args: str | Path) -> dict[str, Any]:
         begin_s = time.monotonic()
-        done = place.desktop(command, *at, *args, "--json", place.work / "report.json", inside=inside)
+        done = place.desktop(
+            command, *at, *args, "--json", place.work / "report.json", inside=inside
+        )
         took_s = time.monotonic() - begin_s
         if done.returncode:
             raise RuntimeError(done.stdout + done.stderr)
         result = json.loads((place.work / "report.json").read_text())
         late_s = result["began_s"] - begin_s  # one clock for all processes of a machine
-        boxes = [box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in result["boxes"].values()]
+        boxes = [
+            box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in result["boxes"].values()
+        ]
         return {"command_s": round(took_s, 2), "boxes": boxes}
 
     installed = timed("install", *install)
     rounds = [timed("deploy", bundle) for bundle in bundles]
     boxes = [box for one in rounds for box in one["boxes"]]
     return {
-        "hosts": len(place.hosts), "rounds": len(rounds), "install": installed,
+        "hosts": len(place.hosts),
+        "rounds": len(rounds),
+        "install": installed,
         "command_s": _spread([one["command_s"] for one in rounds]),
-        **{name: _spread([box[name] for box in boxes]) for name in ("ready_s", "lost_s")}, "deploys": rounds,
-    }  # fmt: skip
+        **{name: _spread([box[name] for box in boxes]) for name in ("ready_s", "lost_s")},
+        "deploys": rounds,
+    }
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
@@ -260,12 +308,19 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def _machine() -> dict[str, Any]:
-    models = (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+    models = (
+        line
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    )
     name = next(models, "unknown").partition(": ")[2]
     return {
-        "processor": name, "arch": platform.machine(), "cores": os.cpu_count(), "load_before": os.getloadavg()[0],
+        "processor": name,
+        "arch": platform.machine(),
+        "cores": os.cpu_count(),
+        "load_before": os.getloadavg()[0],
         "python": platform.python_version(),
-    }  # fmt: skip
+    }
 
 
 if __name__ == "__main__":
@@ -273,7 +328,12 @@ if __name__ == "__main__":
     commands = parser.add_subparsers(required=True, dest="command")
     commands.add_parser("set-up", help="make the Debians")
     measure = commands.add_parser("figures", help="how long an install and a deploy take")
-    measure.add_argument("--out", type=Path, default=ROOT / "build" / "deploy.json", help="(default build/deploy.json)")
+    measure.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "build" / "deploy.json",
+        help="(default build/deploy.json)",
+    )
     args = parser.parse_args()
     try:
         if args.command == "set-up":

@@ -14,9 +14,13 @@ SCRIPTS = ROOT / "systemd"
 
 
 def run_here(code: str) -> str:
-    """Output of Python code that imports the scripts. gevent would change this process too much to import them here."""
+    """Output of Python code that imports the scripts. gevent would change this process too much to
+    import them here."""
     done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(SCRIPTS)}, capture_output=True, text=True
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()

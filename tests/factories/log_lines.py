@@ -1,4 +1,5 @@
-"""What the box logs while a block runs: one text a line, a warning with `<4>` before it as in systemd's journal."""
+"""What the box logs while a block runs: one text a line, a warning with `<4>` before it as in
+systemd's journal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A model that needs no training: two materials, of which one is louder. In: nothing. Out: sweeps, a graph, a method."""
+"""A model that needs no training: two materials, of which one is louder. In: nothing. Out: sweeps,
+a graph, a method."""
 
 from __future__ import annotations
 
@@ -20,15 +21,25 @@ FORM = SweepFormat(2, 2, 100.0, 40, "uint8")
 def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
     """Sweeps of two materials at six positions, the second louder."""
     labels = np.arange(n) % 2
-    noise = np.random.default_rng(5).standard_normal((n, 40, 2, 2)) * (2 + 18 * labels)[:, None, None, None]
+    noise = (
+        np.random.default_rng(5).standard_normal((n, 40, 2, 2))
+        * (2 + 18 * labels)[:, None, None, None]
+    )
     groups = {"position": np.arange(n) // 4, "recording": np.arange(n)}
-    return Dataset((100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small")
+    return Dataset(
+        (100 + noise).clip(0, 255).astype(kind), labels, ("soft", "loud"), 100.0, groups, "small"
+    )
 
 
 def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
-    """A graph that tells the two apart: a convolution that takes differences, its mean size, a threshold."""
+    """A graph that tells the two apart: a convolution that takes differences, its mean size, a
+    threshold."""
     g, taxels = GraphBuilder(), form.rows * form.cols
-    x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")), to=TensorProto.FLOAT)
+    x = g(
+        "Cast",
+        g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")),
+        to=TensorProto.FLOAT,
+    )
     x = g("Transpose", x, perm=[0, 2, 1])
     taps = np.zeros((3, taxels, 2))
     taps[:, :, 0], taps[:, :, 1] = 1, -1

@@ -1,7 +1,8 @@
-"""Enrolments that mean harm: those of the default bundle, changed at random, as whoever has a box's key might sign them. In: a
-generator. Out: the bytes of enrolment.npz.
+"""Enrolments that mean harm: those of the default bundle, changed at random, as whoever has a box's
+key might sign them. In: a generator. Out: the bytes of enrolment.npz.
 
-Two kinds of change: of bytes, which mostly break the file, and of arrays, which leave a file that can be read.
+Two kinds of change: of bytes, which mostly break the file, and of arrays, which leave a file that
+can be read.
 """
 
 from __future__ import annotations
@@ -57,7 +58,11 @@ def changed(values: np.ndarray, rng: Random) -> np.ndarray:
     """Another number in it, other sizes, another type, or a label that is not one."""
     if values.dtype.kind == "U":
         text = rng.choice(("", "wood", "a,b", "x" * 25, "\0", "cork", "é", "$PPLP"))
-        return np.array(text) if not values.ndim or rng.random() < 0.2 else np.array([text] * len(values))
+        return (
+            np.array(text)
+            if not values.ndim or rng.random() < 0.2
+            else np.array([text] * len(values))
+        )
     how = rng.random()
     if how < 0.5 and values.size:
         changed = values.copy()
@@ -72,5 +77,7 @@ def changed(values: np.ndarray, rng: Random) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numbers that the other type does not have
         return values.astype(
-            rng.choice(("float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool"))
+            rng.choice(
+                ("float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool")
+            )
         )

@@ -1,7 +1,7 @@
 """Our own models, and random changes of them. In: nothing, or bytes and a generator. Out: bytes.
 
-Two kinds of change: of bytes, which mostly break the file, and of fields, which leave a file that can be read and reach
-the rules of the operators.
+Two kinds of change: of bytes, which mostly break the file, and of fields, which leave a file that
+can be read and reach the rules of the operators.
 """
 
 from __future__ import annotations
@@ -20,9 +20,49 @@ from appliance.bundle.bundle import Manifest, Thresholds
 from appliance.bundle.onnx_check.operators import OPERATORS
 from appliance.core.errors import FormatError
 
-NUMBERS = (0, 1, -1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 64, 255, 256, 1500, 10_000, 65_535, 65_536, 10**6, 2**31 - 1, -(2**31),
-           2**31, 2**32, 2**40, 2**62, 2**63 - 1, -(2**63))  # fmt: skip
-FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-39, 1e-45, 1e38, -1e38, float("inf"), float("-inf"), float("nan"))
+NUMBERS = (
+    0,
+    1,
+    -1,
+    2,
+    3,
+    4,
+    5,
+    7,
+    8,
+    9,
+    15,
+    16,
+    64,
+    255,
+    256,
+    1500,
+    10_000,
+    65_535,
+    65_536,
+    10**6,
+    2**31 - 1,
+    -(2**31),
+    2**31,
+    2**32,
+    2**40,
+    2**62,
+    2**63 - 1,
+    -(2**63),
+)
+FLOATS = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-39,
+    1e-45,
+    1e38,
+    -1e38,
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+)
 CHANGES = (1, 1, 1, 2, 3)
 """How many, each as likely as it stands here."""
 QUICK = ("L-knn", "L-svm", "st-hmp", "compact-4k")
@@ -45,7 +85,8 @@ def own_default() -> Own:
 
 
 def own_models(names: tuple[str, ...] = ()) -> list[Own]:
-    """The default bundle's model and those of these methods, or of all, hardly trained on a small skin."""
+    """The default bundle's model and those of these methods, or of all, hardly trained on a small
+    skin."""
     from tests.factories.sweep_sets import tones
     from train.models import methods
 
@@ -57,7 +98,9 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
                 model = method.train(sweeps, given, 1).graph().SerializeToString()
             except FormatError:  # a peer that runs in its own library alone
                 continue
-            manifest = Manifest(name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {})
+            manifest = Manifest(
+                name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {}
+            )
             found.append(Own(name, model, manifest))
     return found
 
@@ -72,7 +115,11 @@ def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
     for _ in range(rng.choice(CHANGES)):
         try:
             rng.choice(FIELDS)(made.graph, rng, piece.graph)
-        except (ValueError, TypeError, IndexError):  # no such field there, or it does not take the number
+        except (
+            ValueError,
+            TypeError,
+            IndexError,
+        ):  # no such field there, or it does not take the number
             continue
     if rng.random() < 0.05:
         made.opset_import[0].version = rng.choice((1, 7, 12, 13, 16, 18, 19, 21, 99))
@@ -110,7 +157,14 @@ def short(data: bytes, rng: Random, other: bytes) -> bytes:
 
 
 Graph = onnx.GraphProto
-BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...] = (flip, flip, flip, splice, numbered, short)
+BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...] = (
+    flip,
+    flip,
+    flip,
+    splice,
+    numbered,
+    short,
+)
 
 
 def setting(graph: Graph, rng: Random, other: Graph) -> None:
@@ -121,7 +175,9 @@ def setting(graph: Graph, rng: Random, other: Graph) -> None:
     elif attribute.type == onnx.AttributeProto.FLOAT:
         attribute.f = rng.choice(FLOATS)
     elif attribute.type == onnx.AttributeProto.STRING:
-        attribute.s = rng.choice((b"", b"NONE", b"SOFTMAX", b"mul", b"POLY", b"RBF", b"sqeuclidean"))
+        attribute.s = rng.choice(
+            (b"", b"NONE", b"SOFTMAX", b"mul", b"POLY", b"RBF", b"sqeuclidean")
+        )
     else:
         values = attribute.ints if attribute.type == onnx.AttributeProto.INTS else attribute.floats
         number = rng.choice(NUMBERS) if values is attribute.ints else rng.choice(FLOATS)
@@ -156,7 +212,9 @@ def operator(graph: Graph, rng: Random, other: Graph) -> None:
 
 def names(graph: Graph) -> list[str]:
     """All that a node may take."""
-    return [v.name for v in (*graph.input, *graph.initializer)] + [name for node in graph.node for name in node.output]
+    return [v.name for v in (*graph.input, *graph.initializer)] + [
+        name for node in graph.node for name in node.output
+    ]
 
 
 def wiring(graph: Graph, rng: Random, other: Graph) -> None:
@@ -214,7 +272,11 @@ def form(graph: Graph, rng: Random, other: Graph) -> None:
     values, name = numpy_helper.to_array(held), held.name
     shape, kind = list(values.shape), values.dtype
     if rng.random() < 0.6:
-        _listed(shape, rng.choice([n for n in NUMBERS if n >= 0] if rng.random() < 0.5 else (1, 2, 3, 4, 6)), rng)
+        _listed(
+            shape,
+            rng.choice([n for n in NUMBERS if n >= 0] if rng.random() < 0.5 else (1, 2, 3, 4, 6)),
+            rng,
+        )
     else:
         kind = np.dtype(rng.choice(("f4", "i1", "u1", "i2", "i4", "i8", "f8", "?")))
     if rng.random() < 0.7 and np.prod(shape, dtype=object) < 10**6:
@@ -246,6 +308,21 @@ def ends(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 FIELDS: tuple[Callable[[Graph, Random, Graph], None], ...] = (
-    setting, setting, settings, operator, wiring, nodes, between, between, between, constant, constant, constant, form, form,
-    exchanged, exchanged, ends,
-)  # fmt: skip
+    setting,
+    setting,
+    settings,
+    operator,
+    wiring,
+    nodes,
+    between,
+    between,
+    between,
+    constant,
+    constant,
+    constant,
+    form,
+    form,
+    exchanged,
+    exchanged,
+    ends,
+)

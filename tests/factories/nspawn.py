@@ -1,8 +1,10 @@
-"""A real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a board.
+"""A real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a
+board.
 
-`python -m tests.factories.nspawn` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from Debian, a virtual environment
-with the wheels of appliance/requirements.lock. `Machine` boots it in half a second; what is changed in it lies in
-memory and is gone at the end. It has no devices, and its limits of memory and processor are not enforced. Needs root.
+`python -m tests.factories.nspawn` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from
+Debian, a virtual environment with the wheels of appliance/requirements.lock. `Machine` boots it in
+half a second; what is changed in it lies in memory and is gone at the end. It has no devices, and
+its limits of memory and processor are not enforced. Needs root.
 """
 
 from __future__ import annotations
@@ -38,8 +40,11 @@ PACKAGES = (
     "udev",
 )
 TOOLS = {
-    "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container", "nsenter": "util-linux", "setpriv": "util-linux",
-}  # fmt: skip
+    "mmdebstrap": "mmdebstrap",
+    "systemd-nspawn": "systemd-container",
+    "nsenter": "util-linux",
+    "setpriv": "util-linux",
+}
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
     "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
@@ -89,18 +94,38 @@ def check() -> None:
 
 
 def set_up() -> Path:
-    """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip cannot."""
+    """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip
+    cannot."""
     check()
     return whole(folder(), _make)
 
 
 def _make(root: Path) -> None:
-    run("mmdebstrap", "--variant=minbase", f"--include={','.join(PACKAGES)}", "--aptopt=Acquire::Languages none",
+    run(
+        "mmdebstrap",
+        "--variant=minbase",
+        f"--include={','.join(PACKAGES)}",
+        "--aptopt=Acquire::Languages none",
         *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
-        "--format=directory", SUITE, root)  # fmt: skip
+        "--format=directory",
+        SUITE,
+        root,
+    )
     wheels = root / "wheels"
-    run(*PIP, "download", "--no-deps", "--only-binary", ":all:", "--python-version", PYTHON,
-        "--require-hashes", "-r", LOCK, "-d", wheels)  # fmt: skip
+    run(
+        *PIP,
+        "download",
+        "--no-deps",
+        "--only-binary",
+        ":all:",
+        "--python-version",
+        PYTHON,
+        "--require-hashes",
+        "-r",
+        LOCK,
+        "-d",
+        wheels,
+    )
     shutil.copy(LOCK, wheels)
     inside = ("chroot", root, "env", "-i", PATH)
     run(*inside, "python3", "-m", "venv", "/opt/palpate")
@@ -109,12 +134,19 @@ def _make(root: Path) -> None:
 
 
 def _pip(*args: str) -> tuple[str, ...]:
-    return ("/opt/palpate/bin/pip", "--disable-pip-version-check", "-q", "install", "--no-index", *args)
+    return (
+        "/opt/palpate/bin/pip",
+        "--disable-pip-version-check",
+        "-q",
+        "install",
+        "--no-index",
+        *args,
+    )
 
 
 def _group() -> Path | None:
-    """A new control group, None where there are none: in one that they share, a container's systemd ends the programs of
-    another's.
+    """A new control group, None where there are none: in one that they share, a container's systemd
+    ends the programs of another's.
     """
     mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
     mounted = next((Path(where) for _, where, kind, *_ in mounts if kind == "cgroup2"), None)
@@ -122,24 +154,46 @@ def _group() -> Path | None:
 
 
 class Machine:
-    """A container that has booted; `run` runs a command in it, as root. first: the number of its first process.
+    """A container that has booted; `run` runs a command in it, as root. first: the number of its
+    first process.
 
-    root: what `set_up` gave. parcel: a folder that it sees, read-only, as /parcel. log: where nspawn's own words go.
-    Raises Missing where a container cannot be booted on this machine.
+    root: what `set_up` gave. parcel: a folder that it sees, read-only, as /parcel. log: where
+    nspawn's own words go. Raises Missing where a container cannot be booted on this machine.
     """
 
     def __init__(self, root: Path, parcel: Path, log: Path) -> None:
         self._log, self._group = log, _group()
-        with tempfile.TemporaryDirectory() as place, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear:
+        with (
+            tempfile.TemporaryDirectory() as place,
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear,
+        ):
             ear.bind(f"{place}/notify")
             command = (
-                *(("sh", "-c", 'echo $$ >"$0/cgroup.procs"; exec "$@"', self._group) if self._group else ()),
-                "setpriv", "--pdeathsig", "TERM",  # a test run that is killed leaves no container behind
-                "systemd-nspawn", "--quiet", f"--directory={root}", f"--machine=palpate-{os.getpid()}", "--register=no",
-                "--keep-unit", "--console=pipe", "--private-network", "--volatile=overlay", "--notify-ready=yes",
-                f"--bind-ro={parcel}:/parcel", "--boot",
-            )  # fmt: skip
-            env = os.environ | {"NOTIFY_SOCKET": f"{place}/notify", "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
+                *(
+                    ("sh", "-c", 'echo $$ >"$0/cgroup.procs"; exec "$@"', self._group)
+                    if self._group
+                    else ()
+                ),
+                "setpriv",
+                "--pdeathsig",
+                "TERM",  # a test run that is killed leaves no container behind
+                "systemd-nspawn",
+                "--quiet",
+                f"--directory={root}",
+                f"--machine=palpate-{os.getpid()}",
+                "--register=no",
+                "--keep-unit",
+                "--console=pipe",
+                "--private-network",
+                "--volatile=overlay",
+                "--notify-ready=yes",
+                f"--bind-ro={parcel}:/parcel",
+                "--boot",
+            )
+            env = os.environ | {
+                "NOTIFY_SOCKET": f"{place}/notify",
+                "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1",
+            }
             with log.open("wb") as out:
                 self._process = subprocess.Popen(
                     command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
@@ -156,17 +210,43 @@ class Machine:
         first, end = "", time.monotonic() + BOOT_S
         while time.monotonic() < end and self._process.poll() is None:
             with suppress(TimeoutError):
-                key = dict(line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines())
+                key = dict(
+                    line.partition("=")[::2] for line in ear.recv(4096).decode().splitlines()
+                )
                 first = key.get("X_NSPAWN_LEADER_PID", first)
                 if key.get("READY") == "1":
                     return first
-        raise Missing(f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}")
+        raise Missing(
+            f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}"
+        )
 
-    def run(self, *command: str, say: str = "", limit_s: float = 60) -> subprocess.CompletedProcess[str]:
+    def run(
+        self, *command: str, say: str = "", limit_s: float = 60
+    ) -> subprocess.CompletedProcess[str]:
         """Run a command in it to its end, with `say` as its input."""
-        enter = ("nsenter", "-t", self.first, "-m", "-u", "-i", "-n", "-p", "-C", "-r", "-w", "env", "-i", PATH)
+        enter = (
+            "nsenter",
+            "-t",
+            self.first,
+            "-m",
+            "-u",
+            "-i",
+            "-n",
+            "-p",
+            "-C",
+            "-r",
+            "-w",
+            "env",
+            "-i",
+            PATH,
+        )
         return subprocess.run(
-            [*enter, *command], input=say, capture_output=True, text=True, timeout=limit_s, check=False
+            [*enter, *command],
+            input=say,
+            capture_output=True,
+            text=True,
+            timeout=limit_s,
+            check=False,
         )
 
     def get(self, *command: str, say: str = "") -> str:
@@ -242,7 +322,8 @@ class Service:
         self.machine.get("systemctl", "kill", "--kill-whom=main", f"--signal={signal}", "palpate")
 
     def journal(self, *more: str) -> list[str]:
-        """What the service and systemd about it have written to the journal since the test began."""
+        """What the service and systemd about it have written to the journal since the test
+        began."""
         about = ("-u", "palpate", "-o", "cat", f"--since=@{self._begin:.6f}", *more)
         return self.machine.get("journalctl", "-q", *about).splitlines()
 
@@ -256,12 +337,15 @@ class Service:
 
     def status(self) -> dict[str, Any]:
         """The output of `palpate status --json` for an unprivileged user."""
-        text = self.machine.run("setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json").stdout
+        text = self.machine.run(
+            "setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json"
+        ).stdout
         return dict(json.loads(text))
 
 
 def pack(parcel: Path, source: Path) -> None:
-    """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build in."""
+    """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build
+    in."""
     wheel(parcel, source)
     for name in PLACES:
         shutil.copy(ROOT / "systemd" / name, parcel)

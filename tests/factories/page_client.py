@@ -44,13 +44,20 @@ def received_by(one: socket.socket) -> bytes:
 
 
 def ask(
-    page: Page, path: str = "/", method: str = "GET", host: str = "localhost", more: str = "",
-    tls: ssl.SSLContext | None = None, body: bytes = b"",
-) -> bytes:  # fmt: skip
+    page: Page,
+    path: str = "/",
+    method: str = "GET",
+    host: str = "localhost",
+    more: str = "",
+    tls: ssl.SSLContext | None = None,
+    body: bytes = b"",
+) -> bytes:
     """Its answer to one request, head and body."""
     with connected(page, tls) as one:
         head = f"{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n"
-        with suppress(BrokenPipeError, ConnectionResetError):  # it may refuse what it has not read to the end
+        with suppress(
+            BrokenPipeError, ConnectionResetError
+        ):  # it may refuse what it has not read to the end
             one.sendall(head.encode() + body)
         return received_by(one)
 
@@ -89,7 +96,9 @@ class EventReader:
         return event[1]
 
     def _read_chunk(self) -> None:
-        while (end := self._chunks.find(b"\r\n")) < 0 or len(self._chunks) < end + 4 + int(self._chunks[:end], 16):
+        while (end := self._chunks.find(b"\r\n")) < 0 or len(self._chunks) < end + 4 + int(
+            self._chunks[:end], 16
+        ):
             if not (more := self.socket.recv(65536)):
                 raise EOFError
             self._chunks += more

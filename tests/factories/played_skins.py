@@ -1,4 +1,5 @@
-"""Emulated skins for tests. In: the name of a profile. Out: a skin on a terminal that sends numbered frames."""
+"""Emulated skins for tests. In: the name of a profile. Out: a skin on a terminal that sends
+numbered frames."""
 
 from __future__ import annotations
 
@@ -17,16 +18,21 @@ from appliance.sim.skins.player import Player
 from appliance.sim.skins.wires import wire
 
 SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
-    "flexitac": ((12, 32), "uint8", 100.0), "matrix": ((4, 4), "uint8", 100.0), "anyskin": ((1, 5, 3), "float32", 28.0),
-    "reskin": ((1, 5, 3), "float32", 28.0), "3d-vitac": ((16, 16), "uint8", 32.0),
-    "papillarray": ((3, 3, 3), "float32", 1000.0), "xela-can": ((4, 4, 3), "uint16", 100.0),
+    "flexitac": ((12, 32), "uint8", 100.0),
+    "matrix": ((4, 4), "uint8", 100.0),
+    "anyskin": ((1, 5, 3), "float32", 28.0),
+    "reskin": ((1, 5, 3), "float32", 28.0),
+    "3d-vitac": ((16, 16), "uint8", 32.0),
+    "papillarray": ((3, 3, 3), "float32", 1000.0),
+    "xela-can": ((4, 4, 3), "uint16", 100.0),
     "robotiq-tsf": ((14, 4), "uint16", 62.5),
-}  # fmt: skip
+}
 """Shape, data type and rate of each skin as it comes from its maker."""
 
 
 class Numbered:
-    """Frames that are told apart by their content: frame i as whole number i, in steps of 0.25 where it is no number."""
+    """Frames that are told apart by their content: frame i as whole number i, in steps of 0.25
+    where it is no number."""
 
     def __init__(self, name: str) -> None:
         self.shape, dtype, self.rate_hz = SHAPES[name]
@@ -44,7 +50,9 @@ def played(name: str, **how: Any) -> Iterator[Player]:
     """A skin that plays in a thread until the end of the block."""
     source, stop = Numbered(name), threading.Event()
     with tempfile.TemporaryDirectory() as folder:
-        player = Player(wire(name, source.rate_hz), source, SystemClock(), Path(folder) / "ttySkin", **how)
+        player = Player(
+            wire(name, source.rate_hz), source, SystemClock(), Path(folder) / "ttySkin", **how
+        )
         thread = threading.Thread(target=player.run, args=(stop.is_set,), daemon=True)
         thread.start()
         try:

@@ -9,11 +9,21 @@ from train.calibration.posthoc import PosthocInputs
 
 
 def plain_inputs(
-    tenths: np.ndarray, labels: np.ndarray, groups: np.ndarray, judged: np.ndarray, fixed: int = 0,
+    tenths: np.ndarray,
+    labels: np.ndarray,
+    groups: np.ndarray,
+    judged: np.ndarray,
+    fixed: int = 0,
     disturbed: np.ndarray | None = None,
-) -> PosthocInputs:  # fmt: skip
+) -> PosthocInputs:
     """Features [N, D + 1, F] and what is known of these sweeps; disturbed: None where none is."""
     none = AugmentedCopies(tenths[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
     return PosthocInputs(
-        tenths, labels, groups, judged, fixed, none, np.zeros(len(labels), bool) if disturbed is None else disturbed
+        tenths,
+        labels,
+        groups,
+        judged,
+        fixed,
+        none,
+        np.zeros(len(labels), bool) if disturbed is None else disturbed,
     )

@@ -1,4 +1,5 @@
-"""A page of a recording whose turns a test takes, or a thread does; and what a browser sends to it."""
+"""A page of a recording whose turns a test takes, or a thread does; and what a browser sends to
+it."""
 
 from __future__ import annotations
 
@@ -27,12 +28,16 @@ KIND = "application/json"
 
 
 def ordered(page: Page, key: str, body: bytes | Mapping[str, str], **changed: str | None) -> bytes:
-    """The answer to an order as the page sends it, with other headers where a test changes them (None: without)."""
+    """The answer to an order as the page sends it, with other headers where a test changes them
+    (None: without)."""
     content = body if isinstance(body, bytes) else json.dumps(body).encode()
     headers = {
-        "Origin": f"http://localhost:{port(page)}", "Content-Type": KIND, "X-Palpate-Key": key,
-        "Content-Length": str(len(content)), **{name.replace("_", "-"): value for name, value in changed.items()},
-    }  # fmt: skip
+        "Origin": f"http://localhost:{port(page)}",
+        "Content-Type": KIND,
+        "X-Palpate-Key": key,
+        "Content-Length": str(len(content)),
+        **{name.replace("_", "-"): value for name, value in changed.items()},
+    }
     head = "".join(f"{name}: {value}\r\n" for name, value in headers.items() if value is not None)
     return ask(page, "/order", "POST", f"localhost:{port(page)}", head, body=content)
 
@@ -46,12 +51,17 @@ def key_of(page: Page) -> str:
 
 
 class RecordedPage:
-    """A recording in `folder` and its page, without a box: `turn` is a turn of the loop, which `going` takes by itself."""
+    """A recording in `folder` and its page, without a box: `turn` is a turn of the loop, which
+    `going` takes by itself."""
 
-    def __init__(self, folder: Path, labels: Labels, target: int = 3, access: Access | None = None) -> None:
+    def __init__(
+        self, folder: Path, labels: Labels, target: int = 3, access: Access | None = None
+    ) -> None:
         clock = SystemClock()
         self.health, self.sweeps = replace(HEALTH, bundle="", source="sim"), 0
-        self.recording = RecordingSession(folder, skin.FORMAT, labels, clock, lambda line: None, target)
+        self.recording = RecordingSession(
+            folder, skin.FORMAT, labels, clock, lambda line: None, target
+        )
         self.done: list[str] = []
         self.page = RecordPage(
             access or Access(0),
@@ -95,7 +105,9 @@ class RecordedPage:
         self.sweeps += 1
         frames = Frames.empty(skin.FORMAT) if status in (Status.SHORT, Status.GAP) else cut().frames
         one = replace(cut(), id=self.sweeps, start_ns=SystemClock().now_ns(), frames=frames)
-        return one, replace(OK, sweep=self.sweeps, status=status, label="", detail=detail, scores=np.empty(0))
+        return one, replace(
+            OK, sweep=self.sweeps, status=status, label="", detail=detail, scores=np.empty(0)
+        )
 
     def __enter__(self) -> Self:
         """Serve the page, and take turns."""

@@ -1,4 +1,5 @@
-"""A finished page or picture in a browser, and what a reader could not read of it. In: a file, a width, light or dark."""
+"""A finished page or picture in a browser, and what a reader could not read of it. In: a file, a
+width, light or dark."""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ FAULTS = """() => {
 
 
 def faults(browser: Any, address: str, width: int, scheme: str) -> Mapping[str, list[str]]:
-    """What could not be read of a page or picture in a window of this width, light or dark: texts by kind of fault."""
+    """What could not be read of a page or picture in a window of this width, light or dark: texts
+    by kind of fault."""
     context = browser.new_context(
         viewport={"width": width, "height": 900}, color_scheme=scheme, reduced_motion="reduce"
     )

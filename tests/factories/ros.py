@@ -1,4 +1,5 @@
-"""The bridge to ROS 2 and another node, two processes over loopback, with the Python that has ROS 2."""
+"""The bridge to ROS 2 and another node, two processes over loopback, with the Python that has ROS
+2."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 
 PYTHON = ROOT / os.environ.get("PALPATE_ROS", "build/ros") / "bin" / "python"
-"""Of `make ros`; PALPATE_ROS names another virtual environment, and says that it has to be there."""
+"""Of `make ros`; PALPATE_ROS names another virtual environment, and says that it has to be
+there."""
 
 
 def required() -> None:
@@ -94,7 +96,11 @@ def peer() -> Iterator[RosPeer]:
     """Another node."""
     script = ROOT / "tests" / "factories" / "ros_peer.py"
     command = [PYTHON, str(script)]
-    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    pipes: dict[str, Any] = {
+        "stdin": subprocess.PIPE,
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.DEVNULL,
+    }
     with subprocess.Popen(command, env=environment(), text=True, **pipes) as process:
         try:
             yield RosPeer(process)
@@ -103,7 +109,9 @@ def peer() -> Iterator[RosPeer]:
 
 
 @contextmanager
-def bridge(*parameters: str, log: int = subprocess.DEVNULL, **variables: str) -> Iterator[subprocess.Popen[bytes]]:
+def bridge(
+    *parameters: str, log: int = subprocess.DEVNULL, **variables: str
+) -> Iterator[subprocess.Popen[bytes]]:
     """The bridge as a node. log: where its log goes. variables: of its environment."""
     command = [PYTHON, "-m", "appliance.bridges", "ros", "--ros-args", *parameters]
     with subprocess.Popen(command, cwd=ROOT, env=environment() | variables, stderr=log) as process:

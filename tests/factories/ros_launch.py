@@ -1,7 +1,8 @@
-"""What a launch file describes, without the package `launch`, of which there is neither a wheel nor a Debian package.
+"""What a launch file describes, without the package `launch`, of which there is neither a wheel nor
+a Debian package.
 
-The four names take what ROS 2's take (github.com/ros2/launch, launch/actions and launch/substitutions); a launch file that
-uses more fails here.
+The four names take what ROS 2's take (github.com/ros2/launch, launch/actions and
+launch/substitutions); a launch file that uses more fails here.
 """
 
 from __future__ import annotations
@@ -48,13 +49,19 @@ def LaunchDescription(entities: list[Any]) -> list[Any]:
 
 def processes(path: Path, **arguments: str) -> list[tuple[ExecuteProcess, list[str]]]:
     """The processes that a launch file describes, each with its command for these arguments."""
-    modules = {name: ModuleType(name) for name in ("launch", "launch.actions", "launch.substitutions")}
+    modules = {
+        name: ModuleType(name) for name in ("launch", "launch.actions", "launch.substitutions")
+    }
     vars(modules["launch"])["LaunchDescription"] = LaunchDescription
-    vars(modules["launch.actions"]).update(DeclareLaunchArgument=DeclareLaunchArgument, ExecuteProcess=ExecuteProcess)
+    vars(modules["launch.actions"]).update(
+        DeclareLaunchArgument=DeclareLaunchArgument, ExecuteProcess=ExecuteProcess
+    )
     vars(modules["launch.substitutions"])["LaunchConfiguration"] = LaunchConfiguration
     with mock.patch.dict(sys.modules, modules):
         described = runpy.run_path(str(path))["generate_launch_description"]()
-    declared = {one.name: one.default_value for one in described if isinstance(one, DeclareLaunchArgument)}
+    declared = {
+        one.name: one.default_value for one in described if isinstance(one, DeclareLaunchArgument)
+    }
     values = declared | arguments
     assert values.keys() == declared.keys(), "an argument that the file does not declare"
 
@@ -64,4 +71,8 @@ def processes(path: Path, **arguments: str) -> list[tuple[ExecuteProcess, list[s
             return values[part.name]
         return part if isinstance(part, str) else "".join(map(text, part))
 
-    return [(one, [text(part) for part in one.cmd]) for one in described if isinstance(one, ExecuteProcess)]
+    return [
+        (one, [text(part) for part in one.cmd])
+        for one in described
+        if isinstance(one, ExecuteProcess)
+    ]

@@ -1,4 +1,5 @@
-"""Runs a program of docs/robots/ros2.md, which comes on stdin, four times; prints what came of each as a JSON line.
+"""Runs a program of docs/robots/ros2.md, which comes on stdin, four times; prints what came of each
+as a JSON line.
 
 Arguments: the program's class, and what `classify` gets, as JSON.
 """

@@ -1,4 +1,5 @@
-"""Another ROS 2 node, in a process of its own: prints what it hears as JSON lines, calls what it is told on stdin.
+"""Another ROS 2 node, in a process of its own: prints what it hears as JSON lines, calls what it is
+told on stdin.
 
 Runs with a Python that has rclpy; imports nothing of the project.
 """
@@ -26,12 +27,16 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 TRANSITIONS = {
-    "configure": Transition.TRANSITION_CONFIGURE, "activate": Transition.TRANSITION_ACTIVATE,
-    "deactivate": Transition.TRANSITION_DEACTIVATE, "cleanup": Transition.TRANSITION_CLEANUP,
-}  # fmt: skip
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+}
 STATES = {
-    GoalStatus.STATUS_SUCCEEDED: "succeeded", GoalStatus.STATUS_CANCELED: "canceled", GoalStatus.STATUS_ABORTED: "aborted",
-}  # fmt: skip
+    GoalStatus.STATUS_SUCCEEDED: "succeeded",
+    GoalStatus.STATUS_CANCELED: "canceled",
+    GoalStatus.STATUS_ABORTED: "aborted",
+}
 
 
 ONE_LINE = threading.Lock()
@@ -50,25 +55,40 @@ def status(topic: str, array: DiagnosticArray) -> None:
     values = {pair.key: pair.value for pair in one.values}
     stamp = array.header.stamp.sec + array.header.stamp.nanosec / 1e9
     tell(
-        topic=topic, level=one.level[0], name=one.name, message=one.message, values=values, stamp=stamp,
-        frame_id=array.header.frame_id, monotonic_ns=time.monotonic_ns(),
-    )  # fmt: skip
+        topic=topic,
+        level=one.level[0],
+        name=one.name,
+        message=one.message,
+        values=values,
+        stamp=stamp,
+        frame_id=array.header.frame_id,
+        monotonic_ns=time.monotonic_ns(),
+    )
 
 
 def listen(node: Node) -> None:
     """Subscribe to all that the box publishes."""
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(DiagnosticArray, "/palpate/verdict", lambda m: status("verdict", m), 50)
-    node.create_subscription(DiagnosticArray, "/palpate/state", lambda m: status("state", m), late)
-    node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: status("diagnostics", m), 10)
     node.create_subscription(
-        Image, "/palpate/frames",
+        DiagnosticArray, "/palpate/verdict", lambda m: status("verdict", m), 50
+    )
+    node.create_subscription(DiagnosticArray, "/palpate/state", lambda m: status("state", m), late)
+    node.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda m: status("diagnostics", m), 10
+    )
+    node.create_subscription(
+        Image,
+        "/palpate/frames",
         lambda m: tell(
-            topic="frames", shape=[m.height, m.width], encoding=m.encoding, step=m.step, data=m.data.tolist(),
+            topic="frames",
+            shape=[m.height, m.width],
+            encoding=m.encoding,
+            step=m.step,
+            data=m.data.tolist(),
             frame_id=m.header.frame_id,
         ),
         qos_profile_sensor_data,
-    )  # fmt: skip
+    )
 
 
 def fields(message: object) -> dict:
@@ -79,7 +99,8 @@ def fields(message: object) -> dict:
 class Sweeper:
     """Sends goals to the action, and cancels the one that was accepted last.
 
-    Hears feedback on its topic: rclpy's client passes none on once the result is there, and may see the result first.
+    Hears feedback on its topic: rclpy's client passes none on once the result is there, and may see
+    the result first.
     """
 
     def __init__(self, node: Node) -> None:
@@ -89,9 +110,11 @@ class Sweeper:
         self._client = ActionClient(node, Sweep, "/palpate/sweep")
         self._accepted = None
         node.create_subscription(
-            Sweep.Impl.FeedbackMessage, "/palpate/sweep/_action/feedback",
-            lambda m: tell(topic="feedback", **fields(m.feedback)), 10,
-        )  # fmt: skip
+            Sweep.Impl.FeedbackMessage,
+            "/palpate/sweep/_action/feedback",
+            lambda m: tell(topic="feedback", **fields(m.feedback)),
+            10,
+        )
 
     def send(self, **terms: float | bool) -> None:
         """Send a goal; what comes of it is printed."""
@@ -111,7 +134,9 @@ class Sweeper:
             return
         self._accepted = goal
         goal.get_result_async().add_done_callback(
-            lambda done: tell(topic="result", state=STATES[done.result().status], **fields(done.result().result))
+            lambda done: tell(
+                topic="result", state=STATES[done.result().status], **fields(done.result().result)
+            )
         )
 
 
@@ -122,13 +147,16 @@ def allow_writes(node: Node) -> None:
     client.wait_for_service(20)
     client.call_async(SetParameters.Request(parameters=[wanted])).add_done_callback(
         lambda done: tell(
-            service="allow_writes", success=done.result().results[0].successful, message=done.result().results[0].reason
+            service="allow_writes",
+            success=done.result().results[0].successful,
+            message=done.result().results[0].reason,
         )
     )
 
 
 def obey(node: Node, sweeper: Sweeper | None) -> None:
-    """Call the services that stdin names, one after the other; a JSON object is a goal of the action."""
+    """Call the services that stdin names, one after the other; a JSON object is a goal of the
+    action."""
     for line in sys.stdin:
         name = line.strip()
         if name.startswith("{"):
@@ -150,7 +178,9 @@ def obey(node: Node, sweeper: Sweeper | None) -> None:
             continue
         client.call_async(request).add_done_callback(
             lambda done, name=name: tell(
-                service=name, success=done.result().success, message=getattr(done.result(), "message", "")
+                service=name,
+                success=done.result().success,
+                message=getattr(done.result(), "message", ""),
             )
         )
 

@@ -1,5 +1,5 @@
-"""A board of PROTOCOL.md on a pseudo-terminal: requests are bytes, replies are packets. In: a board of the rig. Out: the
-path of a port, with a thread of this process as the board."""
+"""A board of PROTOCOL.md on a pseudo-terminal: requests are bytes, replies are packets. In: a board
+of the rig. Out: the path of a port, with a thread of this process as the board."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ TURN_S = 0.002
 
 
 class SerialBoard:
-    """A board behind a port at `path`, there while it is plugged in. board: may be exchanged while it is unplugged."""
+    """A board behind a port at `path`, there while it is plugged in. board: may be exchanged while
+    it is unplugged."""
 
     def __init__(self, board: rig.Board, stack: ExitStack) -> None:
         self.board = board

@@ -14,4 +14,11 @@ def sheared(each: int = 2, seed: int = 5, frames: int = FRAMES) -> Dataset:
     """Six tubes at nine positions, `each` sweeps [frames, 2, 2, 3] of each tube at each."""
     samples, labels, position = skin.sweep_set("T-REAL", seed, each, WORLD)
     first = (samples.shape[1] - frames) // 2
-    return Dataset(samples[:, first:][:, :frames], labels, skin.MATERIALS, 750.0, {"position": position}, "sheared")
+    return Dataset(
+        samples[:, first:][:, :frames],
+        labels,
+        skin.MATERIALS,
+        750.0,
+        {"position": position},
+        "sheared",
+    )

@@ -1,4 +1,5 @@
-"""A box on simulated devices, for tests: numbered frames, devices with an idle robot, the robot's end of the port."""
+"""A box on simulated devices, for tests: numbered frames, devices with an idle robot, the robot's
+end of the port."""
 
 from __future__ import annotations
 
@@ -21,17 +22,24 @@ SETTLE_S = 0.02
 
 
 def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
-    """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the axis."""
+    """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the
+    axis."""
     grid = np.arange(fmt.channels).reshape(1, *fmt.shape)
-    return ((np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(fmt.shape)) + grid).astype(fmt.numpy_type)
+    return ((np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(fmt.shape)) + grid).astype(
+        fmt.numpy_type
+    )
 
 
-def idle_devices(seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board) -> devices.SimDevices:
+def idle_devices(
+    seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board
+) -> devices.SimDevices:
     """Simulated devices whose skin sends numbered frames and whose robot does nothing."""
     n = min(round(seconds * fmt.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
     simulated = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
-    simulated.backend.board = rig.Board(fmt, simulated.robot, simulated.clock, **{"packet_frames": 4} | board)
+    simulated.backend.board = rig.Board(
+        fmt, simulated.robot, simulated.clock, **{"packet_frames": 4} | board
+    )
     return simulated
 
 
@@ -89,7 +97,9 @@ class Rigged:
 
     def edge(self, name: str, after_s: float, level: bool = True) -> None:
         """Drive an input line `after_s` from now."""
-        self.simulated.gpio.drive(name, level, self.simulated.clock.now_ns() + round(after_s * SECOND))
+        self.simulated.gpio.drive(
+            name, level, self.simulated.clock.now_ns() + round(after_s * SECOND)
+        )
 
     def pulse(self, name: str, after_s: float) -> None:
         """A pulse of 20 ms."""

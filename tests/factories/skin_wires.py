@@ -1,9 +1,10 @@
-"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: what its frames must hold, their bytes as they are
-described by the makers, and a port that delivers them with a driver's buffer and every fault.
+"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: what its frames must hold,
+their bytes as they are described by the makers, and a port that delivers them with a driver's
+buffer and every fault.
 
-The bytes are written a second time here and not taken from `appliance.sim.skins.wires`, on purpose: two readings of the
-same descriptions, with other choices where a skin leaves one (width of offsets, order of fields, separators), so that a
-mistake of one of them is not confirmed by itself.
+The bytes are written a second time here and not taken from `appliance.sim.skins.wires`, on purpose:
+two readings of the same descriptions, with other choices where a skin leaves one (width of offsets,
+order of fields, separators), so that a mistake of one of them is not confirmed by itself.
 """
 
 from __future__ import annotations
@@ -57,9 +58,14 @@ def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
 
 @lru_cache(20_000)
 def wire(name: str, i: int, period_ns: float = 1e6) -> bytes:
-    """Frame `i` of a delivered profile as bytes, put together from the makers' descriptions. period_ns: of its clock."""
+    """Frame `i` of a delivered profile as bytes, put together from the makers' descriptions.
+    period_ns: of its clock."""
     grid = numbers(profile(name), i)
-    return papillarray(grid, i, period_ns=period_ns) if name == "papillarray" else _WIRES[name](grid, i)
+    return (
+        papillarray(grid, i, period_ns=period_ns)
+        if name == "papillarray"
+        else _WIRES[name](grid, i)
+    )
 
 
 def _bytes_after_a_marker(grid: NDArray[np.generic], i: int) -> bytes:
@@ -75,21 +81,33 @@ def _one_line(grid: NDArray[np.generic], i: int) -> bytes:
 
 
 def _lines(grid: NDArray[np.generic], i: int) -> bytes:
-    return b"".join(" ".join(map(str, row)).encode() + b"\n" for row in grid[..., 0].tolist()) + b"\n"
+    return (
+        b"".join(" ".join(map(str, row)).encode() + b"\n" for row in grid[..., 0].tolist()) + b"\n"
+    )
 
 
-def papillarray(grid: NDArray[np.generic], i: int, sensors: int = 1, period_ns: float = 1e6) -> bytes:
-    """A PTS packet with blocks of type 1 and 3; offsets are one byte wide, counted from the byte that holds their width."""
+def papillarray(
+    grid: NDArray[np.generic], i: int, sensors: int = 1, period_ns: float = 1e6
+) -> bytes:
+    """A PTS packet with blocks of type 1 and 3; offsets are one byte wide, counted from the byte
+    that holds their width."""
     pillars = grid.reshape(-1, 6)
     each = len(pillars) // sensors
     clock = struct.pack("<IQ", (1000 + i) % (1 << 32), 5_000_000 + round(i * period_ns / 1000))
     body = struct.pack("<H", sensors) + bytes(sensors)
     for k in range(sensors):
         body += struct.pack("<H", each) + bytes(each)
-        body += b"".join(struct.pack("<H6f", 2, *row) for row in pillars[k * each : (k + 1) * each].tolist())
+        body += b"".join(
+            struct.pack("<H6f", 2, *row) for row in pillars[k * each : (k + 1) * each].tolist()
+        )
     table = 1 + 2 * 3
     content = bytes([1]) + struct.pack("<HBHB", 1, table, 3, table + len(clock)) + clock + body
-    return b"\x55\x66\x77\x88" + content + struct.pack("<H", sum(content) & 0xFFFF) + b"\xaa\xbb\xcc\xdd"
+    return (
+        b"\x55\x66\x77\x88"
+        + content
+        + struct.pack("<H", sum(content) & 0xFFFF)
+        + b"\xaa\xbb\xcc\xdd"
+    )
 
 
 def _can_lines(grid: NDArray[np.generic], i: int) -> bytes:
@@ -103,24 +121,33 @@ def _can_lines(grid: NDArray[np.generic], i: int) -> bytes:
 def _tsf_packet(grid: NDArray[np.generic], i: int) -> bytes:
     fields = b""
     for finger, part in enumerate(grid.reshape(-1, 28).tolist()):
-        fields += bytes([0x10 | finger << 2]) + struct.pack(">28H", *part) + bytes([0x20 | finger << 2]) + b"\x00\x07"
+        fields += (
+            bytes([0x10 | finger << 2])
+            + struct.pack(">28H", *part)
+            + bytes([0x20 | finger << 2])
+            + b"\x00\x07"
+        )
     return bytes([0x9A, 0, 0x61, len(fields)]) + fields
 
 
 _WIRES: dict[str, Callable[[NDArray[np.generic], int], bytes]] = {
-    "flexitac": _bytes_after_a_marker, "matrix": _bytes_after_a_marker, "anyskin": _floats_and_crlf,
-    "reskin": _one_line, "3d-vitac": _lines, "xela-can": _can_lines,
+    "flexitac": _bytes_after_a_marker,
+    "matrix": _bytes_after_a_marker,
+    "anyskin": _floats_and_crlf,
+    "reskin": _one_line,
+    "3d-vitac": _lines,
+    "xela-can": _can_lines,
     "robotiq-tsf": _tsf_packet,
-}  # fmt: skip
+}
 
 
 @dataclass
 class WirePort:
     """A serial port with a skin behind it, and the kernel's buffer between.
 
-    frames: bytes of frame i. period_ns: time between two. latency: from the end of a frame to the driver. capacity: bytes
-    that the driver keeps; what comes after is thrown away. mangle: changes the bytes of a frame on the cable. chunk: most
-    bytes of one read. sent: what the box wrote.
+    frames: bytes of frame i. period_ns: time between two. latency: from the end of a frame to the
+    driver. capacity: bytes that the driver keeps; what comes after is thrown away. mangle: changes
+    the bytes of a frame on the cable. chunk: most bytes of one read. sent: what the box wrote.
     """
 
     clock: VirtualClock
@@ -203,9 +230,15 @@ class WiredSkin:
     """A sensor on a skin of a delivered profile, in virtual time."""
 
     def __init__(
-        self, name: str, fmt: SweepFormat | None = None, *, rate: float = 1.0, clock: VirtualClock | None = None,
-        tap: TransferObserver | None = None, **settings: object,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        fmt: SweepFormat | None = None,
+        *,
+        rate: float = 1.0,
+        clock: VirtualClock | None = None,
+        tap: TransferObserver | None = None,
+        **settings: object,
+    ) -> None:
         self.name, self.profile, self.clock = name, profile(name), clock or VirtualClock()
         self.format = fmt or self.profile.format
         period_ns = self.profile.format.period_ns / rate
@@ -213,7 +246,13 @@ class WiredSkin:
         config = SensorConfig(skin=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]
         adapted = skin_profile.adapted(self.profile, config)
         self.sensor = SerialSensor(
-            config, adapted, self.format, self.clock, tap, open_port=self.port.open, ports=self.port.ports
+            config,
+            adapted,
+            self.format,
+            self.clock,
+            tap,
+            open_port=self.port.open,
+            ports=self.port.ports,
         )
         self.states: list[str] = []
         self.troubles: list[str] = []
@@ -232,7 +271,8 @@ class WiredSkin:
         return Frames.joined(parts)
 
     def which(self, frames: Frames) -> NDArray[np.int64]:
-        """Which of the frames on the wire each one is [n], by its content; fails for a frame that was never sent."""
+        """Which of the frames on the wire each one is [n], by its content; fails for a frame that
+        was never sent."""
         sent = {taxels(self.profile, i).tobytes(): i for i in range(199)}
         low = np.array([sent[one.tobytes()] for one in frames.taxels], np.int64)
         # the content repeats after 199 frames; the time tells which of them it is

@@ -21,31 +21,54 @@ IDENTITY = ("mine", "2", "9f3c2a1b", "4x4 uint8 at 750 Hz  window 1500", "skin-4
 Script = Callable[[Sentence], Iterable[bytes]]
 
 
-def state(skin: str = "streaming", answered: int = 0, *, sweeping: int = 0, bundle: str = "9f3c2a1b") -> bytes:
+def state(
+    skin: str = "streaming", answered: int = 0, *, sweeping: int = 0, bundle: str = "9f3c2a1b"
+) -> bytes:
     """An STA sentence."""
     return sentence("STA", "9.000", skin, sweeping, answered, *STREAMING[4:9], bundle, "sim")
 
 
-def result(sweep: int, status: str = "ok", label: str = "wood", share: str = "1.00", detail: str = "") -> bytes:
+def result(
+    sweep: int, status: str = "ok", label: str = "wood", share: str = "1.00", detail: str = ""
+) -> bytes:
     """A RES sentence."""
     return sentence(
-        "RES", sweep, "9.500", status, label, "0.900", "0.800", 1, 0, "1.25", "9f3c2a1b", "sim", share, detail
+        "RES",
+        sweep,
+        "9.500",
+        status,
+        label,
+        "0.900",
+        "0.800",
+        1,
+        0,
+        "1.25",
+        "9f3c2a1b",
+        "sim",
+        share,
+        detail,
     )
 
 
 def obeying(heard: Sentence) -> list[bytes]:
     """The box as it is while all is well: a sweep ends with STOP and is answered `ok`."""
-    fields: tuple[object, ...] = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}.get(heard.kind, ())
+    fields: tuple[object, ...] = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}.get(
+        heard.kind, ()
+    )
     if heard.kind == "LABEL":
         code = int(heard.fields[0])
         fields = (code, LABELS[code - 1], len(LABELS))
-    return [sentence("ANS", heard.kind, "ok", *fields), *([result(1)] if heard.kind == "STOP" else [])]
+    return [
+        sentence("ANS", heard.kind, "ok", *fields),
+        *([result(1)] if heard.kind == "STOP" else []),
+    ]
 
 
 class SpeakingBox:
     """Answers each command as the script says, and says what the test wants.
 
-    path: where the robot finds its end; `unplug` takes it away, `plug_in` brings it back. heard: the commands.
+    path: where the robot finds its end; `unplug` takes it away, `plug_in` brings it back. heard:
+    the commands.
     """
 
     def __init__(self, path: Path, script: Script = obeying) -> None:
@@ -93,7 +116,9 @@ class SpeakingBox:
     def wait_for(self, kind: str, timeout_s: float = 30) -> None:
         """Wait until a command has come."""
         with self._come:
-            assert self._come.wait_for(lambda: any(s.kind == kind for s in self.heard), timeout_s), self.heard
+            assert self._come.wait_for(
+                lambda: any(s.kind == kind for s in self.heard), timeout_s
+            ), self.heard
 
     def _listen(self) -> None:
         rest = b""
@@ -103,7 +128,9 @@ class SpeakingBox:
                     continue
                 found, rest = sentences.parse(os.read(self._ends[0], 4096), rest)
                 for one in found:
-                    with self._come:  # heard before it is answered: who has the answer may ask what was heard
+                    with (
+                        self._come
+                    ):  # heard before it is answered: who has the answer may ask what was heard
                         self.heard.append(one)
                         self._come.notify_all()
                     for line in self.script(one):

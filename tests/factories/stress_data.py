@@ -6,8 +6,11 @@ from typing import Any
 
 from train.evaluation import robustness
 
-SEVERITIES = {"dead": ("dead taxels", "taxels", [0.0, 1.0, 2.0]), "hum": ("50 Hz hum", "deviations", [0.0, 1.0, 2.0]),
-              "gain-up": ("higher gain", "share", [0.0, 0.2, 0.5])}  # fmt: skip
+SEVERITIES = {
+    "dead": ("dead taxels", "taxels", [0.0, 1.0, 2.0]),
+    "hum": ("50 Hz hum", "deviations", [0.0, 1.0, 2.0]),
+    "gain-up": ("higher gain", "share", [0.0, 0.2, 0.5]),
+}
 METHODS = {
     "default": {"dead": (98, 96, 80), "hum": (98, 90, 60), "gain-up": (98, 97, 97)},
     "minirocket": {"dead": (96, 50, 30), "hum": (96, 96, 40), "gain-up": (96, 95, 95)},
@@ -27,27 +30,60 @@ BOX = {
 
 
 def figures() -> dict[str, Any]:
-    """Of 100 sweeps and one seed; `quant` refused the set, and the method of the first place is ours."""
-    methods = robustness.merge([*(task(name, right) for name, right in METHODS.items()),
-                                {"method": "quant", "seed": 1, "set": "x", "refused": "needs aeon"}])["methods"]  # fmt: skip
+    """Of 100 sweeps and one seed; `quant` refused the set, and the method of the first place is
+    ours."""
+    methods = robustness.merge(
+        [
+            *(task(name, right) for name, right in METHODS.items()),
+            {"method": "quant", "seed": 1, "set": "x", "refused": "needs aeon"},
+        ]
+    )["methods"]
     box = robustness.merge([task(name, right) for name, right in BOX.items()])["methods"]
     return {
-        "sets": ["sim:T-REAL:101:2"], "methods": {name: methods[name] for name in (*METHODS, "quant")},
-        "box": {"bundle": {"name": "six", "version": "3", "id": "8933e0d5"},
-                "made": {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}},
-                "uninformative": {"silent": "no-contact"}, "curves": {name: entry["curves"] for name, entry in box.items()}},
-        "train": "sim:T-REAL:1", "train_sweeps": 540, "train_digest": "aa11", "test": "sim:T-REAL:101:2", "test_sweeps": 100,
-        "test_digest": "bb22", "attachments": 9, "format": "4x4 uint8 at 750 Hz, window 1500", "seeds": [1],
-        "commit": "c0ffee", "machine": "abacus, 2 cores",
-    }  # fmt: skip
+        "sets": ["sim:T-REAL:101:2"],
+        "methods": {name: methods[name] for name in (*METHODS, "quant")},
+        "box": {
+            "bundle": {"name": "six", "version": "3", "id": "8933e0d5"},
+            "made": {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}},
+            "uninformative": {"silent": "no-contact"},
+            "curves": {name: entry["curves"] for name, entry in box.items()},
+        },
+        "train": "sim:T-REAL:1",
+        "train_sweeps": 540,
+        "train_digest": "aa11",
+        "test": "sim:T-REAL:101:2",
+        "test_sweeps": 100,
+        "test_digest": "bb22",
+        "attachments": 9,
+        "format": "4x4 uint8 at 750 Hz, window 1500",
+        "seeds": [1],
+        "commit": "c0ffee",
+        "machine": "abacus, 2 cores",
+    }
 
 
 def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
     """What robustness.evaluate_method returns."""
     curves = {
-        key: {"title": title, "unit": unit, "about": f"about {key}", "severities": severities, "right": list(right[key]),
-              "low": [n / 100 - 0.05 for n in right[key]], "high": [n / 100 + 0.01 for n in right[key]], "broken": [0] * 3}
+        key: {
+            "title": title,
+            "unit": unit,
+            "about": f"about {key}",
+            "severities": severities,
+            "right": list(right[key]),
+            "low": [n / 100 - 0.05 for n in right[key]],
+            "high": [n / 100 + 0.01 for n in right[key]],
+            "broken": [0] * 3,
+        }
         for key, (title, unit, severities) in SEVERITIES.items()
-    }  # fmt: skip
-    return {"method": name, "seed": 1, "set": "sim:T-REAL:101:2", "refused": "", "total": 100, "ran": "", "curves": curves,
-            "trouble": {"silent": "finite"}}  # fmt: skip
+    }
+    return {
+        "method": name,
+        "seed": 1,
+        "set": "sim:T-REAL:101:2",
+        "refused": "",
+        "total": 100,
+        "ran": "",
+        "curves": curves,
+        "trouble": {"silent": "finite"},
+    }

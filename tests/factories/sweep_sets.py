@@ -10,13 +10,16 @@ from train.data.sets import Dataset
 
 
 def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> Dataset:
-    """Three materials that hum at different rates, `n` sweeps [64, 2, 2] of each, `pieces` to a recording."""
+    """Three materials that hum at different rates, `n` sweeps [64, 2, 2] of each, `pieces` to a
+    recording."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.05, 0.15, 0.35])[labels] * rng.uniform(0.9, 1.1, 3 * n)
     phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((3 * n, 1)))
     offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
-    samples = offset + 12 * np.sin(phase)[:, :, None, None] + 2 * rng.standard_normal((3 * n, 64, 2, 2))
+    samples = (
+        offset + 12 * np.sin(phase)[:, :, None, None] + 2 * rng.standard_normal((3 * n, 64, 2, 2))
+    )
     groups = {"recording": np.arange(3 * n) // pieces, "speed": np.arange(3 * n) // pieces % 4}
     return Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "easy")
 
@@ -39,14 +42,24 @@ def write(path: Path, **changes: object) -> str:
     return str(path)
 
 
-def tones(recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0) -> Dataset:
-    """Three materials that hum at 5, 11 and 23 Hz on a 2 x 1 skin at 100 Hz; `offset` distinguishes a material by its mean."""
+def tones(
+    recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0
+) -> Dataset:
+    """Three materials that hum at 5, 11 and 23 Hz on a 2 x 1 skin at 100 Hz; `offset` distinguishes
+    a material by its mean."""
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(3), recordings * windows)
     recording = np.arange(len(labels)) // windows
     t = np.arange(128) / 100
     phase = rng.uniform(0, 6, (len(labels), 1))
     hum = 20 * np.sin(2 * np.pi * np.array([5.0, 11.0, 23.0])[labels][:, None] * t + phase)
-    x = 200 + offset * labels[:, None, None] + hum[..., None] + noise * rng.standard_normal((len(labels), 128, 2))
+    x = (
+        200
+        + offset * labels[:, None, None]
+        + hum[..., None]
+        + noise * rng.standard_normal((len(labels), 128, 2))
+    )
     groups = {"recording": recording, "session": recording % 3}
-    return Dataset(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c"), 100.0, groups, "tones")
+    return Dataset(
+        np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c"), 100.0, groups, "tones"
+    )

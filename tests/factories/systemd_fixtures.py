@@ -1,7 +1,9 @@
-"""The fixtures of the tests under a real systemd: the machine, the box installed on it, its service. In: nothing. Out: these.
+"""The fixtures of the tests under a real systemd: the machine, the box installed on it, its
+service. In: nothing. Out: these.
 
-A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is simulated, in real time.
-PALPATE_SYSTEMD=1 makes what this needs (see nspawn.py) and fails without it; else what is missing is skipped.
+A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is
+simulated, in real time. PALPATE_SYSTEMD=1 makes what this needs (see nspawn.py) and fails without
+it; else what is missing is skipped.
 """
 
 from __future__ import annotations
@@ -50,7 +52,9 @@ def before(machine: nspawn.Machine) -> list[bool]:
 def service(machine: nspawn.Machine, before: list[bool]) -> Iterator[nspawn.Service]:
     """The installed service, stopped; stopped again and as it was delivered after the test."""
     yield nspawn.Service(machine)
-    machine.run("rm", "-rf", "/run/systemd/system/palpate.service.d", nspawn.SITE, "/run/skin", "/run/hang")
+    machine.run(
+        "rm", "-rf", "/run/systemd/system/palpate.service.d", nspawn.SITE, "/run/skin", "/run/hang"
+    )
     machine.get("systemctl", "daemon-reload")
     machine.get("systemctl", "stop", "palpate")
     machine.run("systemctl", "reset-failed", "palpate")

@@ -1,5 +1,6 @@
-"""A program on a terminal, for tests. In: the far end, the process. Out: what it shows, or an AssertionError with what it has shown
-so far; the process never outlives that, so that no test waits for it for ever.
+"""A program on a terminal, for tests. In: the far end, the process. Out: what it shows, or an
+AssertionError with what it has shown so far; the process never outlives that, so that no test waits
+for it for ever.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ def read(
         if not select.select([far], [], [], max(0.0, end_s - time.monotonic()))[0]:
             run.kill()
             run.wait()
-            raise AssertionError(f"the program was not done within {limit_s} s; it has shown {shown[-3000:]!r}")
+            raise AssertionError(
+                f"the program was not done within {limit_s} s; it has shown {shown[-3000:]!r}"
+            )
         try:
             more = os.read(far, 65536)
         except OSError:  # the terminal's end where the last writer has gone
@@ -45,4 +48,6 @@ def ended(run: subprocess.Popen[Any], shown: bytes, limit_s: float = LIMIT_S) ->
     except subprocess.TimeoutExpired as e:
         run.kill()
         run.wait()
-        raise AssertionError(f"the program did not end within {limit_s} s; it has shown {shown[-3000:]!r}") from e
+        raise AssertionError(
+            f"the program did not end within {limit_s} s; it has shown {shown[-3000:]!r}"
+        ) from e

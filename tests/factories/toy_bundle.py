@@ -1,7 +1,9 @@
-"""A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle, and windows for it.
+"""A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle,
+and windows for it.
 
-Its embedding is two of the taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its materials "a", "b" and
-"c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it looks at the normal one.
+Its embedding is two of the taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its
+materials "a", "b" and "c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it
+looks at the normal one.
 """
 
 from __future__ import annotations
@@ -26,31 +28,42 @@ KNOWN = Known(limit=9.0, temperature=2.0)
 MOVED = Moved(limit=4.0, temperature=3.0, unsure=0.75)
 """Rule for moved sweeps, with the arrays of `moved_arrays`."""
 IN_PLACE = ContactPositions(1.0, (0.5,), (0.5,), 0.25)
-"""The contact of a sweep with a small embedding is in the middle; a larger one draws it aside by up to this limit."""
+"""The contact of a sweep with a small embedding is in the middle; a larger one draws it aside by up
+to this limit."""
 LIMITS = Thresholds(contact=10, full_scale=32767, unsure=0.5)
 OUTPUTS = ("logits", "embedding")
 
 
 def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
-    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves. Shear is a tenth of it."""
+    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves.
+    Shear is a tenth of it."""
     level = np.full((fmt.rows, fmt.cols), 100.0)
     level[0, :2] += 10 * z1, 10 * z2
     ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
     normal = level + ripple
     shear = [0.1 * level + 2 * ripple] * (fmt.axes - 1)
-    return np.rint(np.stack([*shear, normal], axis=-1)).reshape(-1, *fmt.shape).astype(fmt.numpy_type)
+    return (
+        np.rint(np.stack([*shear, normal], axis=-1)).reshape(-1, *fmt.shape).astype(fmt.numpy_type)
+    )
 
 
-def sweep(z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT) -> Sweep:
+def sweep(
+    z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT
+) -> Sweep:
     """A good sweep with this embedding."""
     n = np.arange(fmt.window)
     return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, fmt)), object=object)
 
 
 def model(
-    outputs: Sequence[str] = OUTPUTS, steps: int = 3, fmt: SweepFormat = FORMAT, scale: float = 0.1, labels: int = 3
+    outputs: Sequence[str] = OUTPUTS,
+    steps: int = 3,
+    fmt: SweepFormat = FORMAT,
+    scale: float = 0.1,
+    labels: int = 3,
 ) -> bytes:
-    """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy of the logits."""
+    """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy
+    of the logits."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
     values = fmt.rows * fmt.cols * fmt.axes
@@ -58,10 +71,15 @@ def model(
     pick[fmt.axes - 1, 0] = pick[2 * fmt.axes - 1, 1] = scale
     bias = -(MEANS[:labels] ** 2).sum(1) / 2
     constants = {
-        "axes": np.array([1]), "flat": np.array([1, values]), "pick": pick, "shift": np.float32([-10, -10]),
-        "weights": MEANS[:labels].T / KNOWN.temperature, "bias": bias / np.float32(KNOWN.temperature),
-        "one": np.array([1, 1, labels]), "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
-    }  # fmt: skip
+        "axes": np.array([1]),
+        "flat": np.array([1, values]),
+        "pick": pick,
+        "shift": np.float32([-10, -10]),
+        "weights": MEANS[:labels].T / KNOWN.temperature,
+        "bias": bias / np.float32(KNOWN.temperature),
+        "one": np.array([1, 1, labels]),
+        "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
+    }
     nodes = [
         node("Cast", ["sweep"], ["float"], to=1),
         node("ReduceMean", ["float", "axes"], ["mean"], keepdims=0),
@@ -77,12 +95,15 @@ def model(
     value = onnx.helper.make_tensor_value_info
     kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.numpy_type)
     graph = onnx.helper.make_graph(
-        nodes, "toy",
+        nodes,
+        "toy",
         [value("sweep", kind, [1, fmt.window, *fmt.shape])],
         [value(name, 1, shapes.get(name, [1, labels])) for name in outputs],
         [array(values, name) for name, values in constants.items()],
-    )  # fmt: skip
-    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    )
+    made = onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9
+    )
     return bytes(made.SerializeToString())
 
 
@@ -103,38 +124,66 @@ def npy(array: np.ndarray) -> bytes:
 def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of means.npz."""
     bias = -(MEANS**2).sum(1) / 2
-    return {"means": MEANS, "bias": bias, "sweeps": np.zeros(3, np.int64), "spread": np.ones(3, np.float32)} | changes
+    return {
+        "means": MEANS,
+        "bias": bias,
+        "sweeps": np.zeros(3, np.int64),
+        "spread": np.ones(3, np.float32),
+    } | changes
 
 
 def moved_arrays() -> dict[str, np.ndarray]:
-    """More arrays of means.npz: in place "a" scatters twice as far in the second direction; moved sweeps scatter ten times
-    as far in the first, and lie a tenth further in it."""
+    """More arrays of means.npz: in place "a" scatters twice as far in the second direction; moved
+    sweeps scatter ten times as far in the first, and lie a tenth further in it."""
     shapes = np.stack([np.eye(1)] * 3).astype(np.float16)
     turn = np.diag([0.1, 1]).astype(np.float32)
     at = (MEANS @ turn + [0.1, 0]).astype(np.float32)
-    return {"shapes": shapes * np.float16([0.5, 1, 1])[:, None, None], "moved_turn": turn, "moved_means": at,
-            "moved_shapes": shapes}  # fmt: skip
+    return {
+        "shapes": shapes * np.float16([0.5, 1, 1])[:, None, None],
+        "moved_turn": turn,
+        "moved_means": at,
+        "moved_shapes": shapes,
+    }
 
 
 def files(
-    *, known: Known | None = KNOWN, early: Early | None = None, outputs: Sequence[str] = OUTPUTS,
-    fmt: SweepFormat = FORMAT, arrays: dict[str, np.ndarray] | None = None, moved: Moved | None = None,
-    place: ContactPositions | None = None, **graph: float,
-) -> dict[str, bytes]:  # fmt: skip
+    *,
+    known: Known | None = KNOWN,
+    early: Early | None = None,
+    outputs: Sequence[str] = OUTPUTS,
+    fmt: SweepFormat = FORMAT,
+    arrays: dict[str, np.ndarray] | None = None,
+    moved: Moved | None = None,
+    place: ContactPositions | None = None,
+    **graph: float,
+) -> dict[str, bytes]:
     """The files of a toy bundle by name."""
     arrays = means() if arrays is None else arrays
     at = np.stack([window(2.5, 0.5, fmt), window(0.5, 3.5, fmt)])
     z = np.zeros((2, arrays["means"].shape[1]), np.float32)
     z[:, :2] = [[2.5, 0.5], [0.5, 3.5]]
     logits = (z @ arrays["means"].T + arrays["bias"]) / KNOWN.temperature
-    content = {bundle.MODEL: model(outputs, fmt=fmt, **graph), bundle.GOLDEN: npz(samples=at, logits=logits)}
+    content = {
+        bundle.MODEL: model(outputs, fmt=fmt, **graph),
+        bundle.GOLDEN: npz(samples=at, logits=logits),
+    }
     if known:
         content[bundle.MEANS] = npz(**arrays)
     manifest = Manifest(
-        "toy", "1", fmt, "raw", tuple("abcdef"[: logits.shape[1]]), LIMITS,
-        {k: bundle.file_entry(v) for k, v in content.items()}, figures={"LOPO": {"accuracy": 1.0}}, made={"seed": 1},
-        early=early, known=known, moved=moved, place=place,
-    )  # fmt: skip
+        "toy",
+        "1",
+        fmt,
+        "raw",
+        tuple("abcdef"[: logits.shape[1]]),
+        LIMITS,
+        {k: bundle.file_entry(v) for k, v in content.items()},
+        figures={"LOPO": {"accuracy": 1.0}},
+        made={"seed": 1},
+        early=early,
+        known=known,
+        moved=moved,
+        place=place,
+    )
     return content | {bundle.MANIFEST: manifest.json()}
 
 

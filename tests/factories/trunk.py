@@ -10,16 +10,26 @@ FORM = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
 def trunk(form: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
-    """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths, `tenths` [1, 10, F]."""
+    """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths,
+    `tenths` [1, 10, F]."""
     g, taxels, length = GraphBuilder(), form.rows * form.cols, form.window // 10
     x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=1)
     x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
-    x = g("ReduceMean", g("Reshape", x, g.constant([10, length, taxels], "int64")), axes=[1], keepdims=0)
+    x = g(
+        "ReduceMean",
+        g("Reshape", x, g.constant([10, length, taxels], "int64")),
+        axes=[1],
+        keepdims=0,
+    )
     x = g("MatMul", g.constant(np.tri(10) / np.arange(1, 11)[:, None]), x)
     name, shape = ("tenths", [1, 10, taxels]) if tenths else ("features", [1, taxels])
     x = x if tenths else g("Slice", x, g.constant([9], "int64"), g.constant([10], "int64"))
     g("Reshape", x, g.constant(shape, "int64"), output=name)
-    given = onnx.helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols])
+    given = onnx.helper.make_tensor_value_info(
+        "sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols]
+    )
     out = onnx.helper.make_tensor_value_info(name, 1, shape)
     graph = onnx.helper.make_graph(g.nodes, "toy", [given], [out], g.constants)
-    return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    return onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8
+    )

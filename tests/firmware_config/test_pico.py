@@ -1,4 +1,5 @@
-"""The Pico's firmware as a whole, under MicroPython itself, at a pseudo-terminal that the box reads."""
+"""The Pico's firmware as a whole, under MicroPython itself, at a pseudo-terminal that the box
+reads."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ FORM = {"ROWS": 3, "COLS": 5, "RATE_HZ": 200}
 class PortReader:
     """The box's sensor at a board's port."""
 
-    def __init__(self, port: str, rows: int = 3, cols: int = 5, rate_hz: float = 200, dtype: str = "uint8") -> None:
+    def __init__(
+        self, port: str, rows: int = 3, cols: int = 5, rate_hz: float = 200, dtype: str = "uint8"
+    ) -> None:
         sensor = config.load(None, site=NO_SITE).sensor
         self.format = SweepFormat(rows, cols, rate_hz, 100, dtype)
         # silence: on a busy machine the interpreter may not run for a while
@@ -63,7 +66,8 @@ def scans(frames: Frames) -> np.ndarray:
 
 
 def check_all_there(frames: Frames) -> None:
-    """Nothing that the board took is missing: what is, its interrupt had come too late for, and the numbers tell."""
+    """Nothing that the board took is missing: what is, its interrupt had come too late for, and the
+    numbers tell."""
     assert (np.diff(scans(frames)) % 97 == 1).all()
     assert (np.diff(frames.seq) >= 1).all()
 
@@ -77,8 +81,11 @@ def check_all_there(frames: Frames) -> None:
     ],
 )
 def test_the_box_reads_it(form: dict[str, Any]) -> None:
-    """Identity, format and frames with each taxel at its place, through multiplexers that the firmware switches."""
-    given = {name.lower(): form[name] for name in ("ROWS", "COLS", "RATE_HZ", "DTYPE") if name in form}
+    """Identity, format and frames with each taxel at its place, through multiplexers that the
+    firmware switches."""
+    given = {
+        name.lower(): form[name] for name in ("ROWS", "COLS", "RATE_HZ", "DTYPE") if name in form
+    }
     with pico.plugged_in(**form) as port, PortReader(port, **given) as reader:
         check_all_there(reader.frames(100))
         who, counters = reader.sensor.identity, reader.sensor.counters
@@ -102,8 +109,13 @@ def test_it_is_taken_up_again() -> None:
 
 
 def test_counters_wrap() -> None:
-    """Sequence number, device time and the Pico's ticks wrap while the box reads: nothing is lost, repeated or restarted."""
-    near = {"seq": [65536 - 50, 65535], "t_us": [65536 - 30_000, 65535 - 3], "ticks": (1 << 30) - 400_000}
+    """Sequence number, device time and the Pico's ticks wrap while the box reads: nothing is lost,
+    repeated or restarted."""
+    near = {
+        "seq": [65536 - 50, 65535],
+        "t_us": [65536 - 30_000, 65535 - 3],
+        "ticks": (1 << 30) - 400_000,
+    }
     with pico.plugged_in(**FORM, **near) as port, PortReader(port) as reader:
         frames = reader.frames(200)
         check_all_there(frames)
@@ -114,12 +126,16 @@ def test_counters_wrap() -> None:
 
 
 def test_late_interrupts_cost_frames_and_not_the_clock() -> None:
-    """Every twentieth interrupt comes 30 ms late: the numbers tell what was not taken, and clock and count agree."""
+    """Every twentieth interrupt comes 30 ms late: the numbers tell what was not taken, and clock
+    and count agree."""
     with pico.plugged_in(**FORM, late_ms=30, late_every=20) as port, PortReader(port) as reader:
         frames = reader.frames(200)
         check_all_there(frames)
         assert reader.sensor.counters.lost_frames >= 200 / 20 * 3
-        assert (reader.sensor.counters.fifo_overflows, reader.sensor.counters.enumerations) == (0, 1)
+        assert (reader.sensor.counters.fifo_overflows, reader.sensor.counters.enumerations) == (
+            0,
+            1,
+        )
 
 
 def ask(link: BoardLink, request: packets.Request) -> bytes:
@@ -134,7 +150,8 @@ def ask(link: BoardLink, request: packets.Request) -> bytes:
 
 
 def test_requests_in_the_middle_of_frames() -> None:
-    """Between requests and other bytes in any order the stream stays whole, and each request is answered."""
+    """Between requests and other bytes in any order the stream stays whole, and each request is
+    answered."""
     with pico.plugged_in(**FORM) as port:
         fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
         data, asked, end_s = b"", 0, time.monotonic() + LIMIT_S
@@ -156,7 +173,8 @@ def test_requests_in_the_middle_of_frames() -> None:
 
 
 def test_a_reader_that_stops() -> None:
-    """The FIFO runs over: the oldest frames go, a flag says so, and numbers and content go on as if all had been read."""
+    """The FIFO runs over: the oldest frames go, a flag says so, and numbers and content go on as if
+    all had been read."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
         link = BoardLink(port, 115200, SystemClock())
         form = packets.unpack_format(ask(link, packets.Request.FORMAT))
@@ -164,13 +182,17 @@ def test_a_reader_that_stops() -> None:
         # 205 kB a second: some 70 kB fit the kernel's buffers, 0.25 s the FIFO
         time.sleep(2)
         data, end_s = b"", time.monotonic() + LIMIT_S
-        while not (read := packets.unpack(data)).packets or not any(p.flags for p in read.packets[:-100]):
+        while not (read := packets.unpack(data)).packets or not any(
+            p.flags for p in read.packets[:-100]
+        ):
             assert time.monotonic() < end_s
             data += link.read(65536, 1000)
         link.close()
     assert read.garbage == 0
     flagged = [i for i, p in enumerate(read.packets) if p.flags & packets.Flag.OVERFLOW]
-    gaps = [i for i, (a, b) in enumerate(pairwise(read.packets), 1) if b.seq != a.seq + len(a.taxels)]
+    gaps = [
+        i for i, (a, b) in enumerate(pairwise(read.packets), 1) if b.seq != a.seq + len(a.taxels)
+    ]
     assert set(flagged) <= set(gaps)
     lost = read.packets[flagged[0]].seq - read.packets[flagged[0] - 1].seq
     assert lost > 1
@@ -193,7 +215,9 @@ def test_stop_ends_the_stream() -> None:
             data += link.read(65536, 1000)
         link.request(packets.Request.STOP, 0)
         data = data + link.read(65536, 100)
-        link.request(packets.Request.FORMAT, 0)  # read below: all before it was sent before it was asked
+        link.request(
+            packets.Request.FORMAT, 0
+        )  # read below: all before it was sent before it was asked
         while not packets.unpack(data).replies:
             assert time.monotonic() < end_s
             data += link.read(65536, 1000)
@@ -237,7 +261,8 @@ def allocating(change: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_an_interrupt_allocates_nothing(dtype: str) -> None:
-    """3000 frames with gaps, through a FIFO that runs over, with the heap locked; the same with one allocation fails."""
+    """3000 frames with gaps, through a FIFO that runs over, with the heap locked; the same with one
+    allocation fails."""
     done = allocating(f"settings.DTYPE = {dtype!r}; settings.FIFO_S = 0.5")
     assert done.stdout == "nothing True\n", done.stderr
     worse = allocating("main.readout.Fifo.filled = lambda self: [0] * 100")
@@ -256,9 +281,16 @@ def test_an_interrupt_allocates_nothing(dtype: str) -> None:
 )
 def test_settings_that_cannot_be(options: dict[str, Any], message: str) -> None:
     """The last line of what MicroPython prints names the setting, its value and what to do."""
-    command = [pico.interpreter(), str(pico.SHELL), str(pico.FIRMWARE), json.dumps({"RATE_HZ": 750} | options)]
+    command = [
+        pico.interpreter(),
+        str(pico.SHELL),
+        str(pico.FIRMWARE),
+        json.dumps({"RATE_HZ": 750} | options),
+    ]
     ended = subprocess.run(command, input=b"\1", capture_output=True, timeout=LIMIT_S)
-    said = (ended.stderr + ended.stdout).decode().splitlines()  # MicroPython prints an error on either
+    said = (
+        (ended.stderr + ended.stdout).decode().splitlines()
+    )  # MicroPython prints an error on either
     assert [line for line in said if line != "serves"][-1] == message
     assert ended.returncode == 1
 
@@ -277,11 +309,19 @@ def test_the_page_has_the_budget_that_is_calculated() -> None:
 
 def test_the_page_names_pins_and_settings_as_they_are() -> None:
     """The wiring table and the settings agree, and settle times are those of the budget."""
-    done = pico.run("-c", "import settings, budget; print(settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, "
-                    "settings.SERVICE_PIN, settings.SETTLE_US, budget.settle_us(8), budget.settle_us(12))")  # fmt: skip
+    done = pico.run(
+        "-c",
+        "import settings, budget; print(settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, "
+        "settings.SERVICE_PIN, settings.SETTLE_US, budget.settle_us(8), budget.settle_us(12))",
+    )
     assert done.stdout.startswith("(2, 3, 4, 5) (6, 7, 8, 9) 26 22 5 4.39"), done.stderr
     page = (pico.FIRMWARE / "README.md").read_text()
-    for row in ("| GP2, GP3, GP4, GP5 | 4, 5, 6, 7 |", "| GP6, GP7, GP8, GP9 |", "| GP26 / ADC0 |", "| GP22 |"):
+    for row in (
+        "| GP2, GP3, GP4, GP5 | 4, 5, 6, 7 |",
+        "| GP6, GP7, GP8, GP9 |",
+        "| GP26 / ADC0 |",
+        "| GP22 |",
+    ):
         assert row in page
 
 
@@ -309,6 +349,12 @@ except OSError:
 
 
 def test_ctrl_c_is_a_byte_while_it_serves() -> None:
-    """The number of START must not interrupt the program; after an error the prompt has its Ctrl-C again."""
+    """The number of START must not interrupt the program; after an error the prompt has its Ctrl-C
+    again."""
     done = pico.run("-c", CTRL_C.format(folder=str(pico.SHELL.parent)))
-    assert done.stdout.splitlines() == ["kbd_intr -1", "serving", "kbd_intr 3", "still running False"], done.stderr
+    assert done.stdout.splitlines() == [
+        "kbd_intr -1",
+        "serving",
+        "kbd_intr 3",
+        "still running False",
+    ], done.stderr

@@ -1,4 +1,5 @@
-"""The Pico's readout without pins, under this Python: bytes, order of reading, counters, FIFO, requests."""
+"""The Pico's readout without pins, under this Python: bytes, order of reading, counters, FIFO,
+requests."""
 
 from __future__ import annotations
 
@@ -17,16 +18,26 @@ SMALL = 1 << 30
 
 
 class DrivenBoard:
-    """A Readout whose time and interrupts a test makes. Its frames hold their scan's number in each taxel."""
+    """A Readout whose time and interrupts a test makes. Its frames hold their scan's number in each
+    taxel."""
 
     def __init__(self, ticks=0, wrap=SMALL, level=0, **settings):
         counters = {name: settings.pop(name) for name in ("seq", "t_us") if name in settings}
         self.ticks, self.wrap, self.level, self.scans = ticks, wrap, level, 0
-        self.form = readout.Form(**{"rows": 2, "cols": 3, "rate_hz": 1000, "fifo_s": 0.25} | settings)
+        self.form = readout.Form(
+            **{"rows": 2, "cols": 3, "rate_hz": 1000, "fifo_s": 0.25} | settings
+        )
         self.board = readout.Readout(
-            self.form, "0123456789abcdef", self.scan, lambda: self.level, self, self, lambda: 0, lambda state: None,
+            self.form,
+            "0123456789abcdef",
+            self.scan,
+            lambda: self.level,
+            self,
+            self,
+            lambda: 0,
+            lambda state: None,
             **counters,
-        )  # fmt: skip
+        )
         self.callback = None
 
     def scan(self, buffer, at):
@@ -67,7 +78,12 @@ class DrivenBoard:
         for _ in range(times):
             self.ticks = (self.ticks + (self.form.period_us if us is None else us)) % self.wrap
             self.board.tick()
-            held = [v for part in (self.board, self.board._fifo) for v in vars(part).values() if isinstance(v, int)]
+            held = [
+                v
+                for part in (self.board, self.board._fifo)
+                for v in vars(part).values()
+                if isinstance(v, int)
+            ]
             assert all(abs(v) < SMALL for v in held), "an integer that a Pico allocates"
 
     def sent(self):
@@ -110,12 +126,19 @@ def test_a_setting_that_cannot_be_is_named(settings, named):
     ("settings", "form"),
     [
         ({"rows": 4, "cols": 4, "rate_hz": 750, "fifo_s": 1}, (4, 4, "uint8", 750.188, 756, 6)),
-        ({"rows": 16, "cols": 16, "rate_hz": 100, "fifo_s": 1, "dtype": "uint16"}, (16, 16, "uint16", 100, 100, 1)),
-        ({"rows": 16, "cols": 16, "rate_hz": 10000, "dtype": "uint16"}, (16, 16, "uint16", 10000, 2504, 8)),
+        (
+            {"rows": 16, "cols": 16, "rate_hz": 100, "fifo_s": 1, "dtype": "uint16"},
+            (16, 16, "uint16", 100, 100, 1),
+        ),
+        (
+            {"rows": 16, "cols": 16, "rate_hz": 10000, "dtype": "uint16"},
+            (16, 16, "uint16", 10000, 2504, 8),
+        ),
     ],
 )
 def test_replies_are_those_of_the_protocol(settings, form):
-    """Byte by byte what the box's encoder makes; the FIFO is not shorter than asked, the rate is the timer's."""
+    """Byte by byte what the box's encoder makes; the FIFO is not shorter than asked, the rate is
+    the timer's."""
     made = DrivenBoard(**settings)
     made.ask(readout.IDENTITY)
     who = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-pico", "0123456789abcdef")
@@ -129,7 +152,8 @@ def test_replies_are_those_of_the_protocol(settings, form):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("level", [0, 1])
 def test_packets_are_those_of_the_protocol(dtype, level):
-    """Byte by byte what the box's encoder makes of the same frames, with the trigger line of the first."""
+    """Byte by byte what the box's encoder makes of the same frames, with the trigger line of the
+    first."""
     made = DrivenBoard(dtype=dtype, level=level, seq=(65534, 7))
     made.ask(readout.START)
     made.tick(8)
@@ -140,7 +164,8 @@ def test_packets_are_those_of_the_protocol(dtype, level):
 
 @pytest.mark.parametrize(("rows", "cols"), [*itertools.product(range(1, 17), range(1, 17))])
 def test_every_taxel_is_read_once_at_its_place(rows, cols):
-    """The select lines stand at its row and column when it is read; at the end they are low again, as at the beginning."""
+    """The select lines stand at its row and column when it is read; at the end they are low again,
+    as at the beginning."""
     at, seen, order = 0, [], readout.reading_order(rows, cols)
     for line, level, taxel in zip(*order, strict=True):
         at = at & ~(1 << line) | level << line
@@ -159,7 +184,11 @@ def test_numbers_and_times_follow_one_another():
     made.ask(readout.START)
     made.tick(24)
     got = made.packets()
-    assert [(p.seq, p.t_us, len(p.taxels)) for p in got] == [(0, 1000, 8), (8, 9000, 8), (16, 17000, 8)]
+    assert [(p.seq, p.t_us, len(p.taxels)) for p in got] == [
+        (0, 1000, 8),
+        (8, 9000, 8),
+        (16, 17000, 8),
+    ]
     assert (np.concatenate([p.taxels[:, 1, 2] for p in got]) == np.arange(24)).all()
 
 
@@ -177,7 +206,8 @@ def test_counters_wrap_where_the_protocol_says():
 
 @pytest.mark.parametrize(("late_us", "missed"), [(400, 0), (600, 1), (2400, 2), (100_600, 101)])
 def test_a_late_interrupt_keeps_count_and_clock_together(late_us, missed):
-    """Frames that were not taken keep their numbers; interrupts that had waited take no frame twice."""
+    """Frames that were not taken keep their numbers; interrupts that had waited take no frame
+    twice."""
     made = DrivenBoard()
     made.ask(readout.START)
     made.tick(8)
@@ -203,7 +233,8 @@ def test_a_packet_ends_where_numbers_do_not_follow():
 
 
 def test_a_full_fifo_drops_the_oldest_and_says_so_once():
-    """The announced depth is kept; the packet after the loss carries the flag, the next does not."""
+    """The announced depth is kept; the packet after the loss carries the flag, the next does
+    not."""
     made = DrivenBoard()
     made.ask(readout.START)
     depth = made.form.packets * made.form.packet_frames
@@ -230,7 +261,8 @@ def test_what_is_being_sent_is_not_overwritten():
 
 
 def test_start_and_stop():
-    """START while it runs changes nothing, STOP drops what was not sent, and numbers go on after the next START."""
+    """START while it runs changes nothing, STOP drops what was not sent, and numbers go on after
+    the next START."""
     made = DrivenBoard()
     made.ask(readout.STOP)
     assert made.callback is None
@@ -260,7 +292,8 @@ def test_other_bytes_are_left_alone():
 
 
 class SlowPort:
-    """A port that takes a few bytes at a time, or nothing, and hands requests out at given turns."""
+    """A port that takes a few bytes at a time, or nothing, and hands requests out at given
+    turns."""
 
     def __init__(self, made, requests, chunks):
         self.made, self.requests, self.chunks = made, dict(requests), itertools.cycle(chunks)
@@ -290,7 +323,8 @@ class SlowPort:
 
 @pytest.mark.parametrize("chunks", [(1000,), (7,), (64, 0, 0, 3)])
 def test_replies_wait_for_the_end_of_a_packet(chunks):
-    """However little the port takes at a time, no packet is torn apart by a request that comes in its middle."""
+    """However little the port takes at a time, no packet is torn apart by a request that comes in
+    its middle."""
     made = DrivenBoard()
     asked = {
         2: readout.START,

@@ -1,7 +1,9 @@
-"""Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for each, a seed. Out: a line
-of figures for each target, the smallest corpus that covers as much, and in crashes/ each input that broke a promise.
+"""Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for
+each, a seed. Out: a line of figures for each target, the smallest corpus that covers as much, and
+in crashes/ each input that broke a promise.
 
-What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an interruption.
+What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an
+interruption.
 """
 
 from __future__ import annotations
@@ -24,12 +26,14 @@ LONGEST_INPUT = 5000
 LONGEST_SAVED = 2048
 """Bytes of an input that is saved: longer ones do the same things more often."""
 OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=300", "-print_final_stats=1", "-reload=0")
-"""libFuzzer counts seconds of the clock, so its limit is only for what never ends; the engine has one in processor time."""
+"""libFuzzer counts seconds of the clock, so its limit is only for what never ends; the engine has
+one in processor time."""
 
 
 @dataclass(frozen=True, slots=True)
 class FuzzRun:
-    """Figures of one run of libFuzzer. coverage: places of the instrumented code. features: places with their counts."""
+    """Figures of one run of libFuzzer. coverage: places of the instrumented code. features: places
+    with their counts."""
 
     executions: int
     coverage: int
@@ -40,10 +44,17 @@ class FuzzRun:
 
 def main() -> int:
     """Fuzz the named targets, or all, one after another; 1 where a promise was broken."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split("\n\n")[0])
-    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"from {', '.join(TARGETS)}; all by default")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.fuzz", description=__doc__.split("\n\n")[0]
+    )
     parser.add_argument(
-        "--minutes", type=float, default=10, help="processor time for each target, 0 only to merge (%(default)s)"
+        "targets", nargs="*", metavar="TARGET", help=f"from {', '.join(TARGETS)}; all by default"
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=10,
+        help="processor time for each target, 0 only to merge (%(default)s)",
     )
     parser.add_argument("--seed", type=int, default=1, help="of the generator (%(default)s)")
     given = parser.parse_args()
@@ -62,15 +73,24 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
     (place / "words").write_text("".join(f'"{word}"\n' for word in words), "ascii")
     before = _engine(target, 0, "-runs=0", inputs)
     run = _engine(
-        target, minutes * 60, f"-runs={-1 if minutes else 0}", f"-seed={seed}", f"-dict={place / 'words'}", inputs
+        target,
+        minutes * 60,
+        f"-runs={-1 if minutes else 0}",
+        f"-seed={seed}",
+        f"-dict={place / 'words'}",
+        inputs,
     )
     smallest = place / "smallest"
     rmtree(smallest, ignore_errors=True)
     smallest.mkdir()
     _engine(target, 0, "-merge=1", smallest, inputs)
-    kept = [file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED]
+    kept = [
+        file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED
+    ]
     if not kept:
-        raise SystemExit(f"{target}: the merge kept no input; see {place / 'log'}; the saved corpus stays as it is")
+        raise SystemExit(
+            f"{target}: the merge kept no input; see {place / 'log'}; the saved corpus stays as it is"
+        )
     corpus.save(target, kept)
     print(
         f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, {run.executions / run.cpu_s:.0f}/s; "
@@ -91,7 +111,15 @@ def _engine(target: str, seconds: float, *options: object) -> FuzzRun:
     found = WORK / target / "found"
     rmtree(found, ignore_errors=True)
     found.mkdir()
-    command = [sys.executable, "-m", "tests.fuzz.engine", target, str(seconds), *OPTIONS, f"-artifact_prefix={found}/"]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.fuzz.engine",
+        target,
+        str(seconds),
+        *OPTIONS,
+        f"-artifact_prefix={found}/",
+    ]
     begin = _cpu_s()
     log = WORK / target / "log"
     with log.open("wb") as file:
@@ -99,9 +127,13 @@ def _engine(target: str, seconds: float, *options: object) -> FuzzRun:
     text = log.read_text("utf-8", "replace")
     broke = [corpus.keep_crash(target, file.read_bytes()) for file in sorted(found.iterdir())]
     if done.returncode and not broke:
-        raise SystemExit(f"{target}: the fuzzer ended with {done.returncode}; see {log}\n{text[-2000:]}")
+        raise SystemExit(
+            f"{target}: the fuzzer ended with {done.returncode}; see {log}\n{text[-2000:]}"
+        )
     states = re.findall(r"cov: (\d+) ft: (\d+)", text) or [("0", "0")]
-    count = re.findall(r"number_of_executed_units: (\d+)|^#(\d+)", text, re.MULTILINE) or [("0", "0")]
+    count = re.findall(r"number_of_executed_units: (\d+)|^#(\d+)", text, re.MULTILINE) or [
+        ("0", "0")
+    ]
     executions = max(int(a or b) for a, b in count)
     return FuzzRun(executions, *map(int, states[-1]), _cpu_s() - begin, broke)
 

@@ -1,4 +1,5 @@
-"""The saved inputs: one text file a target, one input a line, written as Python writes bytes, the shortest first.
+"""The saved inputs: one text file a target, one input a line, written as Python writes bytes, the
+shortest first.
 
 So a person reads in a change what was added, and no tool is needed to look inside.
 """
@@ -17,7 +18,11 @@ CRASHES = Path(__file__).with_name("crashes")
 def load(target: str) -> list[bytes]:
     """The saved inputs of a target; none where none were saved."""
     file = SAVED / f"{target}.txt"
-    return [literal_eval(line) for line in file.read_text("ascii").splitlines()] if file.exists() else []
+    return (
+        [literal_eval(line) for line in file.read_text("ascii").splitlines()]
+        if file.exists()
+        else []
+    )
 
 
 def save(target: str, inputs: Iterable[bytes]) -> None:

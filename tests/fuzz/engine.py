@@ -1,4 +1,5 @@
-"""One fuzzing process: Atheris (libFuzzer) drives one target. In: the target's name, CPU seconds, libFuzzer's options.
+"""One fuzzing process: Atheris (libFuzzer) drives one target. In: the target's name, CPU seconds,
+libFuzzer's options.
 
 It is started by the runner, since libFuzzer ends the process that it runs in.
 """
@@ -21,7 +22,8 @@ with atheris.instrument_imports(include=["appliance", "tomllib", "train.data"]):
 from tests.fuzz.mutators import MUTATORS
 
 MEMORY = 1 << 30
-"""Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError, which is a crash."""
+"""Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError,
+which is a crash."""
 
 SLOW_S = 10
 """An input that takes longer, in processor time, is a crash, too."""

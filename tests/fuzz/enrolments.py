@@ -1,5 +1,6 @@
-"""What must hold of enrolment.npz. In: any bytes, beside a small bundle. Out: nothing, or an error where a promise is broken, as
-in `targets`; also where its fuzzing begins, and changes that leave the archive readable.
+"""What must hold of enrolment.npz. In: any bytes, beside a small bundle. Out: nothing, or an error
+where a promise is broken, as in `targets`; also where its fuzzing begins, and changes that leave
+the archive readable.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def read(data: bytes, folder: Path) -> Bundle:
 
 
 def target(data: bytes, folder: Path) -> None:
-    """enrolled.applied: labels that can be sent, and nothing else, are added to what was signed; or a BundleError."""
+    """enrolled.applied: labels that can be sent, and nothing else, are added to what was signed; or
+    a BundleError."""
     old = small()
     try:
         got = read(data, folder)
@@ -52,7 +54,11 @@ def target(data: bytes, folder: Path) -> None:
     assert labels[:n] == old.manifest.labels
     assert n < len(labels) == len(set(labels))
     assert all(bundle.LABEL.fullmatch(label) for label in labels)
-    assert (got.model, got.format, got.manifest.thresholds) == (old.model, old.format, old.manifest.thresholds)
+    assert (got.model, got.format, got.manifest.thresholds) == (
+        old.model,
+        old.format,
+        old.manifest.thresholds,
+    )
     assert got.manifest.known == old.manifest.known
     assert got.manifest.early is None, "early heads do not know the label"
     assert old.classes
@@ -61,10 +67,16 @@ def target(data: bytes, folder: Path) -> None:
         assert np.isfinite(values).all(), f"{name} is not finite"
         if not name.startswith("moved_turn"):
             assert len(values) == len(labels)
-            assert values[:n].tobytes() == old.classes.arrays()[name].tobytes(), f"{name} of a trained label changed"
+            assert values[:n].tobytes() == old.classes.arrays()[name].tobytes(), (
+                f"{name} of a trained label changed"
+            )
     assert set(got.enrolled) == set(labels[n:])
     assert all(1 <= sweeps <= MOST_SWEEPS for sweeps in got.enrolled.values())
-    assert got.golden.shape == (len(old.golden) + len(labels) - n, old.format.window, *old.format.shape)
+    assert got.golden.shape == (
+        len(old.golden) + len(labels) - n,
+        old.format.window,
+        *old.format.shape,
+    )
     assert got.golden[: len(old.golden)].tobytes() == old.golden.tobytes()
     assert got.golden_logits.shape == (len(got.golden), len(labels))
     assert np.isfinite(got.golden_logits).all()
@@ -84,30 +96,53 @@ def _right(labels: int) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """One to three labels; of each array another value that is refused; another bundle's, a label that is taken, none."""
+    """One to three labels; of each array another value that is refused; another bundle's, a label
+    that is taken, none."""
     right = [_right(1), _right(2), _right(3)]
     with np.load(io.BytesIO(right[0])) as z:
         arrays = dict(z.items())
     wrong = [
-        ("means", np.full((1, 2), np.nan, np.float32)), ("means", np.zeros((1, 3), np.float32)),
-        ("means", np.full((1, 2), 3e38, np.float32)), ("spread", np.float32([0.5])), ("sweeps", np.int64([0])),
-        ("sweeps", np.int64([1 << 60])), ("changes", arrays["changes"][:1]), ("logits", arrays["logits"][1:]),
-        ("base", np.array("0" * 64)), ("labels", np.array(["a"])), ("labels", np.array(["a,b"])),
-        ("labels", np.array([], "<U4")), ("labels", np.array(["cork", "cork"])),
-    ]  # fmt: skip
-    return [*right, *(packing.packed(**arrays | {name: value}) for name, value in wrong), right[0][:200], b"PK"]
+        ("means", np.full((1, 2), np.nan, np.float32)),
+        ("means", np.zeros((1, 3), np.float32)),
+        ("means", np.full((1, 2), 3e38, np.float32)),
+        ("spread", np.float32([0.5])),
+        ("sweeps", np.int64([0])),
+        ("sweeps", np.int64([1 << 60])),
+        ("changes", arrays["changes"][:1]),
+        ("logits", arrays["logits"][1:]),
+        ("base", np.array("0" * 64)),
+        ("labels", np.array(["a"])),
+        ("labels", np.array(["a,b"])),
+        ("labels", np.array([], "<U4")),
+        ("labels", np.array(["cork", "cork"])),
+    ]
+    return [
+        *right,
+        *(packing.packed(**arrays | {name: value}) for name, value in wrong),
+        right[0][:200],
+        b"PK",
+    ]
 
 
 def words() -> list[bytes]:
     """Names of arrays, and of numpy's head."""
-    return [*(f"{name}.npy".encode() for name in enrolled.ARRAYS), b"'<f4'", b"'<U4'", b"'shape': (1,)", b"PK\x03\x04"]
+    return [
+        *(f"{name}.npy".encode() for name in enrolled.ARRAYS),
+        b"'<f4'",
+        b"'<U4'",
+        b"'shape': (1,)",
+        b"PK\x03\x04",
+    ]
 
 
 def mutated(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> bytes:
-    """One or two arrays changed, taken out or written twice, and the archive made right again; or bytes changed."""
+    """One or two arrays changed, taken out or written twice, and the archive made right again; or
+    bytes changed."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
-            arrays = {name: values for name, values in z.items() if isinstance(values, np.ndarray)}  # else plain bytes
+            arrays = {
+                name: values for name, values in z.items() if isinstance(values, np.ndarray)
+            }  # else plain bytes
     except Exception:  # whatever numpy says of an archive that is not one
         return plain(data)
     if not arrays or random.random() < 0.2:
@@ -116,7 +151,9 @@ def mutated(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> byt
         name = random.choice(list(arrays))
         values = arrays[name]
         if values.dtype.kind in "iuf" and values.size and random.random() < 0.7:
-            values.ravel()[random.randrange(values.size)] = random.choice((1, 2, 7, 100))  # as it may be
+            values.ravel()[random.randrange(values.size)] = random.choice(
+                (1, 2, 7, 100)
+            )  # as it may be
         else:
             arrays[name] = changed(values, random)
         if len(arrays) > 1 and random.random() < 0.05:

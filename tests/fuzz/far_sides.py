@@ -1,5 +1,6 @@
-"""What must hold of what a controller sends over Modbus, and of files that a person imports. In: any bytes. Out: nothing, or an
-error where a promise is broken, as in `targets`; also where their fuzzing begins, and what their formats are made of.
+"""What must hold of what a controller sends over Modbus, and of files that a person imports. In:
+any bytes. Out: nothing, or an error where a promise is broken, as in `targets`; also where their
+fuzzing begins, and what their formats are made of.
 """
 
 from __future__ import annotations
@@ -22,13 +23,18 @@ REGISTERS = [0] * 100
 WORDS = {
     "modbus": [struct.pack(">H", number) for number in (0, 1, 6, 125, 2000, 0xFF00, 0xFFFF)],
     "import-text": [b",", b";", b"\t", b"\n", b"1e999", b"nan", b"# ", b'"', b"-0.0", b"0x1p3"],
-    "import-mat": [b"IM", b"MI", *(struct.pack("<II", kind, 8) for kind in (1, 2, 5, 6, 9, 14, 15))],
+    "import-mat": [
+        b"IM",
+        b"MI",
+        *(struct.pack("<II", kind, 8) for kind in (1, 2, 5, 6, 9, 14, 15)),
+    ],
 }
 """What each format is made of."""
 
 
 def modbus(data: bytes, folder: Path) -> None:
-    """modbus_pdu: the same requests wherever the bytes were cut, each read or refused, and replies that fit a packet."""
+    """modbus_pdu: the same requests wherever the bytes were cut, each read or refused, and replies
+    that fit a packet."""
     try:
         found, rest = modbus_pdu.requests(data)
     except FormatError as e:
@@ -48,7 +54,11 @@ def modbus(data: bytes, folder: Path) -> None:
 def _reply(request: ModbusRequest) -> bytes:
     try:
         wanted = modbus_pdu.parse(request.pdu)
-        return modbus_pdu.read(wanted, REGISTERS) if isinstance(wanted, Reading) else modbus_pdu.written(request.pdu)
+        return (
+            modbus_pdu.read(wanted, REGISTERS)
+            if isinstance(wanted, Reading)
+            else modbus_pdu.written(request.pdu)
+        )
     except RequestRefused as e:
         return modbus_pdu.refusal(request.pdu, e.fault)
 
@@ -79,7 +89,12 @@ def modbus_seeds() -> list[bytes]:
 
 def text_seeds() -> list[bytes]:
     """Tables as people keep them: with and without a head, with commas, semicolons or spaces."""
-    return [b"t,a,b\n0,1,2\n1,3,4\n", b"1;2\n3;4\n", b"# rate 100\n1 2 3\n4 5 6\n", b"\xef\xbb\xbfa\tb\n1\t-2.5e3\n"]
+    return [
+        b"t,a,b\n0,1,2\n1,3,4\n",
+        b"1;2\n3;4\n",
+        b"# rate 100\n1 2 3\n4 5 6\n",
+        b"\xef\xbb\xbfa\tb\n1\t-2.5e3\n",
+    ]
 
 
 def mat_seeds() -> list[bytes]:
@@ -87,7 +102,11 @@ def mat_seeds() -> list[bytes]:
     found = []
     for packed in (False, True):
         file = io.BytesIO()
-        savemat(file, {"x": np.arange(6.0).reshape(2, 3), "y": np.arange(4, dtype=np.int16)}, do_compression=packed)
+        savemat(
+            file,
+            {"x": np.arange(6.0).reshape(2, 3), "y": np.arange(4, dtype=np.int16)},
+            do_compression=packed,
+        )
         found.append(file.getvalue())
     return found
 

@@ -1,5 +1,6 @@
-"""What must hold of files: a site file, a bundle's manifest, a recorded sweep (.npy with its .json), a capture. In: any
-bytes, and a folder that they are written to. Out: nothing, or an error where a promise is broken, as in `targets`.
+"""What must hold of files: a site file, a bundle's manifest, a recorded sweep (.npy with its
+.json), a capture. In: any bytes, and a folder that they are written to. Out: nothing, or an error
+where a promise is broken, as in `targets`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def one_line(error: Exception) -> str:
 
 
 def settings(data: bytes, folder: Path) -> None:
-    """config.load: a site file is a Config within its limits that is described and loads again, or a ConfigError."""
+    """config.load: a site file is a Config within its limits that is described and loads again, or
+    a ConfigError."""
     site = folder / "palpate.toml"
     (folder / "board-a.toml").write_text(BOARD)
     site.write_bytes(data)
@@ -52,12 +54,16 @@ def settings(data: bytes, folder: Path) -> None:
             assert least <= value <= most, f"{name} = {value!r}"
             assert not value % field.metadata.get("step", 1) or "step" not in field.metadata
         for text in value if isinstance(value, tuple) else (value,):
-            assert not isinstance(text, str) or text.isprintable(), f"{name} = {value!r} cannot be shown"
+            assert not isinstance(text, str) or text.isprintable(), (
+                f"{name} = {value!r} cannot be shown"
+            )
         assert "Literal" not in hint or repr(value) in hint.replace('"', "'"), f"{name} = {value!r}"
     lines = config.describe(got)
     assert len(lines.splitlines()) == len(got.sources)
     site.write_text(lines, "utf-8")
-    assert config.load(None, folder=folder, site=site) == got, "what describe says loads as something else"
+    assert config.load(None, folder=folder, site=site) == got, (
+        "what describe says loads as something else"
+    )
 
 
 def _values(got: config.Config) -> Iterator[tuple[str, Any, Any, str]]:
@@ -66,7 +72,12 @@ def _values(got: config.Config) -> Iterator[tuple[str, Any, Any, str]]:
         group = getattr(got, section.name)
         if is_dataclass(group):
             for field in fields(group):
-                yield f"{section.name}.{field.name}", getattr(group, field.name), field, str(field.type)
+                yield (
+                    f"{section.name}.{field.name}",
+                    getattr(group, field.name),
+                    field,
+                    str(field.type),
+                )
 
 
 def _names_the_place(message: str, data: bytes) -> None:
@@ -77,12 +88,15 @@ def _names_the_place(message: str, data: bytes) -> None:
     except (ValueError, RecursionError):
         assert "not TOML" in message, message
         return
-    shown = (form for key in table for form in (key, repr(key)[1:-1], f"{repr(key)[:77]}..."))  # a long one is cut
+    shown = (
+        form for key in table for form in (key, repr(key)[1:-1], f"{repr(key)[:77]}...")
+    )  # a long one is cut
     assert any(form in message for form in shown), message
 
 
 def manifest(data: bytes, folder: Path) -> None:
-    """bundle.load: a manifest.json beside the default bundle's other files is a usable Bundle, or a BundleError."""
+    """bundle.load: a manifest.json beside the default bundle's other files is a usable Bundle, or a
+    BundleError."""
     for name in (bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
         if not (folder / name).exists():
             (folder / name).write_bytes((bundle.DEFAULT / name).read_bytes())
@@ -94,7 +108,9 @@ def manifest(data: bytes, folder: Path) -> None:
     except BundleError as e:
         one_line(e)
         return
-    assert got.manifest == read or read != read, "two readings of one manifest differ"  # NaN among the figures
+    assert got.manifest == read or read != read, (
+        "two readings of one manifest differ"
+    )  # NaN among the figures
     assert re.fullmatch("[0-9a-f]{8}", got.id)
     assert set(got.enrolled) <= set(read.labels)
     assert got.golden.shape[1:] == (read.format.window, *read.format.shape)
@@ -122,11 +138,14 @@ def _usable(read: bundle.Manifest) -> None:
     assert isinstance(read.figures, dict)
     again = read.json()
     assert json.loads(again).keys() | {"unloaded"} == {field.name for field in fields(read)}
-    assert bundle.Manifest.parse(again).json() == again, "what a manifest writes reads as something else"
+    assert bundle.Manifest.parse(again).json() == again, (
+        "what a manifest writes reads as something else"
+    )
 
 
 def recording(data: bytes, folder: Path) -> None:
-    """sweep.load: a sidecar and what begins with numpy's magic are a Sweep that saves and loads again, or a FormatError."""
+    """sweep.load: a sidecar and what begins with numpy's magic are a Sweep that saves and loads
+    again, or a FormatError."""
     about, magic, table = data.partition(NPY)
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)
@@ -154,7 +173,8 @@ def recording(data: bytes, folder: Path) -> None:
 
 
 def played(data: bytes, folder: Path) -> None:
-    """capture.Playback: a file plays to its end in as many turns as it has records, or is a FormatError."""
+    """capture.Playback: a file plays to its end in as many turns as it has records, or is a
+    FormatError."""
     file = folder / "capture"
     file.write_bytes(data)
     try:

@@ -1,5 +1,5 @@
-"""Changes that keep a format's form, so that they come past its checksums and brackets. In: an input, a generator, and
-the fuzzer's own mutator. Out: another input.
+"""Changes that keep a format's form, so that they come past its checksums and brackets. In: an
+input, a generator, and the fuzzer's own mutator. Out: another input.
 """
 
 from __future__ import annotations
@@ -20,9 +20,33 @@ Plain = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Plain], bytes]
 
 ODD: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, 2, 4, 4.0, 1500.0, 10**400, 1e-320, float("nan"), float("inf"), "", "a", "\n", "\ud800",
-    "x" * 300, [], {}, [[]], {"a": {}}, "means.npz", "raw", "L",
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    2,
+    4,
+    4.0,
+    1500.0,
+    10**400,
+    1e-320,
+    float("nan"),
+    float("inf"),
+    "",
+    "a",
+    "\n",
+    "\ud800",
+    "x" * 300,
+    [],
+    {},
+    [[]],
+    {"a": {}},
+    "means.npz",
+    "raw",
+    "L",
+)
 
 
 def rearranged(pieces: list[bytes], random: Random) -> bytes:
@@ -35,17 +59,21 @@ def rearranged(pieces: list[bytes], random: Random) -> bytes:
 
 
 def parts(split: Callable[[bytes], list[bytes]]) -> Mutator:
-    """A mutator that rearranges what follows the first of the pieces that `split` finds, or changes bytes."""
+    """A mutator that rearranges what follows the first of the pieces that `split` finds, or changes
+    bytes."""
 
     def mutate(data: bytes, random: Random, plain: Plain) -> bytes:
         head, *pieces = split(data)
-        return head + rearranged(pieces, random) if pieces and random.random() < 0.5 else plain(data)
+        return (
+            head + rearranged(pieces, random) if pieces and random.random() < 0.5 else plain(data)
+        )
 
     return mutate
 
 
 def packets(data: bytes, random: Random, plain: Plain) -> bytes:
-    """Packets left out, repeated or put elsewhere, bytes changed, and then most checksums made right again."""
+    """Packets left out, repeated or put elsewhere, bytes changed, and then most checksums made
+    right again."""
     pieces = [p for p in re.split(rb"(?=\x50\xc1)", data) if p]
     data = rearranged(pieces, random) if pieces and random.random() < 0.3 else plain(data)
     changed = bytearray(data)
@@ -79,7 +107,8 @@ def tables(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def trees(data: bytes, random: Random, plain: Plain) -> bytes:
-    """One place in the JSON gets an odd value, another place's value or another name, or is left out; or bytes change."""
+    """One place in the JSON gets an odd value, another place's value or another name, or is left
+    out; or bytes change."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -95,7 +124,9 @@ def trees(data: bytes, random: Random, plain: Plain) -> bytes:
         elif isinstance(branch, dict) and random.random() < 0.2:
             branch.pop(key, None)
         elif isinstance(branch, dict) or key < len(branch):
-            value = random.choice((random.choice(ODD), other.get(name) if isinstance(other, dict) else name))
+            value = random.choice(
+                (random.choice(ODD), other.get(name) if isinstance(other, dict) else name)
+            )
             branch[key] = value if value is not branch else None
     try:
         return json.dumps(tree).encode()
@@ -104,7 +135,8 @@ def trees(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def headed(data: bytes, random: Random, plain: Plain) -> bytes:
-    """The JSON at the head changed as `trees` does, or the bytes after it; a length before it is made right again."""
+    """The JSON at the head changed as `trees` does, or the bytes after it; a length before it is
+    made right again."""
     start, end = data.find(b"{"), data.find(b"}\x93") + 1 or data.find(b"}") + 1
     if not 0 <= start < end or random.random() < 0.3:
         return plain(data)
@@ -118,13 +150,18 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def frames(data: bytes, random: Random, plain: Plain) -> bytes:
-    """A skin's frames left out, repeated or put elsewhere, or bytes changed; then most sums of PapillArray made right."""
-    pieces = [p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p]
+    """A skin's frames left out, repeated or put elsewhere, or bytes changed; then most sums of
+    PapillArray made right."""
+    pieces = [
+        p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p
+    ]
     data = rearranged(pieces, random) if len(pieces) > 1 and random.random() < 0.4 else plain(data)
 
     def seal(match: re.Match[bytes]) -> bytes:
         right = (sum(match[1]) & 0xFFFF).to_bytes(2, "little")
-        return match[0] if random.random() < 0.2 else match[0][:4] + match[1] + right + match[0][-4:]
+        return (
+            match[0] if random.random() < 0.2 else match[0][:4] + match[1] + right + match[0][-4:]
+        )
 
     return re.sub(rb"(?s)\x55\x66\x77\x88(.*?)..\xaa\xbb\xcc\xdd", seal, data)
 

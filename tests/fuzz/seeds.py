@@ -1,5 +1,5 @@
-"""Where each target begins, and the words that its format knows. In: the simulator, PROTOCOL.md, the board files and the
-default bundle. Out: inputs and dictionary words, both bytes.
+"""Where each target begins, and the words that its format knows. In: the simulator, PROTOCOL.md,
+the board files and the default bundle. Out: inputs and dictionary words, both bytes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,16 @@ import numpy as np
 
 from appliance.bundle import bundle
 from appliance.core import config, sentences
-from appliance.core.types import DATA_TYPES, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat, save
+from appliance.core.types import (
+    DATA_TYPES,
+    Edge,
+    EdgeKind,
+    Frames,
+    Status,
+    Sweep,
+    SweepFormat,
+    save,
+)
 from appliance.io import packets, robot_link
 from appliance.io.skin_profile import SkinProfile
 from appliance.recording.capture import MAGIC, CaptureWriter
@@ -26,20 +35,40 @@ from tests.fuzz import enrolments, far_sides, skins
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
-    packets.MAGIC, packets.VERSION, packets.PacketKind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0, 0, 0, 0, 0
+    packets.MAGIC,
+    packets.VERSION,
+    packets.PacketKind.REPLY,
+    packets.MAX_PAYLOAD,
+    0,
+    1,
+    0,
+    0,
+    0,
+    0,
+    0,
+    0,
 )
 """The header of the largest packet there can be; what follows waits for its end."""
 
 
 def unpack() -> list[bytes]:
-    """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken ones."""
+    """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken
+    ones."""
     frames = next(iter(script.tubes(1, 1))).frames[:60]
-    sent = [packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6]) for i in range(5)]
-    others = [packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW) for d in DATA_TYPES]
+    sent = [
+        packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6])
+        for i in range(5)
+    ]
+    others = [
+        packets.pack(7, 9, np.arange(12).reshape(2, 2, 3).astype(d), packets.Flag.OVERFLOW)
+        for d in DATA_TYPES
+    ]
     axes = packets.pack(7, 9, np.arange(54, dtype=np.float32).reshape(2, 3, 3, 3))
     who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
     form = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
-    replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(packets.Request.FORMAT, form)
+    replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(
+        packets.Request.FORMAT, form
+    )
     restarted = packets.pack(900_000, 5, frames[:1]) + packets.pack(0, 6, frames[1:2])
     swapped = sent[0] + sent[2] + sent[1] + sent[1]
     broken = sent[0][:60] + sent[1] + b"\x50" + sent[2][:-1] + b"\0" + sent[3]
@@ -62,7 +91,8 @@ def unpack() -> list[bytes]:
 
 
 def command() -> list[bytes]:
-    """Each command as a program and as a person sends it, the document's sentences, and lines that are none."""
+    """Each command as a program and as a person sends it, the document's sentences, and lines that
+    are none."""
     sealed = [
         sentences.sentence(name, *["plastic rough"] * (name in robot_link.TEXT_COMMANDS))
         for name in robot_link.COMMANDS
@@ -70,25 +100,51 @@ def command() -> list[bytes]:
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
     written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
     by_hand = [b"PPLP," + name.encode() + b"\n" for name in robot_link.COMMANDS]
-    return [b"".join(sealed), b"".join(by_hand), *sealed, *written, b"$PPLP,ID*00\r\n", b"x" * 130 + b"\nPPLP,NEW\n"]
+    return [
+        b"".join(sealed),
+        b"".join(by_hand),
+        *sealed,
+        *written,
+        b"$PPLP,ID*00\r\n",
+        b"x" * 130 + b"\nPPLP,NEW\n",
+    ]
 
 
 def feed() -> list[bytes]:
-    """What a reader may ask for, at once and in one line, the document's examples, and lines that are no requests."""
-    asked = [json.dumps(one).encode() for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})]
+    """What a reader may ask for, at once and in one line, the document's examples, and lines that
+    are no requests."""
+    asked = [
+        json.dumps(one).encode()
+        for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})
+    ]
     both = json.dumps({"frames": 5, "sweeps": False}).encode()
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
-    written = [text.encode() + b"\n" for text in re.findall(r"`(\{[^`]*\})`", protocol) if "HZ" not in text]
-    wrong = [b'{"frames": 21}\n', b"{}\n", b"[[\n", b"x" * 1100, b'{"frames": true}\n', b'{"frames": NaN}\n', b"\n"]
+    written = [
+        text.encode() + b"\n" for text in re.findall(r"`(\{[^`]*\})`", protocol) if "HZ" not in text
+    ]
+    wrong = [
+        b'{"frames": 21}\n',
+        b"{}\n",
+        b"[[\n",
+        b"x" * 1100,
+        b'{"frames": true}\n',
+        b'{"frames": NaN}\n',
+        b"\n",
+    ]
     return [b"\n".join([*asked, both, b""]), both + b"\n", *written, *wrong]
 
 
 def settings() -> list[bytes]:
-    """The files that come with the box without their comments, and all settings as `palpate config` prints them."""
+    """The files that come with the box without their comments, and all settings as `palpate config`
+    prints them."""
     files = sorted((ROOT / "firmware_config").glob("*.toml"))
-    values = ["".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files]
+    values = [
+        "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files
+    ]
     whole = config.describe(config.load(None, site=Path("/dev/null")))
-    return [text.encode() for text in (*values, whole, 'board = "a"\n[sweep]\nmax_duration_s = 3\n')]
+    return [
+        text.encode() for text in (*values, whole, 'board = "a"\n[sweep]\nmax_duration_s = 3\n')
+    ]
 
 
 def manifest() -> list[bytes]:
@@ -110,7 +166,9 @@ def recording() -> list[bytes]:
     )
     for fmt in skins:
         taxels = np.arange(4 * fmt.channels).reshape(4, *fmt.shape).astype(fmt.numpy_type)
-        sweep = Sweep(1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a")
+        sweep = Sweep(
+            1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a"
+        )
         with TemporaryDirectory() as folder:
             path = Path(folder) / "sweep.npy"
             save(path, sweep, fmt)
@@ -138,30 +196,59 @@ def capture() -> list[bytes]:
 
 
 SEEDS: dict[str, Callable[[], list[bytes]]] = {
-    **{f.__name__: f for f in (unpack, command, feed, settings, manifest, recording, capture)}, "profile": skins.profile_seeds,
+    **{f.__name__: f for f in (unpack, command, feed, settings, manifest, recording, capture)},
+    "profile": skins.profile_seeds,
     "enrolment": enrolments.seeds,
     **far_sides.SEEDS,
     **{f"skin-{name}": partial(skins.seeds, name) for name in skins.GRIDS},
-}  # fmt: skip
+}
 
 
 def words(target: str) -> Sequence[bytes]:
     """What the target's format is made of."""
     if target == "unpack":
-        return [packets.MAGIC, ENDLESS, *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind)]
+        return [
+            packets.MAGIC,
+            ENDLESS,
+            *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind),
+        ]
     if target == "command":
         return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
     if target in far_sides.WORDS:
         return far_sides.WORDS[target]
     if target == "feed":
-        return [b'{"frames": ', b'"sweeps": true', b"NaN", b"1e999", b"-0.0", b"null", b"}\n", b", "]
+        return [
+            b'{"frames": ',
+            b'"sweeps": true',
+            b"NaN",
+            b"1e999",
+            b"-0.0",
+            b"null",
+            b"}\n",
+            b", ",
+        ]
     if target == "settings":
         groups = {
-            f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name)) for f in fields(config.Config)
+            f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name))
+            for f in fields(config.Config)
         }
         sections = {name: group for name, group in groups.items() if is_dataclass(group)}
         keys = [f.name for group in sections.values() for f in fields(group)]
-        odd = ["board = ", " = ", '"', "[", "]", "true", "nan", "-0.0", "1e-9", "0x", '"\\u0000"', "1979-05-27", "'''"]
+        odd = [
+            "board = ",
+            " = ",
+            '"',
+            "[",
+            "]",
+            "true",
+            "nan",
+            "-0.0",
+            "1e-9",
+            "0x",
+            '"\\u0000"',
+            "1979-05-27",
+            "'''",
+        ]
         return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *odd)]
     if target == "enrolment":
         return enrolments.words()
@@ -175,6 +262,22 @@ def words(target: str) -> Sequence[bytes]:
         "capture": (SweepFormat,),
     }
     names = [f.name for kind in kinds[target] for f in fields(kind)]
-    odd = ["NaN", "Infinity", "1e999", "4.0", "-1", "true", "null", '"\\ud800"', '"\\n"', "{}", "[]", "[[[["]
-    magic = {"recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"], "capture": [MAGIC]}.get(target, [])
+    odd = [
+        "NaN",
+        "Infinity",
+        "1e999",
+        "4.0",
+        "-1",
+        "true",
+        "null",
+        '"\\ud800"',
+        '"\\n"',
+        "{}",
+        "[]",
+        "[[[[",
+    ]
+    magic = {
+        "recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"],
+        "capture": [MAGIC],
+    }.get(target, [])
     return [*magic, *(text.encode() for text in (*(f'"{name}"' for name in names), *odd))]

@@ -1,9 +1,10 @@
-"""What must hold of skins: of each codec, whatever bytes come, and of the reader of profiles, whatever a file holds. In:
-any bytes, and a folder that a file is written to. Out: nothing, or an error where a promise is broken, as in `targets`.
+"""What must hold of skins: of each codec, whatever bytes come, and of the reader of profiles,
+whatever a file holds. In: any bytes, and a folder that a file is written to. Out: nothing, or an
+error where a promise is broken, as in `targets`.
 
-Promises of a codec: in parts as at once; garbage is counted and what is left over is bounded; no frame is invented. For
-the last, each frame that comes out is looked for in the bytes by a second reading that is slow and made from the skins'
-published layouts, not from the codecs.
+Promises of a codec: in parts as at once; garbage is counted and what is left over is bounded; no
+frame is invented. For the last, each frame that comes out is looked for in the bytes by a second
+reading that is slow and made from the skins' published layouts, not from the codecs.
 """
 
 from __future__ import annotations
@@ -27,17 +28,23 @@ from tests.skins.subjects import PROFILES, subject
 MOST_REST = 70_000
 """Bytes that a codec may keep waiting for more, of any skin: some frames of the largest."""
 GRIDS = {
-    "flexitac": (2, 3), "anyskin": (1, 2), "reskin": (1, 2), "3d-vitac": (2, 3), "papillarray": (3, 3), "xela-can": (1, 2),
+    "flexitac": (2, 3),
+    "anyskin": (1, 2),
+    "reskin": (1, 2),
+    "3d-vitac": (2, 3),
+    "papillarray": (3, 3),
+    "xela-can": (1, 2),
     "robotiq-tsf": (7, 4),
-}  # fmt: skip
-"""Grids on the wire, small enough that an input holds some frames. One skin of each codec; of the codecs for markers and
-for text two, which use other parts of them."""
+}
+"""Grids on the wire, small enough that an input holds some frames. One skin of each codec; of the
+codecs for markers and for text two, which use other parts of them."""
 SUBJECTS = {name: subject(name, *grid, n=16) for name, grid in GRIDS.items()}
 CODECS = {name: codec(subject.profile) for name, subject in SUBJECTS.items()}
 """Made here, so that their modules are imported where the fuzzer instruments them."""
 
 Enclosed = Callable[[SkinProfile, bytes], Iterator[bytes]]
-"""A profile and the bytes up to the end of a frame -> every content that such a frame can have, as the numbers' bytes."""
+"""A profile and the bytes up to the end of a frame -> every content that such a frame can have, as
+the numbers' bytes."""
 
 
 def target(name: str) -> Callable[[bytes, Path], None]:
@@ -55,12 +62,16 @@ def _decode(profile: SkinProfile, read: Codec, enclosed: Enclosed, data: bytes) 
     _sound(profile, got, data)
     for end, taxels in zip(got.ends.tolist(), got.taxels, strict=True):
         content = taxels.tobytes()
-        assert any(content == other for other in enclosed(profile, data[:end])), f"no such frame ends at {end}"
+        assert any(content == other for other in enclosed(profile, data[:end])), (
+            f"no such frame ends at {end}"
+        )
     for cut in {len(data) // 2, data[-1] % len(data)} if data else {0}:
         first = read(Rest(), data[:cut])
         then = read(first.rest, data[cut:])
         parts = np.concatenate([first.taxels, then.taxels])
-        assert parts.tobytes() == got.taxels.tobytes(), f"cut at {cut}, {len(parts)} frames in place of {len(got)}"
+        assert parts.tobytes() == got.taxels.tobytes(), (
+            f"cut at {cut}, {len(parts)} frames in place of {len(got)}"
+        )
         assert first.garbage + then.garbage == got.garbage, f"cut at {cut}, other bytes are garbage"
         assert then.rest.data == got.rest.data
 
@@ -89,13 +100,15 @@ def _fixed(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
     frame = before[-(len(profile.marker) + size + len(profile.trailer)) :]
     if frame.startswith(profile.marker) and frame.endswith(profile.trailer):
         wire = np.frombuffer(
-            frame[len(profile.marker) :][:size], kind.newbyteorder(">" if profile.byte_order == "big" else "<")
+            frame[len(profile.marker) :][:size],
+            kind.newbyteorder(">" if profile.byte_order == "big" else "<"),
         )
         yield _taken(profile, wire)
 
 
 def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """The last lines: one that is a frame, or the rows and a shorter line, which may hold numbers, too."""
+    """The last lines: one that is a frame, or the rows and a shorter line, which may hold numbers,
+    too."""
     lines = before.split(b"\n")[:-1]
     count = profile.rows if profile.lines == "rows" else 1
     for tail in (lines[-count:], lines[-count - 1 : -1]):
@@ -109,7 +122,8 @@ def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _papillarray(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """Any beginning whose sum fits, and no other packet in between; the pillars are where the tables of offsets say."""
+    """Any beginning whose sum fits, and no other packet in between; the pillars are where the
+    tables of offsets say."""
     head, tail = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
     for start in (m.start() + 4 for m in re.finditer(re.escape(head), before)):
         body = before[start:-6]
@@ -124,7 +138,8 @@ def _papillarray(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _pillars(body: bytes, width: int) -> list[np.ndarray]:
-    """Six numbers of each pillar, one after the other, of the block of type 3, wherever its list has it."""
+    """Six numbers of each pillar, one after the other, of the block of type 3, wherever its list
+    has it."""
 
     def offsets(at: int) -> list[int]:
         (n,) = struct.unpack_from("<H", body, at)
@@ -133,9 +148,12 @@ def _pillars(body: bytes, width: int) -> list[np.ndarray]:
     table = {}
     at = 1
     while at + 2 + width <= min([*table.values(), len(body)]):
-        table[int.from_bytes(body[at : at + 2], "little")] = int.from_bytes(body[at + 2 : at + 2 + width], "little")
+        table[int.from_bytes(body[at : at + 2], "little")] = int.from_bytes(
+            body[at + 2 : at + 2 + width], "little"
+        )
         at += 2 + width
-    # a codec may read on in order instead of following the inner offsets, so the content is searched in order, too
+    # a codec may read on in order instead of following the inner offsets, so the content is
+    # searched in order, too
     (n,) = struct.unpack_from("<H", body, table[3])
     place, found = table[3] + 2 + n * width, []
     for _ in range(n):
@@ -155,7 +173,8 @@ def _xela(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
     words = []
     for i, line in enumerate(lines[-profile.rows * profile.cols :]):
         match = re.fullmatch(
-            rb"t([0-9A-Fa-f]{3})([78])[0-9A-Fa-f]{2}([0-9A-Fa-f]{12})(?:[0-9A-Fa-f]{2})?([0-9A-Fa-f]{4})?", line
+            rb"t([0-9A-Fa-f]{3})([78])[0-9A-Fa-f]{2}([0-9A-Fa-f]{12})(?:[0-9A-Fa-f]{2})?([0-9A-Fa-f]{4})?",
+            line,
         )
         if not match or int(match[1], 16) != 0x710 + i or int(match[3][:2], 16) >= 250:
             return
@@ -169,7 +188,9 @@ def _robotiq(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
     for start in (m.start() for m in re.finditer(b"\x9a\x00", before)):
         grids = dict(_grids(before[start:]))
         if sorted(grids) == list(range(profile.rows * profile.cols // 28)):
-            yield _taken(profile, np.concatenate([np.frombuffer(grids[i], ">u2") for i in sorted(grids)]))
+            yield _taken(
+                profile, np.concatenate([np.frombuffer(grids[i], ">u2") for i in sorted(grids)])
+            )
 
 
 def _grids(packets: bytes) -> Iterator[tuple[int, bytes]]:
@@ -177,7 +198,10 @@ def _grids(packets: bytes) -> Iterator[tuple[int, bytes]]:
     while packets[:2] == b"\x9a\x00" and len(packets) >= 4:
         content, packets = packets[4 : 4 + packets[3]], packets[4 + packets[3] :]
         while content and content[0] >> 4 in sizes:
-            field, content = content[: 1 + sizes[content[0] >> 4]], content[1 + sizes[content[0] >> 4] :]
+            field, content = (
+                content[: 1 + sizes[content[0] >> 4]],
+                content[1 + sizes[content[0] >> 4] :],
+            )
             if field[0] >> 4 == 1 and len(field) == 57:
                 yield field[0] >> 2 & 3, field[1:]
 
@@ -186,18 +210,28 @@ def _taken(profile: SkinProfile, wire: np.ndarray) -> bytes:
     """The numbers of the wire that the profile takes, turned as it says, as bytes."""
     grid = wire.reshape(profile.rows, profile.cols, profile.values)[..., list(profile.take)]
     for turn in profile.orientation:
-        grid = {"transpose": grid.swapaxes(0, 1), "flip-rows": grid[::-1], "flip-columns": grid[:, ::-1]}[turn]
+        grid = {
+            "transpose": grid.swapaxes(0, 1),
+            "flip-rows": grid[::-1],
+            "flip-columns": grid[:, ::-1],
+        }[turn]
     return np.ascontiguousarray(grid).astype(profile.format.numpy_type).tobytes()
 
 
 ENCLOSED: dict[str, Enclosed] = {
-    "flexitac": _fixed, "anyskin": _fixed, "reskin": _text, "3d-vitac": _text, "papillarray": _papillarray,
-    "xela-can": _xela, "robotiq-tsf": _robotiq,
-}  # fmt: skip
+    "flexitac": _fixed,
+    "anyskin": _fixed,
+    "reskin": _text,
+    "3d-vitac": _text,
+    "papillarray": _papillarray,
+    "xela-can": _xela,
+    "robotiq-tsf": _robotiq,
+}
 
 
 def profile(data: bytes, folder: Path) -> None:
-    """skin_profile.load: a profile's file is a profile that reads any bytes and says what it is, or a ConfigError."""
+    """skin_profile.load: a profile's file is a profile that reads any bytes and says what it is, or
+    a ConfigError."""
     path = folder / "a-skin.toml"
     path.write_bytes(data)
     try:
@@ -213,7 +247,9 @@ def profile(data: bytes, folder: Path) -> None:
     )
     for texts in (got.start, got.stop, got.tare):
         assert all(isinstance(command, bytes) for command in got.commands(texts, got.rate_hz))
-    assert all(0 < vendor < 1 << 16 and 0 <= product < 1 << 16 for vendor, product in got.ids) or 0 in dict(got.ids)
+    assert all(
+        0 < vendor < 1 << 16 and 0 <= product < 1 << 16 for vendor, product in got.ids
+    ) or 0 in dict(got.ids)
     if got.codec != "palpate":
         _sound(got, codec(got)(Rest(), data[:2000]), data[:2000])
 
@@ -224,10 +260,14 @@ TARGETS: dict[str, Callable[[bytes, Path], None]] = {
 }
 
 MARKS: dict[str, tuple[bytes, ...]] = {
-    "flexitac": (b"\xaa\x55",), "anyskin": (b"\r\n",), "reskin": (b"\r\n", b"\t", b"nan", b"1e3"),
-    "3d-vitac": (b"\r\n\r\n", b"255 "), "papillarray": (bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")),
-    "xela-can": (b"t7108", b"t711", b"\r", b"z\r"), "robotiq-tsf": (b"\x9a\x00\x58", b"\x10", b"\x14"),
-}  # fmt: skip
+    "flexitac": (b"\xaa\x55",),
+    "anyskin": (b"\r\n",),
+    "reskin": (b"\r\n", b"\t", b"nan", b"1e3"),
+    "3d-vitac": (b"\r\n\r\n", b"255 "),
+    "papillarray": (bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")),
+    "xela-can": (b"t7108", b"t711", b"\r", b"z\r"),
+    "robotiq-tsf": (b"\x9a\x00\x58", b"\x10", b"\x14"),
+}
 """What tells frames apart."""
 
 
@@ -245,9 +285,12 @@ def seeds(name: str) -> list[bytes]:
 
 
 def profile_seeds() -> list[bytes]:
-    """The delivered profiles without their comments, the least that is one, and some that are none."""
+    """The delivered profiles without their comments, the least that is one, and some that are
+    none."""
     files = sorted(PROFILES.glob("*.toml"))
-    values = ["".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files]
+    values = [
+        "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files
+    ]
     least = 'about = "a"\nsource = "b"\ncodec = "text"\n'
     refused = [least + line for line in ("rows = 4.0", "row = 4", 'marker = "aa"', "take = [1]")]
     return [text.encode() for text in (*values, least, *refused, 'codec = "text"', "[a")]

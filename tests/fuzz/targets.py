@@ -1,7 +1,9 @@
-"""What must hold of whatever comes in. In: any bytes, and a folder for those that are read as a file. Out: nothing, or
-an error where a promise is broken: an AssertionError from here, or one that the box would not have survived.
+"""What must hold of whatever comes in. In: any bytes, and a folder for those that are read as a
+file. Out: nothing, or an error where a promise is broken: an AssertionError from here, or one that
+the box would not have survived.
 
-Each target is a pure function of its bytes; what is in the folder is only what it wrote there itself.
+Each target is a pure function of its bytes; what is in the folder is only what it wrote there
+itself.
 """
 
 from __future__ import annotations
@@ -54,10 +56,13 @@ def cuts(data: bytes) -> set[int]:
 
 
 def by_the_document(data: bytes) -> list[bytes]:
-    """All whole packets in `data`, as PROTOCOL.md's table reads, in few words and without care for speed."""
+    """All whole packets in `data`, as PROTOCOL.md's table reads, in few words and without care for
+    speed."""
     found, at = [], 0
     while (at := data.find(b"\x50\xc1", at)) >= 0 and len(data) - at >= 20:
-        version, kind, n, _, count, rows, cols, digit, axes = struct.unpack_from("<BBHBBBBBB", data, at + 2)
+        version, kind, n, _, count, rows, cols, digit, axes = struct.unpack_from(
+            "<BBHBBBBBB", data, at + 2
+        )
         end = at + 20 + n + 4
         frames = version == 1 and digit in ITEM_SIZES and axes <= 8
         frames = frames and n == count * rows * cols * max(axes, 1) * ITEM_SIZES[digit] > 0
@@ -74,19 +79,27 @@ def by_the_document(data: bytes) -> list[bytes]:
 
 def shown(packets: list[wire.Packet], replies: list[wire.Reply]) -> list[tuple[object, ...]]:
     """Packets and replies as values that can be compared."""
-    frames = [(p.seq, p.t_us, p.flags, p.taxels.shape, p.taxels.dtype.str, p.taxels.tobytes()) for p in packets]
+    frames = [
+        (p.seq, p.t_us, p.flags, p.taxels.shape, p.taxels.dtype.str, p.taxels.tobytes())
+        for p in packets
+    ]
     return [*frames, *((r.request, r.payload) for r in replies)]
 
 
 def unpack(data: bytes, folder: Path) -> None:
-    """wire.unpack: exactly the document's packets, each byte accounted for, in parts as at once, in one pass."""
+    """wire.unpack: exactly the document's packets, each byte accounted for, in parts as at once, in
+    one pass."""
     scanned = Scanned(data)
     got = wire.unpack(scanned)
-    assert scanned.searches <= 1 + data.count(wire.MAGIC), f"{scanned.searches} searches in {len(data)} bytes"
+    assert scanned.searches <= 1 + data.count(wire.MAGIC), (
+        f"{scanned.searches} searches in {len(data)} bytes"
+    )
     raw = by_the_document(data)
     assert len(got.packets) + len(got.replies) == len(raw)
     assert [p.taxels.tobytes() for p in got.packets] == [r[20:-4] for r in raw if r[3] == 0]
-    assert [p.seq for p in got.packets] == [int.from_bytes(r[12:16], "little") for r in raw if r[3] == 0]
+    assert [p.seq for p in got.packets] == [
+        int.from_bytes(r[12:16], "little") for r in raw if r[3] == 0
+    ]
     assert [r.payload for r in got.replies] == [r[20:-4] for r in raw if r[3] == 1]
     assert sum(map(len, raw)) + got.garbage + len(got.leftover) == len(data)
     assert data.endswith(got.leftover)
@@ -105,7 +118,8 @@ def unpack(data: bytes, folder: Path) -> None:
 
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
-    """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or lost."""
+    """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or
+    lost."""
     counters = usb_sensor.SensorCounters()
     stream = usb_sensor.Stream(SKIN, counters)
     stream.restart()
@@ -115,7 +129,9 @@ def _stream(data: bytes, cut: int, sent: int) -> None:
             frames = stream.feed(part, (i + 1) * 8_000_000)
             assert len(frames.t_ns) == len(frames.seq) == len(frames.taxels)
             numbers += frames.seq.tolist()
-        assert counters.frames + counters.stale_frames + counters.lost_frames >= sent, f"{counters} for {sent} frames"
+        assert counters.frames + counters.stale_frames + counters.lost_frames >= sent, (
+            f"{counters} for {sent} frames"
+        )
     except SensorMismatch as e:
         one_line(e)
     assert all(a < b for a, b in pairwise(numbers)), f"numbers {numbers} do not rise"
@@ -145,20 +161,26 @@ def _replies(data: bytes, replies: list[wire.Reply]) -> None:
             one_line(e)
         try:
             axes = payload[3:4].replace(b"\1", b"\0")
-            assert wire.pack_format(skin := wire.unpack_format(payload)) == payload[:3] + axes + payload[4:16], skin
+            assert (
+                wire.pack_format(skin := wire.unpack_format(payload))
+                == payload[:3] + axes + payload[4:16]
+            ), skin
         except FormatError as e:
             one_line(e)
 
 
 def command(data: bytes, folder: Path) -> None:
-    """sink.parse: one Command a line, in parts as at once, a bounded rest, and an answer that can be sent to each."""
+    """sink.parse: one Command a line, in parts as at once, a bounded rest, and an answer that can
+    be sent to each."""
     got, rest = robot_link.parse(data)
     assert len(rest) <= LINE + 1
     *lines, last = re.split(rb"[\r\n]+", data)
     lines = [line for line in lines if line]
     assert len(got) == len(lines) + (len(last) > LINE)
     for line, parsed in zip(lines, got, strict=False):
-        assert bool(parsed.error) != _is_command(line, parsed.name), f"{line!r} was taken as {parsed}"
+        assert bool(parsed.error) != _is_command(line, parsed.name), (
+            f"{line!r} was taken as {parsed}"
+        )
     for parsed in got:
         _answer(parsed)
     for cut in cuts(data):
@@ -170,7 +192,9 @@ def command(data: bytes, folder: Path) -> None:
 def _is_command(line: bytes, name: str) -> bool:
     """Whether a line is a command by PROTOCOL.md, and this one."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
-    fields = re.split("[, ]", body.decode("ascii", "replace"), maxsplit=2)  # a person may type spaces for the commas
+    fields = re.split(
+        "[, ]", body.decode("ascii", "replace"), maxsplit=2
+    )  # a person may type spaces for the commas
     known = (
         fields[:2] == ["PPLP", name]
         and name in robot_link.COMMANDS
@@ -195,7 +219,8 @@ def _answer(parsed: robot_link.Command) -> None:
 
 
 def requests(data: bytes, folder: Path) -> None:
-    """feed.requests: what the document allows is taken, whatever else is refused in one line, in parts as at once."""
+    """feed.requests: what the document allows is taken, whatever else is refused in one line, in
+    parts as at once."""
     *lines, last = data.split(b"\n")
     right = len(last) <= REQUEST and all(map(_is_request, lines))
     try:
@@ -225,13 +250,31 @@ def _is_request(line: bytes) -> bool:
         asked = json.loads(line)
     except (ValueError, RecursionError):
         return False
-    if len(line) > REQUEST or not isinstance(asked, dict) or set(asked) - {"frames", "sweeps"} or not asked:
+    if (
+        len(line) > REQUEST
+        or not isinstance(asked, dict)
+        or set(asked) - {"frames", "sweeps"}
+        or not asked
+    ):
         return False
     hz, sweeps = asked.get("frames", 0), asked.get("sweeps", True)
-    return not isinstance(hz, bool) and isinstance(hz, (int, float)) and 0 <= hz <= 20 and isinstance(sweeps, bool)
+    return (
+        not isinstance(hz, bool)
+        and isinstance(hz, (int, float))
+        and 0 <= hz <= 20
+        and isinstance(sweeps, bool)
+    )
 
 
 TARGETS: dict[str, Target] = {
-    "unpack": unpack, "command": command, "feed": requests, "settings": files.settings, "manifest": files.manifest,
-    "enrolment": enrolments.target, "recording": files.recording, "capture": files.played, **skins.TARGETS, **far_sides.TARGETS,
-}  # fmt: skip
+    "unpack": unpack,
+    "command": command,
+    "feed": requests,
+    "settings": files.settings,
+    "manifest": files.manifest,
+    "enrolment": enrolments.target,
+    "recording": files.recording,
+    "capture": files.played,
+    **skins.TARGETS,
+    **far_sides.TARGETS,
+}

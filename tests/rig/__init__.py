@@ -1,5 +1,6 @@
-"""The virtual box: an arm64 Debian with the appliance on it, a skin on its USB, its lines and its serial port outside.
+"""The virtual box: an arm64 Debian with the appliance on it, a skin on its USB, its lines and its
+serial port outside.
 
-image.py builds it, machine.py runs it; usbredir.py, lines.py and cell.py are the devices and the robot around it. `make rig`
-shows it.
+image.py builds it, machine.py runs it; usbredir.py, lines.py and cell.py are the devices and the
+robot around it. `make rig` shows it.
 """

@@ -1,7 +1,8 @@
-"""`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a shell in it.
+"""`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a
+shell in it.
 
-`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that are missing here, and
-`table` prints what the box did at each fault that the tests have injected.
+`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that
+are missing here, and `table` prints what the box did at each fault that the tests have injected.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
-    """Let the robot sweep; print what it touched, what the box answered, and the levels of its lines."""
+    """Let the robot sweep; print what it touched, what the box answered, and the levels of its
+    lines."""
     begun = time.monotonic()
     cell.plug()
     cell.until_ready()
@@ -37,9 +39,12 @@ def show(cell: Cell, sweeps: int) -> None:
 
 
 def shell(cell: Cell) -> None:
-    """Run lines from the keyboard in the guest, as root, while the skin streams; `sweep` makes the robot sweep."""
+    """Run lines from the keyboard in the guest, as root, while the skin streams; `sweep` makes the
+    robot sweep."""
     cell.plug()
-    print("a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends")
+    print(
+        "a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends"
+    )
     while line := input("box# ").strip():
         if line == "sweep":
             print(cell.sweep())
@@ -80,7 +85,10 @@ def main() -> int:
         begun = time.monotonic()
         with Guest(made, Path(folder), snapshot=True) as machine:
             machine.ready(60)
-            print(f"the virtual box goes on from its snapshot: {time.monotonic() - begun:.1f} s", flush=True)
+            print(
+                f"the virtual box goes on from its snapshot: {time.monotonic() - begun:.1f} s",
+                flush=True,
+            )
             cell = Cell(machine)
             shell(cell) if args.what == "shell" else show(cell, args.sweeps)
     return 0

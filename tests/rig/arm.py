@@ -1,7 +1,9 @@
-"""Runs a command in a namespace where arm64 programs run, too. In: a command. Out: its exit code; nothing else changes.
+"""Runs a command in a namespace where arm64 programs run, too. In: a command. Out: its exit code;
+nothing else changes.
 
-The kernel hands foreign programs to an emulator that is registered in a binfmt_misc of its own: one that lives in a
-private user and mount namespace, in which all ids are mapped. Needs root, Linux 6.7 and qemu-aarch64-static.
+The kernel hands foreign programs to an emulator that is registered in a binfmt_misc of its own: one
+that lives in a private user and mount namespace, in which all ids are mapped. Needs root, Linux 6.7
+and qemu-aarch64-static.
 """
 
 import ctypes
@@ -42,7 +44,10 @@ def _inside(command: list[str], emulator: bytes, ready: int, mapped: int) -> Non
     os.read(mapped, 1)
     os.setresgid(0, 0, 0)
     os.setresuid(0, 0, 0)
-    _check(libc.mount(b"binfmt_misc", FOLDER, b"binfmt_misc", 0, None), "mount binfmt_misc (Linux 6.7 can)")
+    _check(
+        libc.mount(b"binfmt_misc", FOLDER, b"binfmt_misc", 0, None),
+        "mount binfmt_misc (Linux 6.7 can)",
+    )
     with open(FOLDER + b"/register", "wb") as f:
         f.write(b":arm64:M::" + MAGIC + b":" + MASK + b":" + emulator + b":F")
     os.execvp(command[0], command)

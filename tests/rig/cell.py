@@ -1,4 +1,5 @@
-"""The robot cell around a guest: a robot that sweeps on request, and reads sentences and lines as a controller does.
+"""The robot cell around a guest: a robot that sweeps on request, and reads sentences and lines as a
+controller does.
 
 In: a Guest. Out: answers, with what was really touched and when.
 """
@@ -19,24 +20,27 @@ from appliance.sim import rig, script, skin
 from tests.rig.machine import Guest
 
 FIFO = 22_500
-"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by a cable that came late."""
+"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by a
+cable that came late."""
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
 BEHIND_NS = 50_000_000
-"""A touch begins only while the box takes frames no older than this: else its edges, which lie ahead of its frames by the
-clock, would come at once and its sweep be too short.
+"""A touch begins only while the box takes frames no older than this: else its edges, which lie
+ahead of its frames by the clock, would come at once and its sweep be too short.
 """
 SEEN_S = 20
 """Longest wait until the box has seen that the skin is gone."""
 BEGUN_S = 60
-"""Longest wait for a touch to begin, while a box that did something else works off what it has not taken yet."""
+"""Longest wait for a touch to begin, while a box that did something else works off what it has not
+taken yet."""
 ANSWER_S = 30
 """Longest wait for an answer after the stop edge, in the guest's time as all waits are."""
 
 
 @dataclass(slots=True)
 class Touch:
-    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: when its edges come.
+    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: when its
+    edges come.
 
     played: set once the board has come to it.
     """
@@ -51,7 +55,8 @@ class Touch:
 
 
 class CellRobot:
-    """The script that a board plays: an empty skin, and a touch whenever one is asked for (see sim.rig.Robot)."""
+    """The script that a board plays: an empty skin, and a touch whenever one is asked for (see
+    sim.rig.Robot)."""
 
     def __init__(self, lines: rig.EdgeLines, clock: Clock, seed: int) -> None:
         self.skipped = None
@@ -64,8 +69,15 @@ class CellRobot:
             return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
         touch = self.touches.get_nowait()
         act = touch.act
-        touch.first, touch.start_ns, touch.stop_ns = first, frame_ns(first + act.start), frame_ns(first + act.stop)
-        for line, t_ns, wanted in (("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)):
+        touch.first, touch.start_ns, touch.stop_ns = (
+            first,
+            frame_ns(first + act.start),
+            frame_ns(first + act.stop),
+        )
+        for line, t_ns, wanted in (
+            ("START", touch.start_ns, touch.start),
+            ("STOP", touch.stop_ns, touch.stop),
+        ):
             if wanted:
                 self._lines.drive(line, True, t_ns)
                 self._lines.drive(line, False, t_ns + rig.PULSE_NS)
@@ -74,26 +86,34 @@ class CellRobot:
 
 
 class Cell:
-    """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug` is called.
+    """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug`
+    is called.
 
-    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`. packet_frames: of its boards;
-    more of them in a packet spare an emulator half of its work.
+    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`.
+    packet_frames: of its boards; more of them in a packet spare an emulator half of its work.
     """
 
     def __init__(self, machine: Guest, seed: int = 1) -> None:
-        self.machine, self.lines, self.serial, self.cable = machine, machine.lines, machine.serial, machine.skin
+        self.machine, self.lines, self.serial, self.cable = (
+            machine,
+            machine.lines,
+            machine.serial,
+            machine.skin,
+        )
         self.clock = machine.clock
         self.hand = CellRobot(machine.lines, self.clock, seed)
         self.acts = script.tubes(seed)
         self.packet_frames = 6
 
     def board(self, **arguments: Any) -> rig.Board:
-        """A board in the robot's hand; arguments: those of sim.rig.Board (ppm, latency, serial and others)."""
+        """A board in the robot's hand; arguments: those of sim.rig.Board (ppm, latency, serial and
+        others)."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
         return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
     def plug(self, board: rig.Board | None = None) -> rig.Board:
-        """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs has seen it: FAULT."""
+        """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs
+        has seen it: FAULT."""
         board = board or self.board()
         if self.cable.board:
             self.unplug()
@@ -107,7 +127,9 @@ class Cell:
 
     def until_ready(self, timeout_s: float = 60) -> None:
         """Wait until the box says READY. Raises AssertionError where it does not."""
-        if not (self.lines.wait("READY", True, timeout_s) and self.lines.wait("FAULT", False, timeout_s)):
+        if not (
+            self.lines.wait("READY", True, timeout_s) and self.lines.wait("FAULT", False, timeout_s)
+        ):
             raise AssertionError(f"not READY within {timeout_s} s; the box says: {self.journal()}")
 
     def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
@@ -117,7 +139,8 @@ class Cell:
         return touch
 
     def sweep(self, timeout_s: float = ANSWER_S) -> tuple[Touch, Answer]:
-        """A whole sweep; the touch and the answer of the box. Raises AssertionError if no answer comes."""
+        """A whole sweep; the touch and the answer of the box. Raises AssertionError if no answer
+        comes."""
         since = len(self.serial.heard)
         touch = self.touch()
         self.begun(touch)
@@ -126,7 +149,9 @@ class Cell:
     def begun(self, touch: Touch) -> None:
         """Wait until the board has come to a touch. Raises AssertionError where it does not."""
         if not self.clock.until(touch.played.is_set, BEGUN_S):
-            raise AssertionError(f"the box is {BEGUN_S} s behind the skin; the box says: {self.journal()}")
+            raise AssertionError(
+                f"the box is {BEGUN_S} s behind the skin; the box says: {self.journal()}"
+            )
 
     def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:
         """The first RES of the lines from number `since` on."""
@@ -149,7 +174,8 @@ class Cell:
         return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
 
     def restore(self) -> None:
-        """Put everything in order: lines low, cable and port working, a sound skin; wait until the box is READY."""
+        """Put everything in order: lines low, cable and port working, a sound skin; wait until the
+        box is READY."""
         for name in ("START", "STOP"):
             self.lines.set(name, False)
         self.cable.mangle, self.cable.slow_s = bytes, 0.0

@@ -1,5 +1,5 @@
-"""What tests on the virtual box share. PALPATE_RIG=quick runs them, =full with the counts of the report; else they are
-skipped. `make test-rig` sets it, and makes the box first.
+"""What tests on the virtual box share. PALPATE_RIG=quick runs them, =full with the counts of the
+report; else they are skipped. `make test-rig` sets it, and makes the box first.
 """
 
 from __future__ import annotations
@@ -59,14 +59,16 @@ def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture
 def cell(shared: Cell) -> Cell:
-    """The guest of this file, with a sound skin, quiet lines and a robot that listens; the box is READY."""
+    """The guest of this file, with a sound skin, quiet lines and a robot that listens; the box is
+    READY."""
     shared.restore()
     return shared
 
 
 @pytest.fixture
 def note(request: pytest.FixtureRequest) -> Callable[[str, str, int], None]:
-    """Writes down what became of a fault, for the table of the report: note(fault, outcome, times)."""
+    """Writes down what became of a fault, for the table of the report: note(fault, outcome,
+    times)."""
 
     def write(fault: str, outcome: str, times: int) -> None:
         print(f"{fault}: {outcome}, {times} times")

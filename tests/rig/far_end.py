@@ -1,4 +1,5 @@
-"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with times of the guest."""
+"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with
+times of the guest."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
 
 
 class FarEnd:
-    """heard: (ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port fills up."""
+    """heard: (ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port
+    fills up."""
 
     def __init__(self, path: Path, clock: GuestClock) -> None:
         self.heard: list[tuple[int, str]] = []
@@ -59,7 +61,8 @@ class FarEnd:
         return self.wait_for("$PPLP,ANS,", timeout_s, since)
 
     def wait_for(self, start: str, timeout_s: float, since: int = 0) -> str:
-        """The first line that begins so, of those from number `since` on. Raises AssertionError where none comes."""
+        """The first line that begins so, of those from number `since` on. Raises AssertionError
+        where none comes."""
         found: list[str] = []
 
         def there() -> bool:
@@ -68,7 +71,9 @@ class FarEnd:
 
         if not self._clock.until(there, timeout_s):
             last = [line for _, line in self.heard[since:]][-5:]
-            raise AssertionError(f"no line {start}… within {timeout_s} s; the last ones were {last}")
+            raise AssertionError(
+                f"no line {start}… within {timeout_s} s; the last ones were {last}"
+            )
         return found[0]
 
     def _listen(self, port: socket.socket) -> None:
@@ -81,6 +86,8 @@ class FarEnd:
                     return
                 *lines, rest = (rest + data).split(b"\n")
                 now_ns = self._clock.now_ns()
-                self.heard += [(now_ns, line.decode("ascii", "replace").rstrip("\r")) for line in lines]
+                self.heard += [
+                    (now_ns, line.decode("ascii", "replace").rstrip("\r")) for line in lines
+                ]
         except OSError:
             return  # closed

@@ -1,9 +1,11 @@
-"""The guest's own time, seen from outside. In: a counter of the guest's hardware. Out: nanoseconds, and waits in them.
+"""The guest's own time, seen from outside. In: a counter of the guest's hardware. Out: nanoseconds,
+and waits in them.
 
-The guest's time goes by the instructions that its processors have done (`-icount`), or with the host's while they
-have nothing to do. So a host that is busy makes the guest slow, but never late: skin, robot and every wait of a test go
-by this clock, too. Its counter is WALCLK of an Intel HD Audio controller that no driver of the guest claims: 24 MHz,
-32 bits, read over qtest without the guest's noticing (High Definition Audio Specification 1.0a, 3.3.22).
+The guest's time goes by the instructions that its processors have done (`-icount`), or with the
+host's while they have nothing to do. So a host that is busy makes the guest slow, but never late:
+skin, robot and every wait of a test go by this clock, too. Its counter is WALCLK of an Intel HD
+Audio controller that no driver of the guest claims: 24 MHz, 32 bits, read over qtest without the
+guest's noticing (High Definition Audio Specification 1.0a, 3.3.22).
 """
 
 from __future__ import annotations
@@ -16,18 +18,25 @@ from appliance.core.clock import Clock, SystemClock
 from tests.rig.qtest import Qtest
 
 SHIFT = 1
-"""An instruction takes 2 ** SHIFT ns of the guest's time, however long it takes to emulate: half of a Raspberry Pi 4."""
+"""An instruction takes 2 ** SHIFT ns of the guest's time, however long it takes to emulate: half of
+a Raspberry Pi 4."""
 TICK_US = 1000
-"""QEMU brings its counter up to date at least so often, by a timer; else it stood still while the guest sleeps."""
+"""QEMU brings its counter up to date at least so often, by a timer; else it stood still while the
+guest sleeps."""
 STEADY = (
-    "-icount", f"shift={SHIFT},sleep=on", "-netdev", "hubport,id=none,hubid=0",
-    "-object", f"filter-buffer,id=tick,netdev=none,interval={TICK_US}",
-)  # fmt: skip
+    "-icount",
+    f"shift={SHIFT},sleep=on",
+    "-netdev",
+    "hubport,id=none,hubid=0",
+    "-object",
+    f"filter-buffer,id=tick,netdev=none,interval={TICK_US}",
+)
 """QEMU's arguments; the timer is that of a network filter through which nothing goes."""
 SLOT = 10
 DEVICE = ("-device", f"intel-hda,addr={SLOT:#x}")
 ECAM, WINDOW = 0x40_1000_0000, range(0x1000_0000, 0x3EFF_0000)
-"""Of QEMU's `virt`: configuration space of PCI, and where 32-bit cards lie once the kernel has set them up."""
+"""Of QEMU's `virt`: configuration space of PCI, and where 32-bit cards lie once the kernel has set
+them up."""
 COMMAND, BAR, WALCLK = 0x04, 0x10, 0x30
 HZ, WRAP = 24_000_000, 1 << 32
 LOOK_S = 0.01
@@ -36,9 +45,11 @@ STILL_S = 120
 
 
 class GuestClock:
-    """A clock as appliance.core.clock.Clock, by a counter of HZ that wraps; read it more often than every 179 s.
+    """A clock as appliance.core.clock.Clock, by a counter of HZ that wraps; read it more often than
+    every 179 s.
 
-    latest_ns: the newest reading, for those who may not ask. host: the time by which a dead counter is noticed.
+    latest_ns: the newest reading, for those who may not ask. host: the time by which a dead counter
+    is noticed.
     """
 
     def __init__(self, counter: Callable[[], int], host: Clock | None = None) -> None:
@@ -47,14 +58,17 @@ class GuestClock:
         self._ticks, self._moved_ns, self._reading = 0, self._host.now_ns(), threading.Lock()
 
     def now_ns(self) -> int:
-        """The guest's time. Raises TimeoutError where it stands still, OSError where QEMU has gone."""
+        """The guest's time. Raises TimeoutError where it stands still, OSError where QEMU has
+        gone."""
         with self._reading:
             more = (self._counter() - self._ticks) % WRAP
             host_ns = self._host.now_ns()
             if more:
                 self._moved_ns = host_ns
             elif host_ns - self._moved_ns > STILL_S * 1_000_000_000:
-                raise TimeoutError(f"the guest's clock has stood still for {STILL_S} s; has it crashed?")
+                raise TimeoutError(
+                    f"the guest's clock has stood still for {STILL_S} s; has it crashed?"
+                )
             self._ticks += more
             self.latest_ns = self._ticks * 1_000_000_000 // HZ
             return self.latest_ns
@@ -83,7 +97,8 @@ class GuestClock:
 
 
 def find(qtest: Qtest, timeout_s: float) -> GuestClock:
-    """The clock of a guest whose kernel has set up its cards, or does so now. Raises TimeoutError where it does not."""
+    """The clock of a guest whose kernel has set up its cards, or does so now. Raises TimeoutError
+    where it does not."""
     config, end_s = ECAM + (SLOT << 15), time.monotonic() + timeout_s
 
     def read(address: int) -> int:
@@ -93,5 +108,7 @@ def find(qtest: Qtest, timeout_s: float) -> GuestClock:
         if time.monotonic() > end_s:
             raise TimeoutError(f"the guest's kernel has set up no card within {timeout_s} s")
         time.sleep(0.1)
-    qtest.ask(f"writew {config + COMMAND:#x} 0x2")  # it answers reads of its memory; no driver has seen to that
+    qtest.ask(
+        f"writew {config + COMMAND:#x} 0x2"
+    )  # it answers reads of its memory; no driver has seen to that
     return GuestClock(lambda: read(place + WALCLK))

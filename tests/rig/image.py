@@ -1,8 +1,10 @@
-"""Builds the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, cached under their hash.
+"""Builds the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, cached
+under their hash.
 
-Two steps. A *ground*: Debian for arm64 with its stock kernel and a virtual environment with the box's locked
-dependencies; it takes minutes and is the same for every commit. On it a *box*: the wheel, units, rules and settings of this
-checkout, installed in the running guest as a person would, and a snapshot of the guest when its service has started.
+Two steps. A *ground*: Debian for arm64 with its stock kernel and a virtual environment with the
+box's locked dependencies; it takes minutes and is the same for every commit. On it a *box*: the
+wheel, units, rules and settings of this checkout, installed in the running guest as a person would,
+and a snapshot of the guest when its service has started.
 """
 
 from __future__ import annotations
@@ -27,30 +29,71 @@ SUITE = "bookworm"
 GUEST_PYTHON = "3.11"
 """Python of that suite."""
 PACKAGES = (
-    "systemd", "systemd-sysv", "udev", "dbus", "kmod", "libpam-systemd", "python3-venv", "libusb-1.0-0", "e2fsprogs",
-    "procps", "usbutils", "openssh-server", "openssl", "sudo",
-)  # fmt: skip
+    "systemd",
+    "systemd-sysv",
+    "udev",
+    "dbus",
+    "kmod",
+    "libpam-systemd",
+    "python3-venv",
+    "libusb-1.0-0",
+    "e2fsprogs",
+    "procps",
+    "usbutils",
+    "openssh-server",
+    "openssl",
+    "sudo",
+)
 MODULES = (
-    "virtio_blk", "virtio_pci", "ext4", "crc32c_generic", "virtio_console", "virtio_rng", "autofs4", "xhci-pci",
-    "cdc-acm", "ftdi_sio", "usbserial", "tmpfs", "virtio_net",
-)  # fmt: skip
+    "virtio_blk",
+    "virtio_pci",
+    "ext4",
+    "crc32c_generic",
+    "virtio_console",
+    "virtio_rng",
+    "autofs4",
+    "xhci-pci",
+    "cdc-acm",
+    "ftdi_sio",
+    "usbserial",
+    "tmpfs",
+    "virtio_net",
+)
 EARLY = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic")
 """Modules that the ramdisk loads; everything else comes from the disk."""
 LINES = ("START", "STOP", "READY", "FAULT", "RESULT-VALID", "CLASS-0", "CLASS-1", "CLASS-2")
 """What the kernel of the guest calls the eight lines of its PL061, by offset."""
 DISK = "2G"
-MACHINE = ("-machine", "virt,gic-version=3", "-cpu", "cortex-a72", "-smp", "2", "-m", "512", "-nic", "none")
+MACHINE = (
+    "-machine",
+    "virt,gic-version=3",
+    "-cpu",
+    "cortex-a72",
+    "-smp",
+    "2",
+    "-m",
+    "512",
+    "-nic",
+    "none",
+)
 """The guest's hardware, as far as its device tree describes it."""
 TOOLS = {
-    "qemu-system-aarch64": "qemu-system-arm", "qemu-img": "qemu-utils", "qemu-aarch64-static": "qemu-user-static",
-    "mmdebstrap": "mmdebstrap", "arch-test": "arch-test", "fdtput": "device-tree-compiler", "mke2fs": "e2fsprogs",
-    "depmod": "kmod", "cpio": "cpio",
-}  # fmt: skip
+    "qemu-system-aarch64": "qemu-system-arm",
+    "qemu-img": "qemu-utils",
+    "qemu-aarch64-static": "qemu-user-static",
+    "mmdebstrap": "mmdebstrap",
+    "arch-test": "arch-test",
+    "fdtput": "device-tree-compiler",
+    "mke2fs": "e2fsprogs",
+    "depmod": "kmod",
+    "cpio": "cpio",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The files of a box: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in it."""
+    """The files of a box: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in
+    it."""
 
     ground: Path
     disk: Path
@@ -62,7 +105,8 @@ class Image:
 
 
 def image(log: Callable[[str], None] = print) -> Image:
-    """The box of this checkout, built if it is not cached. Raises Missing if that is not possible here."""
+    """The box of this checkout, built if it is not cached. Raises Missing if that is not possible
+    here."""
     return box(ground(log), log)
 
 
@@ -73,12 +117,15 @@ def built() -> Image | None:
 
 
 def ground(log: Callable[[str], None] = print) -> Path:
-    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, built if it is not cached. Raises Missing."""
+    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, built if it is not cached. Raises
+    Missing."""
     target = CACHE / _ground_name()
     if not target.exists():
         _need(TOOLS)
         if os.geteuid():
-            raise Missing("the virtual box is made as root, since files of many owners are; use sudo")
+            raise Missing(
+                "the virtual box is made as root, since files of many owners are; use sudo"
+            )
         log(f"making the ground of the virtual box: Debian {SUITE} for arm64, about three minutes")
         whole(target, _make_ground)
     return target
@@ -111,20 +158,30 @@ def lacking(tools: Iterable[str] = TOOLS) -> list[str]:
 def _need(tools: Iterable[str]) -> None:
     os.environ["PATH"] += ":/usr/sbin:/sbin"
     if packages := lacking(tools):
-        raise Missing(f"the virtual box needs more than is here; apt-get install {' '.join(packages)}")
+        raise Missing(
+            f"the virtual box needs more than is here; apt-get install {' '.join(packages)}"
+        )
 
 
 def _ground_name() -> str:
-    parts = [emulated_machines.LOCK, HERE / "arm.py", GUEST / "agent.py", GUEST / "agent.service", GUEST / "init"]
+    parts = [
+        emulated_machines.LOCK,
+        HERE / "arm.py",
+        GUEST / "agent.py",
+        GUEST / "agent.service",
+        GUEST / "init",
+    ]
     key = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
     return f"ground-{_hash(parts, key)}"
 
 
 def _box_name() -> str:
     parts = [
-        p for folder in ("appliance", "systemd", "firmware_config") for p in sorted((ROOT / folder).rglob("*"))
+        p
+        for folder in ("appliance", "systemd", "firmware_config")
+        for p in sorted((ROOT / folder).rglob("*"))
         if p.is_file() and "__pycache__" not in p.parts
-    ]  # fmt: skip
+    ]
     parts += [
         ROOT / "pyproject.toml",
         GUEST / "install.sh",
@@ -145,18 +202,43 @@ def _hash(parts: Iterable[Path], key: str) -> str:
 def _make_ground(part: Path) -> None:
     apt = emulated_machines.apt(part, "arm64")
     about = run(*apt, "apt-cache", "depends", "linux-image-arm64").split()
-    package = next(word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit())
-    subprocess.run([*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True)
+    package = next(
+        word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit()
+    )
+    subprocess.run(
+        [*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True
+    )
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
     lock = part / emulated_machines.LOCK.name
     lock.write_text(guest_lock())
-    run(*emulated_machines.PIP, "download", *emulated_machines.ARM_WHEELS, "--python-version", GUEST_PYTHON,
-        "--require-hashes", "-r", lock, "-d", part / "wheels")  # fmt: skip
+    run(
+        *emulated_machines.PIP,
+        "download",
+        *emulated_machines.ARM_WHEELS,
+        "--python-version",
+        GUEST_PYTHON,
+        "--require-hashes",
+        "-r",
+        lock,
+        "-d",
+        part / "wheels",
+    )
     version = package.removeprefix("linux-image-")
     _make_root(part, version)
     _make_ramdisk(part, version)
-    run("mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1", "-d", part / "root", part / "disk.img", DISK)
+    run(
+        "mke2fs",
+        "-q",
+        "-t",
+        "ext4",
+        "-E",
+        "lazy_itable_init=1",
+        "-d",
+        part / "root",
+        part / "disk.img",
+        DISK,
+    )
     shutil.copy(part / "kernel" / "boot" / f"vmlinuz-{version}", part / "vmlinuz")
     _make_tree(part / "tree.dtb")
     for rest in part.iterdir():
@@ -165,8 +247,11 @@ def _make_ground(part: Path) -> None:
 
 
 def guest_lock() -> str:
-    """The locked dependencies as they are for the guest's Python and processor: pip would choose by this machine's."""
-    return run_here(f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', 'aarch64'))")
+    """The locked dependencies as they are for the guest's Python and processor: pip would choose by
+    this machine's."""
+    return run_here(
+        f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', 'aarch64'))"
+    )
 
 
 def _make_root(part: Path, version: str) -> None:
@@ -185,13 +270,25 @@ def _make_root(part: Path, version: str) -> None:
         "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
         'chroot "$1" systemctl disable ssh.service systemd-networkd.service',
     )
-    here = [] if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode else [
-        sys.executable, HERE / "arm.py"
-    ]  # fmt: skip
-    run(*here, "mmdebstrap", "--architectures=arm64", "--variant=minbase", f"--include={','.join(PACKAGES)}",
-        "--dpkgopt=path-exclude=/usr/share/man/*", "--dpkgopt=path-exclude=/usr/share/doc/*",
-        "--dpkgopt=path-exclude=/usr/share/locale/*", *(f"--customize-hook={hook}" for hook in hooks),
-        "--format=directory", SUITE, part / "root")  # fmt: skip
+    here = (
+        []
+        if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode
+        else [sys.executable, HERE / "arm.py"]
+    )
+    run(
+        *here,
+        "mmdebstrap",
+        "--architectures=arm64",
+        "--variant=minbase",
+        f"--include={','.join(PACKAGES)}",
+        "--dpkgopt=path-exclude=/usr/share/man/*",
+        "--dpkgopt=path-exclude=/usr/share/doc/*",
+        "--dpkgopt=path-exclude=/usr/share/locale/*",
+        *(f"--customize-hook={hook}" for hook in hooks),
+        "--format=directory",
+        SUITE,
+        part / "root",
+    )
     _modules(part / "kernel", part / "root", version, MODULES)
 
 
@@ -208,7 +305,9 @@ def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> li
             text=True,
             check=False,
         ).stdout
-        found |= dict.fromkeys(Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod"))
+        found |= dict.fromkeys(
+            Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod")
+        )
     for file in found:
         place = target / file.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -231,12 +330,24 @@ def _make_ramdisk(part: Path, version: str) -> None:
     shutil.copy(part / "busybox/bin/busybox", ramdisk / "bin")
     shutil.copy(GUEST / "init", ramdisk / "init")
     (ramdisk / "init").chmod(0o755)
-    run("sh", "-c", f"cd {ramdisk} && find . | cpio -o -H newc --quiet | gzip -1 > {part / 'ramdisk'}")
+    run(
+        "sh",
+        "-c",
+        f"cd {ramdisk} && find . | cpio -o -H newc --quiet | gzip -1 > {part / 'ramdisk'}",
+    )
 
 
 def _make_tree(path: Path) -> None:
-    """The machine's device tree, with names for its lines and none of them taken for a power button."""
-    run("qemu-system-aarch64", MACHINE[0], f"{MACHINE[1]},dumpdtb={path}", *MACHINE[2:], "-display", "none")
+    """The machine's device tree, with names for its lines and none of them taken for a power
+    button."""
+    run(
+        "qemu-system-aarch64",
+        MACHINE[0],
+        f"{MACHINE[1]},dumpdtb={path}",
+        *MACHINE[2:],
+        "-display",
+        "none",
+    )
     run("fdtput", "-r", path, "/gpio-keys")
     run("fdtput", "-t", "s", path, "/pl061@9030000", "gpio-line-names", *LINES)
 

@@ -1,5 +1,5 @@
-"""What a test that runs inside the guest stands on. In: a Machine. Out: a folder for its second disk, and a bench that does
-outside what such a test asks for (tests/backends/remote.py).
+"""What a test that runs inside the guest stands on. In: a Machine. Out: a folder for its second
+disk, and a bench that does outside what such a test asks for (tests/backends/remote.py).
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
 
 RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")
-"""Pure Python, so this machine's installation serves the guest; `packaging` is in the box's lock."""
+"""Pure Python, so this machine's installation serves the guest; `packaging` is in the box's
+lock."""
 SETTLE_S = 0.2
 
 
 def pack(folder: Path, tests: Iterable[str]) -> None:
-    """Put these files and folders of the checkout and what runs them into `folder`, each where it lies in the checkout."""
+    """Put these files and folders of the checkout and what runs them into `folder`, each where it
+    lies in the checkout."""
     for name in tests:
         source, place = ROOT / name, folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -88,7 +90,8 @@ class GuestControls:
         self._machine.serial.say(data)
 
     def hear(self) -> bytes:
-        """What has come since the last call. Between calls nobody reads, so that a port may fill up."""
+        """What has come since the last call. Between calls nobody reads, so that a port may fill
+        up."""
         port = self._machine.serial
         port.deaf = False
         self._clock.sleep(SETTLE_S)

@@ -1,9 +1,11 @@
-"""Which sweeps a box must have stored when it is killed. In: the sentences a robot heard, the files that were found.
-Out: what is missing. Also the log of a campaign of kills, which a later run continues.
+"""Which sweeps a box must have stored when it is killed. In: the sentences a robot heard, the files
+that were found. Out: what is missing. Also the log of a campaign of kills, which a later run
+continues.
 
-A kept sweep is written after its answer, in the same turn of the loop, and state sentences come after that. So one whose
-answer was heard, and after it a state sentence of the same run, must be there whole. One sweep a run may be missing:
-the one in progress, whose answer is the last that was heard.
+A kept sweep is written after its answer, in the same turn of the loop, and state sentences come
+after that. So one whose answer was heard, and after it a state sentence of the same run, must be
+there whole. One sweep a run may be missing: the one in progress, whose answer is the last that was
+heard.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ ANSWERED = {str(status) for status in Status if status.classified} | {"unknown",
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """An answer with a window behind it: its number, and when the box had all that it needed, in s of its clock."""
+    """An answer with a window behind it: its number, and when the box had all that it needed, in s
+    of its clock."""
 
     sweep: int
     complete_s: float
@@ -42,15 +45,19 @@ class Heard:
 
 
 def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
-    """From the next start on the service runs with these arguments. more: further lines of its drop-in."""
+    """From the next start on the service runs with these arguments. more: further lines of its
+    drop-in."""
     folder = DROP_IN.rpartition("/")[0]
     machine.run(f"mkdir -p {folder}", check=True)
-    machine.put(DROP_IN, f"[Service]\nExecStart=\nExecStart={PALPATE} {arguments}\n{more}\n".encode())
+    machine.put(
+        DROP_IN, f"[Service]\nExecStart=\nExecStart={PALPATE} {arguments}\n{more}\n".encode()
+    )
     machine.run("systemctl daemon-reload", check=True, timeout_s=60)
 
 
 def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
-    """Look at a disk that nobody uses, on a copy: e2fsck's exit code once the journal is replayed, and what was kept."""
+    """Look at a disk that nobody uses, on a copy: e2fsck's exit code once the journal is replayed,
+    and what was kept."""
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
@@ -74,7 +81,8 @@ def whole(line: str) -> list[str]:
 
 
 def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
-    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (ns, line) of one boot."""
+    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (ns, line)
+    of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
     last: Heard | None = None
@@ -90,11 +98,17 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
 
 
 def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
-    """Counts: answers with a window, sweeps that must be stored, how many of these are missing, how many others are."""
+    """Counts: answers with a window, sweeps that must be stored, how many of these are missing, how
+    many others are."""
     must, may = owed(heard)
     gone = [h for h in must if not any(h.fits(k) for k in kept)]
     unfinished = [h for h in may if not any(h.fits(k) for k in kept)]
-    return {"answered": len(must) + len(may), "owed": len(must), "lost": len(gone), "unfinished": len(unfinished)}
+    return {
+        "answered": len(must) + len(may),
+        "owed": len(must),
+        "lost": len(gone),
+        "unfinished": len(unfinished),
+    }
 
 
 class CampaignLog:

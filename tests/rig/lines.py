@@ -1,9 +1,10 @@
-"""The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: what the box drives, with times.
+"""The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: what the
+box drives, with times.
 
 All times are the guest's.
 
-A PL061 of QEMU's `virt` machine: inputs are set and outputs watched through the qtest socket, and the guest's stock
-driver sees interrupts.
+A PL061 of QEMU's `virt` machine: inputs are set and outputs watched through the qtest socket, and
+the guest's stock driver sees interrupts.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from tests.rig.guest_clock import GuestClock
 from tests.rig.qtest import Qtest
 
 HOLD_NS = 250_000_000
-"""A level that was planned is held at least so long, however late it came: an emulated processor that is busy takes an
-interrupt long after the edge, and looks at the level only then.
+"""A level that was planned is held at least so long, however late it came: an emulated processor
+that is busy takes an interrupt long after the edge, and looks at the level only then.
 """
 
 
 class GuestLines:
-    """levels: line name -> what the box drives it to. log: (ns, name, level) of all changes, in order, each with the time that
-    was read last.
+    """levels: line name -> what the box drives it to. log: (ns, name, level) of all changes, in
+    order, each with the time that was read last.
 
     Fits where the rig's robot drives its edges (appliance.sim.rig.EdgeLines).
     """
@@ -45,9 +46,12 @@ class GuestLines:
         self.run_through([(name, level)])
 
     def run_through(self, steps: Iterable[tuple[str, bool]]) -> None:
-        """Drive inputs one after the other, in one write to QEMU: some tens of microseconds from step to step."""
+        """Drive inputs one after the other, in one write to QEMU: some tens of microseconds from
+        step to step."""
         into = f"set_irq_in {self._place} unnamed-gpio-in"
-        self._qtest.ask(*(f"{into} {self._names.index(name)} {int(level)}" for name, level in steps))
+        self._qtest.ask(
+            *(f"{into} {self._names.index(name)} {int(level)}" for name, level in steps)
+        )
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
         """Drive an input at a time, or at once where that has passed."""

@@ -1,7 +1,9 @@
-"""One guest. In: an image. Out: a running machine whose USB, lines and serial port are at hand outside.
+"""One guest. In: an image. Out: a running machine whose USB, lines and serial port are at hand
+outside.
 
-Boots from its disk, or goes on from the snapshot in two seconds. `cut` pulls the plug. Nothing of a run is kept: each
-has a disk of its own on top of the image's, unless it is asked to write into the image itself.
+Boots from its disk, or goes on from the snapshot in two seconds. `cut` pulls the plug. Nothing of a
+run is kept: each has a disk of its own on top of the image's, unless it is asked to write into the
+image itself.
 """
 
 from __future__ import annotations
@@ -27,22 +29,30 @@ from tests.rig.usbredir import UsbRedirPeer
 START_S = 60
 """Longest wait for QEMU to open its sockets, or to load a snapshot."""
 CARDS_S = 600
-"""Longest wait for a kernel that boots to set up its cards, by the host's time: no other is known yet."""
+"""Longest wait for a kernel that boots to set up its cards, by the host's time: no other is known
+yet."""
 
 
 class Guest:
     """A guest that runs until `close`, `cut`, or it powers off.
 
-    image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there, instead of booting.
-    disk: use this disk as it is and write into it. code: a folder that is its second disk, read-only. ssh: port of this
-    machine that leads to the guest's port 22, where it has one; else it has no network. clock: its time. lines, serial,
-    skin: the robot's ends of trigger and result lines, of the serial port, and of the USB cable.
+    image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there,
+    instead of booting. disk: use this disk as it is and write into it. code: a folder that is its
+    second disk, read-only. ssh: port of this machine that leads to the guest's port 22, where it
+    has one; else it has no network. clock: its time. lines, serial, skin: the robot's ends of
+    trigger and result lines, of the serial port, and of the USB cable.
     """
 
     def __init__(
-        self, image: Image, folder: Path, *, snapshot: bool = False, disk: Path | None = None, code: Path | None = None,
+        self,
+        image: Image,
+        folder: Path,
+        *,
+        snapshot: bool = False,
+        disk: Path | None = None,
+        code: Path | None = None,
         ssh: int = 0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._folder = Path(folder) / f"vm{time.monotonic_ns()}"
         self._folder.mkdir(parents=True)
         if disk is None and snapshot:
@@ -54,9 +64,11 @@ class Guest:
         redir.bind(str(self._folder / "skin"))
         redir.listen(1)
         self._process = subprocess.Popen(
-            self._command(image, snapshot, ssh), stdin=subprocess.DEVNULL, stdout=(self._folder / "qemu.log").open("wb"),
+            self._command(image, snapshot, ssh),
+            stdin=subprocess.DEVNULL,
+            stdout=(self._folder / "qemu.log").open("wb"),
             stderr=subprocess.STDOUT,
-        )  # fmt: skip
+        )
         try:
             self._qmp = self._connect("qmp").makefile("rw")
             self._qmp.readline()
@@ -84,28 +96,69 @@ class Guest:
         at = self._folder
 
         forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
-        network = ["-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="] if ssh else []
+        network = (
+            ["-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="]
+            if ssh
+            else []
+        )
 
         def port(name: str) -> tuple[str, str]:
             return "-chardev", f"socket,id={name},path={at}/{name},server=on,wait=off"
 
         return [
-            "qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=single", *guest_clock.STEADY, "-display", "none",
-            "-kernel", image.kernel, "-initrd", image.ground / "ramdisk", "-dtb", image.ground / "tree.dtb",
-            "-append", "console=ttyAMA0 quiet systemd.show_status=0 panic=-1", "-no-reboot",
-            "-drive", f"file={self.disk},format=qcow2,if=none,id=d0", "-device", "virtio-blk-pci,drive=d0,addr=4",
-            "-drive", f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on",
-            "-device", "virtio-blk-pci,drive=d1,addr=5",
-            "-device", "qemu-xhci,id=xhci,addr=6", "-device", "virtio-rng-pci,addr=7",
-            *port("robot"), "-device", "pci-serial,chardev=robot,addr=8",
-            "-device", "virtio-serial-pci,addr=9", *guest_clock.DEVICE,
-            *port("agent"), "-device", "virtserialport,chardev=agent,name=palpate.agent",
-            *port("bench"), "-device", "virtserialport,chardev=bench,name=palpate.bench",
-            "-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console",
-            "-qmp", f"unix:{at}/qmp,server=on,wait=off",
-            "-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null", *network,
+            "qemu-system-aarch64",
+            *MACHINE,
+            "-accel",
+            "tcg,thread=single",
+            *guest_clock.STEADY,
+            "-display",
+            "none",
+            "-kernel",
+            image.kernel,
+            "-initrd",
+            image.ground / "ramdisk",
+            "-dtb",
+            image.ground / "tree.dtb",
+            "-append",
+            "console=ttyAMA0 quiet systemd.show_status=0 panic=-1",
+            "-no-reboot",
+            "-drive",
+            f"file={self.disk},format=qcow2,if=none,id=d0",
+            "-device",
+            "virtio-blk-pci,drive=d0,addr=4",
+            "-drive",
+            f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on",
+            "-device",
+            "virtio-blk-pci,drive=d1,addr=5",
+            "-device",
+            "qemu-xhci,id=xhci,addr=6",
+            "-device",
+            "virtio-rng-pci,addr=7",
+            *port("robot"),
+            "-device",
+            "pci-serial,chardev=robot,addr=8",
+            "-device",
+            "virtio-serial-pci,addr=9",
+            *guest_clock.DEVICE,
+            *port("agent"),
+            "-device",
+            "virtserialport,chardev=agent,name=palpate.agent",
+            *port("bench"),
+            "-device",
+            "virtserialport,chardev=bench,name=palpate.bench",
+            "-chardev",
+            f"file,id=console,path={at}/console",
+            "-serial",
+            "chardev:console",
+            "-qmp",
+            f"unix:{at}/qmp,server=on,wait=off",
+            "-qtest",
+            f"unix:{at}/qtest,server=on,wait=off",
+            "-qtest-log",
+            "/dev/null",
+            *network,
             *(["-loadvm", "ready"] if snapshot else []),
-        ]  # fmt: skip
+        ]
 
     def _connect(self, name: str) -> socket.socket:
         end = time.monotonic() + START_S
@@ -124,12 +177,18 @@ class Guest:
     def _find(self, kind: str) -> str:
         """Place of a device of the board in QEMU's tree of objects."""
         devices = self.qmp("qom-list", path="/machine/unattached")
-        return next(f"/machine/unattached/{d['name']}" for d in devices if d["type"] == f"child<{kind}>")
+        return next(
+            f"/machine/unattached/{d['name']}" for d in devices if d["type"] == f"child<{kind}>"
+        )
 
     def _plug_cable(self, listener: socket.socket) -> UsbRedirPeer:
         """Put the far end of a USB cable on the guest's port; nothing hangs on it yet."""
         address = {"type": "unix", "data": {"path": str(self._folder / "skin")}}
-        self.qmp("chardev-add", id="skin", backend={"type": "socket", "data": {"addr": address, "server": False}})
+        self.qmp(
+            "chardev-add",
+            id="skin",
+            backend={"type": "socket", "data": {"addr": address, "server": False}},
+        )
         self.qmp("device_add", driver="usb-redir", id="cable", chardev="skin", bus="xhci.0")
         listener.settimeout(START_S)
         return UsbRedirPeer(listener.accept()[0], self.clock)
@@ -150,8 +209,11 @@ class Guest:
         """Wait until the guest runs shell lines. Raises GuestFailed where it does not."""
         self.run("true", timeout_s=timeout_s)
 
-    def run(self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b"") -> Done:
-        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says nothing, or check asks."""
+    def run(
+        self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
+    ) -> Done:
+        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says
+        nothing, or check asks."""
         return self._shell.run(line, timeout_s=timeout_s, check=check, stdin=stdin)
 
     def put(self, path: str, data: bytes) -> None:
@@ -163,7 +225,8 @@ class Guest:
         return base64.b64decode(self.run(f"base64 {path}", check=True).out)
 
     def save(self) -> None:
-        """Keep the running guest in its disk as the snapshot `ready`, without what hangs on its USB, and end."""
+        """Keep the running guest in its disk as the snapshot `ready`, without what hangs on its
+        USB, and end."""
         self.qmp("device_del", id="cable")
         self.run("udevadm settle")
         text = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
@@ -172,7 +235,8 @@ class Guest:
         self.close()
 
     def bench(self) -> socket.socket:
-        """The other end of the guest's port palpate.bench, over which tests inside ask for what happens outside."""
+        """The other end of the guest's port palpate.bench, over which tests inside ask for what
+        happens outside."""
         return self._connect("bench")
 
     def console(self) -> str:

@@ -1,7 +1,8 @@
-"""What became of each fault. In: a line from each test that made one. Out: the table fault x outcome, as Markdown.
+"""What became of each fault. In: a line from each test that made one. Out: the table fault x
+outcome, as Markdown.
 
-Lines gather in build/rig/faults.jsonl over all runs; of one fault the run with the most repetitions counts, and of such
-the last.
+Lines gather in build/rig/faults.jsonl over all runs; of one fault the run with the most repetitions
+counts, and of such the last.
 """
 
 from __future__ import annotations
@@ -23,16 +24,22 @@ def write(test: str, fault: str, outcome: str, times: int, file: Path = FILE) ->
     """Add a line."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a") as f:
-        f.write(json.dumps({"test": test, "fault": fault, "outcome": outcome, "times": times}) + "\n")
+        f.write(
+            json.dumps({"test": test, "fault": fault, "outcome": outcome, "times": times}) + "\n"
+        )
 
 
 def table(file: Path = FILE) -> list[str]:
-    """Lines of a Markdown table, the faults of one test file together. Raises OSError where nothing was noted."""
+    """Lines of a Markdown table, the faults of one test file together. Raises OSError where nothing
+    was noted."""
     best: dict[tuple[str, str], dict[str, Any]] = {}
     for line in file.read_text().splitlines():
         event = json.loads(line)
         key = event["test"].partition("::")[0], event["fault"]
         if key not in best or event["times"] >= best[key]["times"]:
             best[key] = event
-    rows = [f"| {fault} | {event['outcome']} | {event['times']} |" for (_, fault), event in sorted(best.items())]
+    rows = [
+        f"| {fault} | {event['outcome']} | {event['times']} |"
+        for (_, fault), event in sorted(best.items())
+    ]
     return ["| fault | what the box did | times |", "|---|---|---|", *rows]

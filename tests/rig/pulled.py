@@ -1,4 +1,5 @@
-"""The skin's cable, pulled at a moment of a sweep. In: a cell, the number of the try. Out: the status of the one answer."""
+"""The skin's cable, pulled at a moment of a sweep. In: a cell, the number of the try. Out: the
+status of the one answer."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ SECOND = 1_000_000_000
 
 
 def before(cell: Cell, i: int) -> str:
-    """Pulled before a sweep: READY falls, FAULT rises; a start edge is answered at once, its stop edge is not."""
+    """Pulled before a sweep: READY falls, FAULT rises; a start edge is answered at once, its stop
+    edge is not."""
     cell.unplug()
     assert cell.lines.wait("FAULT", True, 20)
     assert cell.lines.wait("READY", False, 20)

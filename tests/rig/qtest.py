@@ -1,4 +1,5 @@
-"""QEMU's qtest socket. In: lines of its protocol. Out: their answers; levels of intercepted outputs as they change."""
+"""QEMU's qtest socket. In: lines of its protocol. Out: their answers; levels of intercepted outputs
+as they change."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ ANSWER_S = 60
 
 
 class Qtest:
-    """One guest's socket. changed: called for each change of an intercepted output, with its number and level."""
+    """One guest's socket. changed: called for each change of an intercepted output, with its number
+    and level."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.changed: Callable[[int, bool], None] = lambda number, level: None

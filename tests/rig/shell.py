@@ -1,5 +1,5 @@
-"""Shell lines in the guest, from outside. In: the far end of the port at which its agent listens (guest/agent.py). Out: what
-the lines said.
+"""Shell lines in the guest, from outside. In: the far end of the port at which its agent listens
+(guest/agent.py). Out: what the lines said.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from tests.rig.guest_clock import GuestClock
 
 REPLY_S = 60
-"""What a line's answer may take, by the guest's clock, beyond the time that the line itself may take."""
+"""What a line's answer may take, by the guest's clock, beyond the time that the line itself may
+take."""
 
 
 class GuestFailed(AssertionError):
@@ -29,14 +30,18 @@ class Done:
 
 
 class Shell:
-    """One line at a time. An answer that comes too late for its line is passed over, not taken for that of the next."""
+    """One line at a time. An answer that comes too late for its line is passed over, not taken for
+    that of the next."""
 
     def __init__(self, port: socket.socket, clock: GuestClock) -> None:
         self._port, self._clock = port, clock
         self._rest, self._unanswered = b"", 0
 
-    def run(self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b"") -> Done:
-        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says nothing, or check asks."""
+    def run(
+        self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
+    ) -> Done:
+        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says
+        nothing, or check asks."""
         request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
         try:
             self._port.sendall(json.dumps(request).encode() + b"\n")

@@ -1,5 +1,6 @@
-"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged. In: hours, a seed.
-Out: one record for each box, a page with four charts, and exit code 1 if a target was missed.
+"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged. In:
+hours, a seed. Out: one record for each box, a page with four charts, and exit code 1 if a target
+was missed.
 
 Each box is recorded by a process of its own. An interrupted soak is continued by the next run.
 """
@@ -37,7 +38,8 @@ WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
 SILENT_S = 60.0
 """A box that sends nothing for this long is gone; a working one sends its state each second."""
 GRACE_S = 5.0
-"""While a soak goes on, an answer may take so long after its stop edge; at the end, all are awaited."""
+"""While a soak goes on, an answer may take so long after its stop edge; at the end, all are
+awaited."""
 MARGIN_S = 0.5
 """A box is stopped this far inside a sweep, so that it is certain that the sweep had begun."""
 SAME = ("box", "commit", "bundle", "format", "machine", "versions")
@@ -47,7 +49,8 @@ NOTED = 200
 
 
 class Recorder:
-    """Writes the record of a run from the sentences of a box and samples of its process. All times are the box's."""
+    """Writes the record of a run from the sentences of a box and samples of its process. All times
+    are the box's."""
 
     def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script) -> None:
         self.run = run
@@ -63,7 +66,8 @@ class Recorder:
         self._begun_s = self._heard_s = self._looked_s = self._clock()
 
     def listen(self, seconds: float, stopped: Callable[[], bool]) -> None:
-        """Judge what comes, and look now and then, for so long or until `stopped()`. Raises Gone."""
+        """Judge what comes, and look now and then, for so long or until `stopped()`. Raises
+        Gone."""
         end_s = self._clock() + seconds
         while (now_s := self._clock()) < end_s and not stopped():
             for line in self._box.heard(WAIT_S):
@@ -78,7 +82,10 @@ class Recorder:
     def sweeping(self) -> bool:
         """Whether a sweep is certainly under way."""
         now_s = self._clock()
-        (_, stops), (starts, _) = self._box.edges(now_s + MARGIN_S), self._box.edges(now_s - MARGIN_S)
+        (_, stops), (starts, _) = (
+            self._box.edges(now_s + MARGIN_S),
+            self._box.edges(now_s - MARGIN_S),
+        )
         return starts > stops
 
     def stop(self) -> None:
@@ -116,15 +123,26 @@ class Recorder:
         return round(self.run.began_s + at_s - self._begun_s, 2)
 
     def _answer(self, at_s: float, answer: Answer) -> None:
-        # by time, not by number: an edge that an emulator misses makes one answer of two, or two of one
+        # by time, not by number: an edge that an emulator misses makes one answer of two, or two of
+        # one
         fact = self._sweeps[max(self._box.edges(at_s)[1], 1)]
-        if wrong := soak_judge.numbering(answer.sweep, self._last, self._box.edges(at_s + MARGIN_S)[0]):
+        if wrong := soak_judge.numbering(
+            answer.sweep, self._last, self._box.edges(at_s + MARGIN_S)[0]
+        ):
             self.fault(wrong, at_s)
         self._last = max(self._last, answer.sweep)
-        self.run.answers.append([
-            self._since(at_s), answer.sweep, fact.label, answer.status, answer.label, fact.alone, answer.latency_ms,
-            answer.lost,
-        ])  # fmt: skip
+        self.run.answers.append(
+            [
+                self._since(at_s),
+                answer.sweep,
+                fact.label,
+                answer.status,
+                answer.label,
+                fact.alone,
+                answer.latency_ms,
+                answer.lost,
+            ]
+        )
 
     def _note(self, at_s: float, state: list[str]) -> None:
         if state[1] == "streaming":
@@ -137,10 +155,16 @@ class Recorder:
 
 
 def record(
-    box: BoxUnderTest, run: SoakRun, length_s: float, save: Callable[[], None], *,
-    stopped: Callable[[], bool] = lambda: False, log: Callable[[str], None] = print,
-) -> None:  # fmt: skip
-    """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong stands in the run."""
+    box: BoxUnderTest,
+    run: SoakRun,
+    length_s: float,
+    save: Callable[[], None],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    log: Callable[[str], None] = print,
+) -> None:
+    """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong
+    stands in the run."""
     recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
@@ -170,8 +194,8 @@ def progress(run: SoakRun) -> str:
 
 
 def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
-    """The runs of an interrupted soak and when it was started; none and now where there is none, or where it was of other
-    code, another seed or another machine."""
+    """The runs of an interrupted soak and when it was started; none and now where there is none, or
+    where it was of other code, another seed or another machine."""
     if path.exists():
         held = json.loads(path.read_text())
         if all(held.get(name) == value for name, value in about.items()):
@@ -185,7 +209,9 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _text(value: Any, indent: str = "") -> str:
-    flat = isinstance(value, list | tuple) and not any(isinstance(v, dict | list | tuple) for v in value)
+    flat = isinstance(value, list | tuple) and not any(
+        isinstance(v, dict | list | tuple) for v in value
+    )
     if flat or not isinstance(value, dict | list | tuple):
         return json.dumps(value)
     deeper = indent + " "
@@ -200,9 +226,14 @@ def _text(value: Any, indent: str = "") -> str:
 
 
 def soak(
-    box: BoxUnderTest, seed: int, hours: float, work: Path, *, stopped: Callable[[], bool] = lambda: False,
+    box: BoxUnderTest,
+    seed: int,
+    hours: float,
+    work: Path,
+    *,
+    stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
-) -> Path:  # fmt: skip
+) -> Path:
     """Record one box for what is left of `hours`; its record."""
     path = _record(work, box.name)
     about = {
@@ -230,7 +261,8 @@ def soak(
 
 
 def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One record of soaks that went on side by side, their runs one after the other as if they had been interrupted.
+    """One record of soaks that went on side by side, their runs one after the other as if they had
+    been interrupted.
 
     Raises ValueError where they are of different boxes or code, or where two sweep with one seed.
     """
@@ -239,10 +271,14 @@ def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for other in others:
         for name in SAME:
             if other[name] != first[name]:
-                raise ValueError(f"{name} is {other[name]!r} in one record, {first[name]!r} in another; join like ones")
+                raise ValueError(
+                    f"{name} is {other[name]!r} in one record, {first[name]!r} in another; join like ones"
+                )
         for run in (SoakRun(**run) for run in other["runs"]):
             if any(run.seed == held.seed for held in runs):
-                raise ValueError(f"two runs have the seed {run.seed}: the same sweeps; give each soak its own --seed")
+                raise ValueError(
+                    f"two runs have the seed {run.seed}: the same sweeps; give each soak its own --seed"
+                )
             runs.append(_moved(run, sum(held.length_s for held in runs)))
     return first | {"runs": [asdict(run) for run in runs]}
 
@@ -259,18 +295,22 @@ def _moved(run: SoakRun, began_s: float) -> SoakRun:
 def draw(works: Sequence[Path], out: Path) -> bool:
     """Put the records together, judge and draw them; False where a target was not reached.
 
-    A box of which several folders hold a record has them joined; one of which none does keeps that of the page in `out`,
-    which is judged and drawn again.
+    A box of which several folders hold a record has them joined; one of which none does keeps that
+    of the page in `out`, which is judged and drawn again.
     """
     records = _drawn(out)
     for name in BOXES:
-        if held := [json.loads(path.read_text()) for work in works if (path := _record(work, name)).exists()]:
+        if held := [
+            json.loads(path.read_text()) for work in works if (path := _record(work, name)).exists()
+        ]:
             records.append(joined(held))
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
     results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
         "left_out": {
-            name: kind.missing() or "it was not recorded" for name, kind in BOXES.items() if name not in boxes
+            name: kind.missing() or "it was not recorded"
+            for name, kind in BOXES.items()
+            if name not in boxes
         },
         "boxes": boxes,
     }
@@ -307,21 +347,47 @@ def main() -> int:
     length.add_argument("--hours", type=float, default=1.0, help="how long in all (default 1)")
     length.add_argument("--minutes", type=float, help="the same in minutes, for a try")
     parser.add_argument("--seed", type=int, default=1, help="of the robot's sweeps (default 1)")
-    parser.add_argument("--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes")
+    parser.add_argument(
+        "--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes"
+    )
     parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
-    parser.add_argument("--beside", type=Path, action="append", default=[], metavar="WORK",
-                        help="where a soak with another --seed is kept, whose runs are joined when the page is drawn")  # fmt: skip
-    parser.add_argument("--draw", action="store_true", help="only draw what is there, or the page of --out again")
+    parser.add_argument(
+        "--beside",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="WORK",
+        help="where a soak with another --seed is kept, whose runs are joined when the page is drawn",
+    )
+    parser.add_argument(
+        "--draw", action="store_true", help="only draw what is there, or the page of --out again"
+    )
     args = parser.parse_args()
     hours = args.minutes / 60 if args.minutes else args.hours
     if args.box:
         got: list[int] = []
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda n, frame: got.append(n))
-        soak(BOXES[args.box](), args.seed, hours, args.work, stopped=lambda: bool(got), log=partial(print, flush=True))
+        soak(
+            BOXES[args.box](),
+            args.seed,
+            hours,
+            args.work,
+            stopped=lambda: bool(got),
+            log=partial(print, flush=True),
+        )
         return 0
-    arguments = ["--seed", str(args.seed), "--hours", repr(hours), "--work", str(args.work.resolve())]
+    arguments = [
+        "--seed",
+        str(args.seed),
+        "--hours",
+        repr(hours),
+        "--work",
+        str(args.work.resolve()),
+    ]
     recorded = args.draw or _together(arguments)
     try:
         reached = draw([args.work, *args.beside], args.out)
@@ -331,7 +397,8 @@ def main() -> int:
 
 
 def _together(arguments: list[str]) -> bool:
-    """Each box that can be had here in a process of its own; who interrupts this one interrupts them. False if one fell."""
+    """Each box that can be had here in a process of its own; who interrupts this one interrupts
+    them. False if one fell."""
     children = []
     for name, kind in BOXES.items():
         if missing := kind.missing():

@@ -1,8 +1,9 @@
-"""Boxes under test. In: a script of sweeps. Out: a box at work in real time: its sentences, the edges that it was given, and
-the resources of its process.
+"""Boxes under test. In: a script of sweeps. Out: a box at work in real time: its sentences, the
+edges that it was given, and the resources of its process.
 
-One is the installed command on this machine with the simulated skin, its serial line a pseudo-terminal; the other the
-virtual box, with its skin, lines and serial port on real buses of the guest.
+One is the installed command on this machine with the simulated skin, its serial line a
+pseudo-terminal; the other the virtual box, with its skin, lines and serial port on real buses of
+the guest.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Gone(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A sweep of the script: what is touched, the numbers of the frames at its edges, what the bundle by itself says."""
+    """A sweep of the script: what is touched, the numbers of the frames at its edges, what the
+    bundle by itself says."""
 
     label: str
     start: int
@@ -58,7 +60,8 @@ class Fact:
 
 
 class Script:
-    """The robot's sweeps in order, as facts; worked out as far as somebody asks. Numbers begin with 1, as in sentences."""
+    """The robot's sweeps in order, as facts; worked out as far as somebody asks. Numbers begin with
+    1, as in sentences."""
 
     def __init__(self, seed: int) -> None:
         self._acts, self._facts, self._next = script.tubes(seed), list[Fact](), 0
@@ -74,12 +77,17 @@ class Script:
         """Start and stop edges until this frame."""
         while self._next <= frame:
             self._add()
-        starts, stops = (bisect_right(self._facts, frame, key=key) for key in (lambda f: f.start, lambda f: f.stop))
+        starts, stops = (
+            bisect_right(self._facts, frame, key=key)
+            for key in (lambda f: f.start, lambda f: f.stop)
+        )
         return starts, stops
 
     def _add(self) -> None:
         act = next(self._acts)
-        self._facts.append(Fact(act.label, self._next + act.start, self._next + act.stop, self._alone(act)))
+        self._facts.append(
+            Fact(act.label, self._next + act.start, self._next + act.stop, self._alone(act))
+        )
         self._next += len(act.frames)
 
     def _alone(self, act: rig.Act) -> str:
@@ -104,7 +112,8 @@ class BoxUnderTest(Protocol):
         ...
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """Lines that have come since the last call, each with its time; waits no longer. Raises Gone."""
+        """Lines that have come since the last call, each with its time; waits no longer. Raises
+        Gone."""
         ...
 
     def edges(self, at_s: float) -> tuple[int, int]:
@@ -133,7 +142,8 @@ class BoxUnderTest(Protocol):
 
 
 def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
-    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as `BoxUnderTest.process` returns it."""
+    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as
+    `BoxUnderTest.process` returns it."""
     kib = dict(SMAPS.findall(smaps))
     fields = stat.rpartition(")")[2].split()
     cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
@@ -141,9 +151,11 @@ def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, in
 
 
 class Reckoned:
-    """A robot and a board that cannot be asked: their sweeps and frames by the clock, since the script is known.
+    """A robot and a board that cannot be asked: their sweeps and frames by the clock, since the
+    script is known.
 
-    The quickest answer fixes where the script is, the first frames that were counted where the board is.
+    The quickest answer fixes where the script is, the first frames that were counted where the
+    board is.
     """
 
     def __init__(self, sweeps: Script) -> None:
@@ -154,19 +166,27 @@ class Reckoned:
         """Take note of a sentence."""
         if answer := Answer.read(line):
             self._begin(at_s - self._sweeps[answer.sweep].stop / skin.FORMAT.rate_hz - HALF_FRAME_S)
-        if not self._board_s and line.startswith("$PPLP,STA,") and int(frames := line.split(",")[6]):
+        if (
+            not self._board_s
+            and line.startswith("$PPLP,STA,")
+            and int(frames := line.split(",")[6])
+        ):
             self._board_s = at_s - int(frames) / skin.FORMAT.rate_hz
 
     def _begin(self, origin_s: float) -> None:
-        """The script began then or earlier. Only a little earlier than was known: a slow first answer is put right, an
-        answer with a wrong number moves nothing.
+        """The script began then or earlier. Only a little earlier than was known: a slow first
+        answer is put right, an answer with a wrong number moves nothing.
         """
         if not self._origin_s or 0 < self._origin_s - origin_s < SLOW_ANSWER_S:
             self._origin_s = origin_s
 
     def edges(self, at_s: float) -> tuple[int, int]:
         """As BoxUnderTest.edges."""
-        return self._sweeps.edges((at_s - self._origin_s) * skin.FORMAT.rate_hz) if self._origin_s else (0, 0)
+        return (
+            self._sweeps.edges((at_s - self._origin_s) * skin.FORMAT.rate_hz)
+            if self._origin_s
+            else (0, 0)
+        )
 
     def taken(self, at_s: float) -> float:
         """As BoxUnderTest.taken."""
@@ -202,7 +222,9 @@ class ThisMachine:
         palpate = Path(sys.executable).with_name("palpate")
         command = [*self._before, str(palpate), "run", *options, *self._sets]
         self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "log"
-        self._box = subprocess.Popen([*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb"))
+        self._box = subprocess.Popen(
+            [*command, "--set", f"serial.port={port}"], stderr=self._log.open("wb")
+        )
         self._stack.callback(self._end)
 
     def _end(self) -> None:
@@ -250,11 +272,17 @@ class ThisMachine:
             smaps, stat = ((place / name).read_text() for name in ("smaps_rollup", "stat"))
             return process(smaps, stat, len(os.listdir(place / "fd")))
         except (OSError, KeyError) as e:
-            raise Gone(f"the process of the box cannot be read: {e}; its log ends {self._log_text()!r}") from e
+            raise Gone(
+                f"the process of the box cannot be read: {e}; its log ends {self._log_text()!r}"
+            ) from e
 
     def about(self) -> Mapping[str, Any]:
         """As BoxUnderTest."""
-        versions = {"python": platform.python_version(), "numpy": np.__version__, "onnxruntime": ort.__version__}
+        versions = {
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "onnxruntime": ort.__version__,
+        }
         return {
             "what": "palpate run --sim skin, the serial line a pseudo-terminal; its memory holds the simulated skin too",
             "machine": f"{platform.machine()}, {os.cpu_count()} cores, Linux {platform.release()}",
@@ -277,6 +305,8 @@ class ThisMachine:
         end_s = time.monotonic() + STOP_S
         ended = False
         while not ended and time.monotonic() < end_s:
-            ended = self._box.poll() is not None  # before the last look, so that nothing is left in the line
+            ended = (
+                self._box.poll() is not None
+            )  # before the last look, so that nothing is left in the line
             with suppress(BlockingIOError):
                 yield from self._read(0.2)

@@ -1,7 +1,8 @@
-"""The virtual box under test. In: a script of sweeps. Out: sentences of the guest, edges given to it, resources of its process.
+"""The virtual box under test. In: a script of sweeps. Out: sentences of the guest, edges given to
+it, resources of its process.
 
-The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its serial port: the way of a
-real box. Only what it takes of memory is asked for inside.
+The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its
+serial port: the way of a real box. Only what it takes of memory is asked for inside.
 """
 
 from __future__ import annotations
@@ -32,13 +33,16 @@ from tests.rig.soak_boxes import Gone, Script, process
 READY_S = 180
 LOCKED = re.compile(r"^onnxruntime==(\S+)", re.M)
 SENT = 4096
-"""Packets of which it is remembered when they went: half a minute, longer than any sentence takes."""
+"""Packets of which it is remembered when they went: half a minute, longer than any sentence
+takes."""
 
 
 class SoakRobot:
-    """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of starts, and of stops.
+    """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of
+    starts, and of stops.
 
-    The edges of a sweep are planned while the one before it is made: they come in time however late frames are fetched.
+    The edges of a sweep are planned while the one before it is made: they come in time however late
+    frames are fetched.
     """
 
     def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
@@ -58,7 +62,9 @@ class SoakRobot:
 
     def _plan(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
         act = next(self._acts)
-        for line, frame, edges in zip(("START", "STOP"), (act.start, act.stop), self.edges_ns, strict=True):
+        for line, frame, edges in zip(
+            ("START", "STOP"), (act.start, act.stop), self.edges_ns, strict=True
+        ):
             at_ns = frame_ns(first + frame)
             self._lines.drive(line, True, at_ns)
             self._lines.drive(line, False, at_ns + rig.PULSE_NS)
@@ -150,7 +156,9 @@ class VirtualBox:
         """As BoxUnderTest."""
         place = f"/proc/{self._pid}"
         try:
-            text = self._guest.run(f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True).out
+            text = self._guest.run(
+                f"cat {place}/smaps_rollup {place}/stat && ls {place}/fd | wc -l", check=True
+            ).out
         except (GuestFailed, OSError) as e:
             raise Gone(f"the box cannot be looked at: {e}; did it end?") from e
         *_, stat, files = text.strip().splitlines()

@@ -19,18 +19,35 @@ from appliance.core.types import Status
 
 Json = Mapping[str, Any]
 ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "lost")
-"""Columns of an answer: when it came (seconds of the soak), its RES sentence beside what was touched. alone: what the
-same bundle says, in the recorder, of the very frames that the script has there (see `said`)."""
-SAMPLE = ("s", "rss_kib", "pss_kib", "cpu_s", "files", "threads", "received", "lost", "garbage", "enumerations", "dropped",
-          "behind")  # fmt: skip
-"""Columns of a sample: the process, then the counters of the last STA. behind: frames that the board had taken and the
-box had not counted yet, received or lost; the least since the sample before."""
+"""Columns of an answer: when it came (seconds of the soak), its RES sentence beside what was
+touched. alone: what the same bundle says, in the recorder, of the very frames that the script has
+there (see `said`)."""
+SAMPLE = (
+    "s",
+    "rss_kib",
+    "pss_kib",
+    "cpu_s",
+    "files",
+    "threads",
+    "received",
+    "lost",
+    "garbage",
+    "enumerations",
+    "dropped",
+    "behind",
+)
+"""Columns of a sample: the process, then the counters of the last STA. behind: frames that the
+board had taken and the box had not counted yet, received or lost; the least since the sample
+before."""
 GROWTH_KIB_H = 256.0
-"""Memory is flat where the upper end of the slope's 95 % interval stays below this; stated before the first run."""
+"""Memory is flat where the upper end of the slope's 95 % interval stays below this; stated before
+the first run."""
 IN_FLIGHT = 12
-"""Two packets: what a board has taken and the box not counted may differ by so much between two looks."""
+"""Two packets: what a board has taken and the box not counted may differ by so much between two
+looks."""
 LOOKS = 6
-"""Samples, a minute of them, of which the least `behind` counts: a box that is late for a while has lost nothing."""
+"""Samples, a minute of them, of which the least `behind` counts: a box that is late for a while has
+lost nothing."""
 SECURE_MIN = 10
 """Minutes that the second half must have before growth or flatness is judged."""
 
@@ -39,8 +56,9 @@ SECURE_MIN = 10
 class SoakRun:
     """One unbroken run of one box; a soak that was interrupted has several.
 
-    began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be answered by its end.
-    faults: [seconds, what was wrong]. silence_s: longest time without a sentence. ended: why, "" while it goes on.
+    began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be
+    answered by its end. faults: [seconds, what was wrong]. silence_s: longest time without a
+    sentence. ended: why, "" while it goes on.
     """
 
     seed: int
@@ -60,16 +78,22 @@ def columns(rows: Sequence[Sequence[Any]], names: Sequence[str]) -> dict[str, li
 
 
 def numbering(number: int, last: int, started: int) -> str:
-    """What is wrong with the number of an answer after the answer `last`, when `started` sweeps had begun; "" if nothing."""
+    """What is wrong with the number of an answer after the answer `last`, when `started` sweeps had
+    begun; "" if nothing."""
     if number == last + 1:
-        return "" if number <= started else f"answer {number} came before its start edge, the robot had given {started}"
+        return (
+            ""
+            if number <= started
+            else f"answer {number} came before its start edge, the robot had given {started}"
+        )
     if number <= last:
         return f"answer {number} came again, {last} was answered already"
     return f"answer {number} came after {last}: {number - last - 1} left out"
 
 
 def kind(status: str, label: str, touched: str) -> str:
-    """An answer as right, wrong, unsure or refused; cut, where the soak's own end aborted the sweep."""
+    """An answer as right, wrong, unsure or refused; cut, where the soak's own end aborted the
+    sweep."""
     if status == Status.OK:
         return "right" if label == touched else "wrong"
     if status == Status.ABORTED:
@@ -94,16 +118,20 @@ def sums(box: Json) -> dict[str, Any]:
         "hours": sum(run["length_s"] for run in runs) / 3600,
         "due": due,
         "answers": len(rows),
-        "unanswered": sum(len({*range(1, run["due"] + 1)} - {row[1] for row in run["answers"]}) for run in runs),
+        "unanswered": sum(
+            len({*range(1, run["due"] + 1)} - {row[1] for row in run["answers"]}) for run in runs
+        ),
         "cut": kinds["cut"],
-        "differs": sum(row[3] != Status.ABORTED and short_answer(row[3], row[4]) != row[5] for row in rows),
+        "differs": sum(
+            row[3] != Status.ABORTED and short_answer(row[3], row[4]) != row[5] for row in rows
+        ),
         "statuses": dict(Counter(a["status"])),
         "faults": sum(len(run["faults"]) for run in runs),
         "silence_s": max((run["silence_s"] for run in runs), default=0.0),
         "latency_ms": _percentiles([row[6] for row in rows if row[3] != Status.ABORTED]),
         "memory": slope(runs),
         "wrong_band": band(rows)[1][-1] if judged else [0, 0],
-    }  # fmt: skip
+    }
     result |= {name: share(kinds[name], judged) for name in ("right", "wrong", "unsure", "refused")}
     return result | _counted(runs)
 
@@ -115,8 +143,8 @@ def share(n: int, total: int) -> dict[str, Any]:
 
 
 def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
-    """Seconds of the answers, and how many wrong ones are to be expected by then: 95 % of a binomial whose rate is that of
-    the same bundle by itself on the script's own frames."""
+    """Seconds of the answers, and how many wrong ones are to be expected by then: 95 % of a
+    binomial whose rate is that of the same bundle by itself on the script's own frames."""
     rows = [row for row in rows if row[3] != Status.ABORTED]
     alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, and no refusal
     rate = sum(alone) / len(rows) if rows else 0.0
@@ -128,22 +156,35 @@ def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
 def _percentiles(values: Sequence[float]) -> dict[str, float]:
     if not values:
         return {}
-    return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99)} | {"max": max(values)}
+    return {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99)} | {
+        "max": max(values)
+    }
 
 
 def slope(runs: Sequence[Json]) -> dict[str, Any]:
-    """Growth of resident memory over the second half of each run, KiB an hour, by least squares with its 95 % interval.
+    """Growth of resident memory over the second half of each run, KiB an hour, by least squares
+    with its 95 % interval.
 
-    Runs are separate processes: each has a level of its own, all have one slope. Neighbouring samples are alike, so the
-    interval is that of so many independent ones as their correlation leaves (Bartlett 1946, first order).
+    Runs are separate processes: each has a level of its own, all have one slope. Neighbouring
+    samples are alike, so the interval is that of so many independent ones as their correlation
+    leaves (Bartlett 1946, first order).
     """
-    held = [columns(half, SAMPLE) for run in runs if len(half := run["samples"][len(run["samples"]) // 2 :]) > 1]
-    result = {"samples": sum(len(h["s"]) for h in held), "minutes": sum(h["s"][-1] - h["s"][0] for h in held) / 60}
+    held = [
+        columns(half, SAMPLE)
+        for run in runs
+        if len(half := run["samples"][len(run["samples"]) // 2 :]) > 1
+    ]
+    result = {
+        "samples": sum(len(h["s"]) for h in held),
+        "minutes": sum(h["s"][-1] - h["s"][0] for h in held) / 60,
+    }
     n, fitted = result["samples"], len(held) + 1
     if n <= fitted:
         return result | {"kib_h": None, "low": None, "high": None}
-    x, y = (np.concatenate([np.subtract(v, np.mean(v)) for v in values])
-            for values in ([h["s"] for h in held], [h["rss_kib"] for h in held]))  # fmt: skip
+    x, y = (
+        np.concatenate([np.subtract(v, np.mean(v)) for v in values])
+        for values in ([h["s"] for h in held], [h["rss_kib"] for h in held])
+    )
     x = x / 3600
     b = float(x @ y / (x @ x))
     rest = y - b * x
@@ -158,8 +199,10 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
 def _counted(runs: Sequence[Json]) -> dict[str, Any]:
     """Counters of the box, and what the board took that it never counted."""
     last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
-    result: dict[str, Any] = {name: sum(c[name][-1] for c in last)
-                            for name in ("received", "lost", "garbage", "enumerations", "dropped")}  # fmt: skip
+    result: dict[str, Any] = {
+        name: sum(c[name][-1] for c in last)
+        for name in ("received", "lost", "garbage", "enumerations", "dropped")
+    }
     result["unaccounted"] = sum(unaccounted(c["behind"]) for c in last)
     result["cpu"] = sum(c["cpu_s"][-1] - c["cpu_s"][0] for c in last) / max(
         sum(c["s"][-1] - c["s"][0] for c in last), 1
@@ -170,10 +213,11 @@ def _counted(runs: Sequence[Json]) -> dict[str, Any]:
 
 
 def unaccounted(behind: Sequence[float]) -> int:
-    """Frames that the board took and the box counted neither as received nor as lost, from what it was behind over time.
+    """Frames that the board took and the box counted neither as received nor as lost, from what it
+    was behind over time.
 
-    What is on its way comes back down within a minute; what was dropped in silence never does. More than was taken,
-    frames out of nowhere, counts as well.
+    What is on its way comes back down within a minute; what was dropped in silence never does. More
+    than was taken, frames out of nowhere, counts as well.
     """
     if not behind:
         return 0
@@ -182,9 +226,20 @@ def unaccounted(behind: Sequence[float]) -> int:
 
 
 def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
-    """(what, what is wanted, what came out, whether it was reached) of each target; None where the run was too short."""
-    yield "sweeps without an answer", "0", f"{result['unanswered']} of {result['due']}", result["unanswered"] == 0
-    yield "sentences out of order, broken or missing", "0", f"{result['faults']}", result["faults"] == 0
+    """(what, what is wanted, what came out, whether it was reached) of each target; None where the
+    run was too short."""
+    yield (
+        "sweeps without an answer",
+        "0",
+        f"{result['unanswered']} of {result['due']}",
+        result["unanswered"] == 0,
+    )
+    yield (
+        "sentences out of order, broken or missing",
+        "0",
+        f"{result['faults']}",
+        result["faults"] == 0,
+    )
     yield (
         "frames lost and not accounted for",
         "0",
@@ -194,7 +249,12 @@ def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
     yield "sentences dropped", "0", f"{result['dropped']}", result["dropped"] == 0
     most = result["wrong_band"][1]
     wrong = result["wrong"]["n"]
-    yield "wrong verdicts, against the network by itself", f"at most {most}", f"{wrong}", wrong <= most
+    yield (
+        "wrong verdicts, against the network by itself",
+        f"at most {most}",
+        f"{wrong}",
+        wrong <= most,
+    )
     m = result["memory"]
     grown = "" if m["high"] is None else estimate(m["kib_h"], m["low"], m["high"])
     flat = grown and m["high"] < GROWTH_KIB_H
@@ -204,7 +264,9 @@ def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
         grown,
         bool(flat) if m["minutes"] >= SECURE_MIN else None,
     )
-    steady = all(result[name][-1] <= max(result[name][:2]) for name in ("files", "threads") if result[name])
+    steady = all(
+        result[name][-1] <= max(result[name][:2]) for name in ("files", "threads") if result[name]
+    )
     held = ", ".join(str(result[name][-1]) for name in ("files", "threads") if result[name])
     yield "open files, threads", "no more", held, steady
 

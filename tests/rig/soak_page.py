@@ -1,6 +1,8 @@
-"""The page of a soak. In: records with their sums. Out: HTML and its picture of four charts over time.
+"""The page of a soak. In: records with their sums. Out: HTML and its picture of four charts over
+time.
 
-Nothing is computed here but what a chart needs; every sentence with a number takes it from the sums.
+Nothing is computed here but what a chart needs; every sentence with a number takes it from the
+sums.
 """
 
 from __future__ import annotations
@@ -28,21 +30,46 @@ from tests.rig.soak_judge import (
     targets,
 )
 from train.reports import formatting, html, provenance
-from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, WIDTH, add_axes, set_ticks, to_svg
+from train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    SMALL,
+    WIDTH,
+    add_axes,
+    set_ticks,
+    to_svg,
+)
 
 Json = Mapping[str, Any]
-LOOKS = {"color": ACCENT, "linewidth": 1.8}, {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))}
+LOOKS = (
+    {"color": ACCENT, "linewidth": 1.8},
+    {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))},
+)
 """Of the boxes; where both do the same, one shows through the other."""
 DOTS = 1500
 """Dots of a chart; of more sweeps the slowest of each few is drawn."""
 ORIGIN = {
-    "what": "what runs", "machine": "machine", "versions": "versions", "bundle": "bundle", "commit": "commit", "seed": "seed",
-    "format": "skin", "started": "started (UTC)", "runs": "runs",
-}  # fmt: skip
+    "what": "what runs",
+    "machine": "machine",
+    "versions": "versions",
+    "bundle": "bundle",
+    "commit": "commit",
+    "seed": "seed",
+    "format": "skin",
+    "started": "started (UTC)",
+    "runs": "runs",
+}
 """What was run: names in the records and on the page."""
 
 
-ENDS = {"time": "to its end", "interrupted": "interrupted", "gone": "the box was gone", "": "not ended"}
+ENDS = {
+    "time": "to its end",
+    "interrupted": "interrupted",
+    "gone": "the box was gone",
+    "": "not ended",
+}
 
 
 def render(records: Json) -> tuple[str, str]:
@@ -71,8 +98,10 @@ def render(records: Json) -> tuple[str, str]:
             for run in box["runs"]
             for at_s, what in run["faults"]
         ],
-        origin=[[text, *(_about(box, name) for box in boxes.values())] for name, text in ORIGIN.items()],
-    )  # fmt: skip
+        origin=[
+            [text, *(_about(box, name) for box in boxes.values())] for name, text in ORIGIN.items()
+        ],
+    )
     return page, svg
 
 
@@ -105,9 +134,18 @@ def _sums(sums: Sequence[Json]) -> list[list[str]]:
         ("hours", lambda s: f"{s['hours']:.2f}"),
         ("sweeps, answered of begun", lambda s: f"{s['due'] - s['unanswered']:,} of {s['due']:,}"),
         ("aborted by the end of the soak", lambda s: f"{s['cut']}"),
-        *((name, lambda s, n=name: _share(s[n])) for name in ("right", "wrong", "unsure", "refused")),
-        *((f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}") for name in statuses),
-        ("other than the network by itself", lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}"),
+        *(
+            (name, lambda s, n=name: _share(s[n]))
+            for name in ("right", "wrong", "unsure", "refused")
+        ),
+        *(
+            (f"answered {name}", lambda s, n=name: f"{s['statuses'].get(n, 0):,}")
+            for name in statuses
+        ),
+        (
+            "other than the network by itself",
+            lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}",
+        ),
         ("frames received", lambda s: f"{s['received']:,}"),
         ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
         ("frames not accounted for", lambda s: f"{s['unaccounted']:,}"),
@@ -115,10 +153,19 @@ def _sums(sums: Sequence[Json]) -> list[list[str]]:
         ("times that the skin was found on the bus", lambda s: f"{s['enumerations']}"),
         ("sentences dropped", lambda s: f"{s['dropped']}"),
         ("longest silence, s", lambda s: f"{s['silence_s']:.1f}"),
-        ("latency, ms: median, 99 %, worst", lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values())),
+        (
+            "latency, ms: median, 99 %, worst",
+            lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values()),
+        ),
         ("resident memory, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
-        ("the same, shared pages divided by their users, MiB: start, half-way, end", lambda s: _mib(s["pss_kib"])),
-        ("growth of resident memory in the second half, KiB an hour", lambda s: _slope(s["memory"])),
+        (
+            "the same, shared pages divided by their users, MiB: start, half-way, end",
+            lambda s: _mib(s["pss_kib"]),
+        ),
+        (
+            "growth of resident memory in the second half, KiB an hour",
+            lambda s: _slope(s["memory"]),
+        ),
         ("the same, KiB for 1,000 sweeps", _each),
         ("share of a core used", lambda s: formatting.percent(s["cpu"])),
     ]
@@ -141,7 +188,9 @@ def charts(records: Json) -> str:
     ):
         row, column = divmod(i, 2)
         left, top = 0.1 + 0.5 * column, 0.9 - 0.47 * row
-        axes = add_axes(figure, left, left + 0.375, top, top - 0.3)  # the last tick is centred on the end
+        axes = add_axes(
+            figure, left, left + 0.375, top, top - 0.3
+        )  # the last tick is centred on the end
         axes.set_xlim(0, 60 * hours / by * 1.01)
         for (_, box), look in zip(boxes, LOOKS, strict=False):
             draw(axes, box, look, 60 * by)
@@ -151,8 +200,17 @@ def charts(records: Json) -> str:
         axes.yaxis.set_label_coords(0, 1.03)
     for i, ((name, _), look) in enumerate(zip(boxes, LOOKS, strict=False)):
         mark = "╍" if "linestyle" in look else "—"
-        figure.text(0.1 + 0.25 * i, 0.97, f"{mark} {name}", color=look["color"], size=SMALL + 0.5, va="center")
-    with matplotlib.rc_context({"path.simplify": False}):  # it would leave out strokes without length
+        figure.text(
+            0.1 + 0.25 * i,
+            0.97,
+            f"{mark} {name}",
+            color=look["color"],
+            size=SMALL + 0.5,
+            va="center",
+        )
+    with matplotlib.rc_context(
+        {"path.simplify": False}
+    ):  # it would leave out strokes without length
         return to_svg(figure, "memory, latency, loss and wrong verdicts of a soak over time")
 
 
@@ -161,12 +219,19 @@ def _memory(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     mib = np.divide(samples["rss_kib"], 1024)
     axes.plot(np.divide(samples["s"], unit_s), mib, **look)
     low, high = (axes.get_ylim() if axes.lines[1:] else (np.inf, -np.inf)) if len(mib) else (0, 1)
-    axes.set_ylim(min(low, np.min(mib, initial=np.inf) - 4), max(high, np.max(mib, initial=-np.inf) + 4))
+    axes.set_ylim(
+        min(low, np.min(mib, initial=np.inf) - 4), max(high, np.max(mib, initial=-np.inf) + 4)
+    )
 
 
 def dots(box: Json) -> tuple[Any, Any]:
     """Seconds and latencies in ms of the sweeps that are drawn: all, or the slowest of each few."""
-    rows = [row for run in box["runs"] for row in run["answers"] if kind(row[3], row[4], row[2]) != "cut"]
+    rows = [
+        row
+        for run in box["runs"]
+        for row in run["answers"]
+        if kind(row[3], row[4], row[2]) != "cut"
+    ]
     s, ms = (np.array(columns(rows, ANSWER)[name], float) for name in ("s", "latency_ms"))
     each = max(-(-len(s) // DOTS), 1)
     pick = [k + int(np.argmax(ms[k : k + each])) for k in range(0, len(s), each)]
@@ -181,7 +246,9 @@ def _latency(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     axes.plot(x, y, color=look["color"], linewidth=2.2, alpha=0.7, solid_capstyle="round")
     axes.set_yscale("log")
     low, high = axes.get_ylim() if axes.lines[1:] else (1.0, 10.0)
-    axes.set_ylim(min(low, 0.8 * float(ms.min(initial=1))), max(high, 1.5 * float(ms.max(initial=1))))
+    axes.set_ylim(
+        min(low, 0.8 * float(ms.min(initial=1))), max(high, 1.5 * float(ms.max(initial=1)))
+    )
 
 
 def _loss(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
@@ -201,7 +268,9 @@ def _wrong(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     rows = [row for run in box["runs"] for row in run["answers"]]
     s, ends = band(rows)
     low, high = np.transpose(ends) if ends else ([], [])
-    axes.fill_between(np.divide(s, unit_s), low, high, color=look["color"], alpha=0.13, linewidth=0, step="post")
+    axes.fill_between(
+        np.divide(s, unit_s), low, high, color=look["color"], alpha=0.13, linewidth=0, step="post"
+    )
     wrong = np.cumsum([kind(row[3], row[4], row[2]) == "wrong" for row in rows])
     axes.step(np.divide([row[0] for row in rows], unit_s), wrong, where="post", **look)
     most = max([1, *high, *wrong[-1:]])
@@ -211,8 +280,16 @@ def _wrong(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
 def _scales(axes: Axes) -> None:
     """Few round ticks."""
     for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        along = MaxNLocator(4, integer=True, steps=[1, 1.5, 2, 3, 6, 10]) if axis is axes.xaxis else MaxNLocator(4)
-        there = [10.0**k for k in range(-3, 7)] if axis.get_scale() == "log" else along.tick_values(*ends)
+        along = (
+            MaxNLocator(4, integer=True, steps=[1, 1.5, 2, 3, 6, 10])
+            if axis is axes.xaxis
+            else MaxNLocator(4)
+        )
+        there = (
+            [10.0**k for k in range(-3, 7)]
+            if axis.get_scale() == "log"
+            else along.tick_values(*ends)
+        )
         ticks = [tick for tick in there if ends[0] <= tick <= ends[1]]
         set_ticks(axis, ticks)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
@@ -235,7 +312,9 @@ def _mib(kib: Sequence[float]) -> str:
 
 
 def _slope(m: Json, by: float = 1.0) -> str:
-    return "" if m["high"] is None else estimate(*(m[name] * by for name in ("kib_h", "low", "high")))
+    return (
+        "" if m["high"] is None else estimate(*(m[name] * by for name in ("kib_h", "low", "high")))
+    )
 
 
 def _each(s: Json) -> str:
@@ -246,5 +325,7 @@ def _about(box: Json, name: str) -> str:
     if name == "versions":
         return ", ".join(f"{k} {v}" for k, v in box[name].items())
     if name == "runs":
-        return "; ".join(f"{run['length_s'] / 60:.1f} min, {ENDS[run['ended']]}" for run in box[name])
+        return "; ".join(
+            f"{run['length_s'] / 60:.1f} min, {ENDS[run['ended']]}" for run in box[name]
+        )
     return str(box.get(name, "not noted"))

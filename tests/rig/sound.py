@@ -1,4 +1,5 @@
-"""What a robot checks around a fault: the box recovers by itself, and no answer names a material that was not touched.
+"""What a robot checks around a fault: the box recovers by itself, and no answer names a material
+that was not touched.
 
 In: a cell. Out: right sweeps, state fields, or AssertionError with the journal of the box.
 """
@@ -19,15 +20,33 @@ from appliance.sim import rig, skin
 from tests.rig.cell import Cell, Touch
 
 FIELDS = (
-    "time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations", "dropped", "bundle",
+    "time",
+    "state",
+    "sweeping",
+    "answered",
+    "received",
+    "lost",
+    "garbage",
+    "enumerations",
+    "dropped",
+    "bundle",
     "source",
-)  # fmt: skip
+)
 """The first of a state sentence (PROTOCOL.md, part 2)."""
 LATE = {
-    "gap", "short", "long", "no-start", "no-stop", "edges-lost", "sensor-lost", "not-ready", "unsure", "unknown",
-}  # fmt: skip
-"""Answers to sound sweeps while the guest is busy with something else: frames or edges come to the box late, and the
-window lies beside its place. None names a wrong material.
+    "gap",
+    "short",
+    "long",
+    "no-start",
+    "no-stop",
+    "edges-lost",
+    "sensor-lost",
+    "not-ready",
+    "unsure",
+    "unknown",
+}
+"""Answers to sound sweeps while the guest is busy with something else: frames or edges come to the
+box late, and the window lies beside its place. None names a wrong material.
 """
 OPEN_NS = 1_000_000_000
 """A sweep is open so long after its start edge, at most."""
@@ -36,7 +55,8 @@ TRIES = 6
 
 
 def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
-    """Those that the default bundle names right by itself, also a few frames beside the middle: what else comes is a fault."""
+    """Those that the default bundle names right by itself, also a few frames beside the middle:
+    what else comes is a fault."""
     model, window = bundle.load(bundle.DEFAULT), skin.FORMAT.window
     alone = Classifier(model, SystemClock())
     for act in acts:
@@ -51,7 +71,8 @@ def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
 
 
 def not_wrong(touch: Touch, answer: Answer) -> str:
-    """The status of an answer. Raises AssertionError where it names another material than was touched."""
+    """The status of an answer. Raises AssertionError where it names another material than was
+    touched."""
     assert answer.label in ("", touch.act.label), f"{touch.act.label} was answered {answer}"
     return answer.status
 
@@ -66,7 +87,9 @@ def check_recovers(cell: Cell) -> None:
         if answer.status == "ok":
             return
         assert answer.status in LATE, f"a sound sweep was answered {answer}"
-    raise AssertionError(f"{TRIES} sound sweeps were answered {received}; the box says: {cell.journal()}")
+    raise AssertionError(
+        f"{TRIES} sound sweeps were answered {received}; the box says: {cell.journal()}"
+    )
 
 
 def state(cell: Cell) -> dict[str, str]:
@@ -80,13 +103,16 @@ def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
     end, seen = cell.clock.now_s() + timeout_s, Counter[str]()
     while (now := state(cell)["state"]) != wanted:
         seen[now] += 1
-        assert cell.clock.now_s() < end, f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
+        assert cell.clock.now_s() < end, (
+            f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
+        )
         cell.wait(0.02)
 
 
 def begin(cell: Cell) -> tuple[Touch, int]:
-    """A sweep that the box says is open, and the number of lines heard before it. Tried again where the box was doing
-    something else while the start edge came and went. Raises AssertionError where none opens."""
+    """A sweep that the box says is open, and the number of lines heard before it. Tried again where
+    the box was doing something else while the start edge came and went. Raises AssertionError where
+    none opens."""
     for _ in range(TRIES):
         since = len(cell.serial.heard)
         touch = cell.touch()
@@ -113,7 +139,8 @@ def let_go(cell: Cell) -> None:
 
 
 def only_answer(cell: Cell, since: int, seconds: float = 0.3) -> Answer:
-    """The one answer since line number `since`. Raises AssertionError where a second comes within `seconds`."""
+    """The one answer since line number `since`. Raises AssertionError where a second comes within
+    `seconds`."""
     first = cell.answer(since)
     end = cell.clock.now_s() + seconds
     while cell.clock.now_s() < end:

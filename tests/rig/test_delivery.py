@@ -1,7 +1,9 @@
-"""`make install` and `make deploy` into a bare arm64 Debian, over ssh: install, start, deliver, trial, power cut, rollback.
+"""`make install` and `make deploy` into a bare arm64 Debian, over ssh: install, start, deliver,
+trial, power cut, rollback.
 
-In: a guest without Palpate, with the lines, the serial port and the skin of a cell, its sshd at a port of this machine. Out:
-which bundle answers the robot. The stages share the guest's disk and come in their order.
+In: a guest without Palpate, with the lines, the serial port and the skin of a cell, its sshd at a
+port of this machine. Out: which bundle answers the robot. The stages share the guest's disk and
+come in their order.
 """
 
 from __future__ import annotations
@@ -29,16 +31,20 @@ from tests.rig.machine import Guest
 from tests.rig.notes import HOW
 from tests.rig.sound import known, not_wrong
 
-pytestmark = pytest.mark.skipif(HOW != "full", reason="installs a bare guest; make test-rig COUNTS=full")
+pytestmark = pytest.mark.skipif(
+    HOW != "full", reason="installs a bare guest; make test-rig COUNTS=full"
+)
 pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
 
 Note = Callable[[str, str, int], None]
 
 BOOT_S, BACK_S = 300, 180
 INSTALL_S = 1800
-"""Longest time for a command of the desktop: the guest builds a virtual environment, at the pace of an emulator."""
+"""Longest time for a command of the desktop: the guest builds a virtual environment, at the pace of
+an emulator."""
 TRIES = 3
-"""Sweeps until one is named: while an emulator is busy with something else, one may come to nothing."""
+"""Sweeps until one is named: while an emulator is busy with something else, one may come to
+nothing."""
 NETWORK = "[Match]\nType=ether\n[Network]\nAddress=10.0.2.15/24\nLinkLocalAddressing=no\nIPv6AcceptRA=no\n"
 """What QEMU's network without a way out expects."""
 ROBOT_PORT = 'SUBSYSTEM=="tty", KERNELS=="0000:00:08.0", SYMLINK+="palpate-robot"\n'
@@ -50,14 +56,16 @@ mkdir /home/{hosts.USER}/.ssh; cat > /home/{hosts.USER}/.ssh/authorized_keys
 chown -R {hosts.USER} /home/{hosts.USER}/.ssh
 systemctl enable --now systemd-networkd ssh
 """
-"""Takes the ground's runtime away and lets a person in, as a card that was written for a new board does."""
+"""Takes the ground's runtime away and lets a person in, as a card that was written for a new board
+does."""
 AS_PALPATE = "runuser -u palpate --"
 
 
 class BareBox:
     """A disk on top of a ground's, a desktop with a key to it, and a person who signs bundles.
 
-    port: of this machine, that leads to the guest's sshd. sha: of the bundles, in the order in which they were delivered.
+    port: of this machine, that leads to the guest's sshd. sha: of the bundles, in the order in
+    which they were delivered.
     """
 
     def __init__(self, on: Path, folder: Path) -> None:
@@ -72,7 +80,8 @@ class BareBox:
 
     @contextmanager
     def on(self) -> Iterator[Cell]:
-        """Power on; a robot's cell around it, its skin plugged in. The power goes at the end, as it is."""
+        """Power on; a robot's cell around it, its skin plugged in. The power goes at the end, as it
+        is."""
         with Guest(self._image, self.folder, disk=self.disk, ssh=self.port) as guest:
             guest.ready(BOOT_S)
             cell = Cell(guest)
@@ -81,7 +90,8 @@ class BareBox:
             yield cell
 
     def prepare(self, cell: Cell) -> None:
-        """What a person does before the first install: a card with a network, a key, and the settings of the cell."""
+        """What a person does before the first install: a card with a network, a key, and the
+        settings of the cell."""
         run, put = cell.machine.run, cell.machine.put
         put("/etc/systemd/network/wire.network", NETWORK.encode())
         put("/etc/udev/rules.d/71-rig.rules", ROBOT_PORT.encode())
@@ -108,7 +118,9 @@ class BareBox:
     def deploy(self) -> str:
         """`make deploy` of a new bundle, signed, with the next counter."""
         number = len(self.sha) + 1
-        made = deliveries.put(self.folder / f"bundle-{number}", deliveries.files(number, self._signer))
+        made = deliveries.put(
+            self.folder / f"bundle-{number}", deliveries.files(number, self._signer)
+        )
         self.sha.append(hashlib.sha256((made / bundle.MANIFEST).read_bytes()).hexdigest())
         return self.desktop("deploy", made)
 
@@ -137,15 +149,20 @@ def sound(box: BareBox) -> None:
 
 
 def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
-    """A bare board is installed, takes a bundle on trial, loses power in the trial and goes on with it; a bundle with which the
-    program dies at each start is left without help, and `palpate rollback` goes back by hand."""
+    """A bare board is installed, takes a bundle on trial, loses power in the trial and goes on with
+    it; a bundle with which the program dies at each start is left without help, and `palpate
+    rollback` goes back by hand."""
     box = BareBox(ground(), tmp_path)
     with box.on() as cell:
         box.prepare(cell)
         said = box.install()
         assert re.search(r"is READY [0-9.]+ s after the command\n", said), said
         answered_by(cell, bundle.load(bundle.DEFAULT).id)
-        note("make install on a bare Debian for arm64, over ssh", "service started, READY; a sweep named rightly", 1)
+        note(
+            "make install on a bare Debian for arm64, over ssh",
+            "service started, READY; a sweep named rightly",
+            1,
+        )
         said = box.deploy()
         assert re.search(r"is READY [0-9.]+ s after the command; .* on trial: ", said), said
         first = box.sha[0]
@@ -156,7 +173,10 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
     with box.on() as cell:
         answered_by(cell, first)
         told = roles(cell)[first]
-        assert (told["role"], told["detail"].split(",")[0]) == ("on trial", f"start 1 of {MOST_STARTS}"), told
+        assert (told["role"], told["detail"].split(",")[0]) == (
+            "on trial",
+            f"start 1 of {MOST_STARTS}",
+        ), told
         note("power cut in the trial", "on trial still, READY after the boot; file system clean", 1)
         cell.machine.run(f"{AS_PALPATE} {PALPATE} commit", timeout_s=90, check=True)
         box.deploy()
@@ -167,7 +187,9 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
         told = roles(cell)
         assert (told[first]["role"], told[second]["role"]) == ("current", "left"), told
         note(
-            "bundle on trial with which the program dies at each start", "left without help, the one before answers", 1
+            "bundle on trial with which the program dies at each start",
+            "left without help, the one before answers",
+            1,
         )
         box.deploy()
         answered_by(cell, box.sha[2])
@@ -175,7 +197,9 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
     with box.on() as cell:
         answered_by(cell, box.sha[2])
         cell.machine.run(
-            f"{AS_PALPATE} {PALPATE} rollback && systemctl restart --no-block palpate", timeout_s=90, check=True
+            f"{AS_PALPATE} {PALPATE} rollback && systemctl restart --no-block palpate",
+            timeout_s=90,
+            check=True,
         )
         cell.lines.wait("READY", False, BACK_S)
         answered_by(cell, first)

@@ -1,4 +1,5 @@
-"""What the trigger lines can do to the box, on a real kernel. In: edges that no sound robot makes. Out: one answer each.
+"""What the trigger lines can do to the box, on a real kernel. In: edges that no sound robot makes.
+Out: one answer each.
 
 Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
 """
@@ -42,11 +43,13 @@ port = "/dev/palpate-robot"
 BUSY, DECIDED = "CLASS-0", "CLASS-1"
 SECOND = 1_000_000_000
 PULSE_NS = 500_000_000
-"""After so long the robot's own pulse is over: both edges of a glitch within it would be an end of it."""
+"""After so long the robot's own pulse is over: both edges of a glitch within it would be an end of
+it."""
 MANY = 10_000
 """Of so many interrupts more than the kernel's 1024 events stay, however many are joined."""
 HALT_S = 60
-"""Less than the watchdog's time in the guest; a machine that is busy gets so many edges to the guest in no less."""
+"""Less than the watchdog's time in the guest; a machine that is busy gets so many edges to the
+guest in no less."""
 LOST_EDGES = 15
 """Of a state sentence: the edges that the kernel dropped (PROTOCOL.md, part 2)."""
 WIDTHS_S = (0.0005, 0.001, 0.002, 0.005)
@@ -86,13 +89,19 @@ def statuses(cell: Cell, since: int, n: int) -> list[str]:
 
 def interrupts(cell: Cell) -> int:
     """Edges that the guest's kernel has noticed on all inputs."""
-    return int(cell.machine.run("awk '/palpate/ {n += $2 + $3} END {print n}' /proc/interrupts", check=True).out)
+    return int(
+        cell.machine.run(
+            "awk '/palpate/ {n += $2 + $3} END {print n}' /proc/interrupts", check=True
+        ).out
+    )
 
 
 @contextmanager
 def halted(cell: Cell) -> Iterator[None]:
     """The program stands still meanwhile; the kernel does not."""
-    pid = cell.machine.run("systemctl show --property MainPID --value palpate", check=True).out.strip()
+    pid = cell.machine.run(
+        "systemctl show --property MainPID --value palpate", check=True
+    ).out.strip()
     cell.machine.run(f"kill -STOP {pid}", check=True)
     try:
         yield
@@ -107,7 +116,8 @@ def toggle(cell: Cell, name: str, edges: int) -> None:
 
 
 def test_glitches(cell: Cell, count: Count, note: Note) -> None:
-    """Pulses that are over before the kernel can look are nothing, on both lines; longer ones are an edge or nothing."""
+    """Pulses that are over before the kernel can look are nothing, on both lines; longer ones are
+    an edge or nothing."""
     since, times = len(cell.serial.heard), count(20, 500)
     for _ in range(times):
         for name in ("START", "STOP"):
@@ -126,11 +136,16 @@ def test_glitches(cell: Cell, count: Count, note: Note) -> None:
         assert seen.keys() <= {"no-stop", "short", "no-start"}, seen
         starts = seen["no-stop"] + seen["short"]
         assert starts <= times
-        note(f"pulse of {1000 * width_s:g} ms", f"{starts} starts, {times - starts} times nothing", times)
+        note(
+            f"pulse of {1000 * width_s:g} ms",
+            f"{starts} starts, {times - starts} times nothing",
+            times,
+        )
 
 
 def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: Note) -> None:
-    """A start edge while a sweep is open: `no-stop`, and the new sweep is right, though glitches come all the time."""
+    """A start edge while a sweep is open: `no-stop`, and the new sweep is right, though glitches
+    come all the time."""
     outcomes: Counter[str] = Counter()
     for _ in range(count(1, 10)):
         cell.until_ready()
@@ -150,11 +165,16 @@ def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: No
         _, second = answers(cell, since, 2)
         outcomes[not_wrong(touch, second)] += 1
     assert outcomes["ok"], outcomes
-    note("start edge while a sweep is open, glitches in the next", f"no-stop, then {dict(outcomes)}", outcomes.total())
+    note(
+        "start edge while a sweep is open, glitches in the next",
+        f"no-stop, then {dict(outcomes)}",
+        outcomes.total(),
+    )
 
 
 def test_stop_without_start(cell: Cell, note: Note) -> None:
-    """A stop edge alone is `no-start`; so it is for each sweep while START is stuck, low or high."""
+    """A stop edge alone is `no-start`; so it is for each sweep while START is stuck, low or
+    high."""
     since = len(cell.serial.heard)
     pulse(cell, "STOP")
     assert statuses(cell, since, 1) == ["no-start"]
@@ -170,7 +190,8 @@ def test_stop_without_start(cell: Cell, note: Note) -> None:
 
 
 def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
-    """With STOP stuck, low or high, a sweep is answered `long` after sweep.max_duration_s; the next is right by itself."""
+    """With STOP stuck, low or high, a sweep is answered `long` after sweep.max_duration_s; the next
+    is right by itself."""
     levels = [False, True][: count(0, 2)]
     if not levels:
         pytest.skip("twelve seconds each; in the full run")
@@ -189,7 +210,8 @@ def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
 
 
 def test_storm(cell: Cell, note: Note) -> None:
-    """10,000 edges on START: each is a start or is joined with others; no verdict, and a right sweep when it is quiet."""
+    """10,000 edges on START: each is a start or is joined with others; no verdict, and a right
+    sweep when it is quiet."""
     since = len(cell.serial.heard)
     toggle(cell, "START", 10_000)
     cell.wait(0.1)
@@ -204,7 +226,8 @@ def test_storm(cell: Cell, note: Note) -> None:
 
 
 def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
-    """Start and stop in one turn are answered in order; of more than the kernel holds, `edges-lost`; then all is well."""
+    """Start and stop in one turn are answered in order; of more than the kernel holds,
+    `edges-lost`; then all is well."""
     since = len(cell.serial.heard)
     with halted(cell):
         pulse(cell, "START")
@@ -220,14 +243,16 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
     cell.until_ready(20)
     assert int(cell.state()[LOST_EDGES]) > dropped
     outcomes = [answer.status for answer in cell.answers(since)]
-    # the skin may have gone stale while the program stood still; the one start edge has one answer either way
+    # the skin may have gone stale while the program stood still; the one start edge has one answer
+    # either way
     assert outcomes in (["edges-lost"], ["not-ready"])
     check_recovers(cell)
     note("event queue overrun", f"{', '.join(outcomes)}; then a right verdict", 1)
 
 
 def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
-    """A whole sweep of a robot with one line, and the number of the line that was heard before it."""
+    """A whole sweep of a robot with one line, and the number of the line that was heard before
+    it."""
     since = len(cell.serial.heard)
     touch = cell.touch(start=False, stop=False)
     cell.begun(touch)
@@ -237,10 +262,11 @@ def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
 
 
 def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
-    """One-line mode, NEW OBJECT, BUSY and DECIDED on the same chip; a line that is high at start-up makes no sweep.
+    """One-line mode, NEW OBJECT, BUSY and DECIDED on the same chip; a line that is high at start-up
+    makes no sweep.
 
-    A storm, here of bursts, raises FAULT until it is over, and a line that stays high is `long`. The last test of this
-    guest: the wiring stays.
+    A storm, here of bursts, raises FAULT until it is over, and a line that stays high is `long`.
+    The last test of this guest: the wiring stays.
     """
     cell.lines.set("START", True)
     cell.machine.put("/etc/palpate/palpate.toml", OTHER_WIRING.encode())
@@ -260,12 +286,18 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
         until(cell, touch.stop_ns + SECOND // 3)
         seen = [(name, level) for _, name, level in cell.lines.log[begun:]]
         assert (
-            seen.index((BUSY, True)) < seen.index((DECIDED, True)) if results[-1][1].share < 1 else (BUSY, True) in seen
+            seen.index((BUSY, True)) < seen.index((DECIDED, True))
+            if results[-1][1].share < 1
+            else (BUSY, True) in seen
         )
         assert seen.index((BUSY, False)) > seen.index((BUSY, True))
     assert [answer.fused for _, answer in results] == [1, 2]
     assert not_wrong(*results[0]) == "ok"
-    note("one-line mode, NEW OBJECT, BUSY, DECIDED, high at start-up", "work; no-start for the fall", 2)
+    note(
+        "one-line mode, NEW OBJECT, BUSY, DECIDED, high at start-up",
+        "work; no-start for the fall",
+        2,
+    )
 
     since, begun = len(cell.serial.heard), len(cell.lines.log)
     toggle(cell, "START", count(2000, 10_000))
@@ -273,7 +305,11 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
     assert ("FAULT", True) in [(name, level) for _, name, level in cell.lines.log[begun:]]
     assert cell.lines.wait("FAULT", False, 10)
     cell.until_ready()
-    note(f"storm of {count(2000, 10_000)} edges in one burst", "FAULT and edges-lost; READY by itself", 1)
+    note(
+        f"storm of {count(2000, 10_000)} edges in one burst",
+        "FAULT and edges-lost; READY by itself",
+        1,
+    )
     since = len(cell.serial.heard)
     cell.lines.set("START", True)
     assert statuses(cell, since, 1) == ["long"]

@@ -1,4 +1,5 @@
-"""The contract of skin, lines and port, run inside the guest over its real kernel; what is outside it asks for."""
+"""The contract of skin, lines and port, run inside the guest over its real kernel; what is outside
+it asks for."""
 
 from __future__ import annotations
 
@@ -24,21 +25,33 @@ CODE = (
 
 
 def test_the_contract_holds_on_a_real_kernel(
-    image: Image, tmp_path: Path, count: Callable[[int, int], int], note: Callable[[str, str, int], None]
+    image: Image,
+    tmp_path: Path,
+    count: Callable[[int, int], int],
+    note: Callable[[str, str, int], None],
 ):
-    """test_backends.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of it where time is short."""
+    """test_backends.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of
+    it where time is short."""
     code = tmp_path / "code"
     code.mkdir()
     pack(code, CODE)
     some = count(1, 0) * " -k 'without_a_gap or start_and_stop or test_outputs or arrive_whole'"
     with Guest(image, tmp_path, snapshot=True, code=code) as machine:
         asking = threading.Thread(
-            target=remote.serve, args=(machine.bench().makefile("rwb"), GuestControls(machine)), daemon=True
+            target=remote.serve,
+            args=(machine.bench().makefile("rwb"), GuestControls(machine)),
+            daemon=True,
         )
         asking.start()
-        machine.run("systemctl stop palpate; mkdir -p /code && mount -o ro /dev/vdb /code", timeout_s=90, check=True)
+        machine.run(
+            "systemctl stop palpate; mkdir -p /code && mount -o ro /dev/vdb /code",
+            timeout_s=90,
+            check=True,
+        )
         env = "PYTHONDONTWRITEBYTECODE=1 PALPATE_BACKEND=remote PYTHONPATH=/code/site"
-        done = machine.run(f"cd /code && timeout -s INT 500 env {env} {PYTEST}{some}", timeout_s=520)
+        done = machine.run(
+            f"cd /code && timeout -s INT 500 env {env} {PYTEST}{some}", timeout_s=520
+        )
     assert done.rc == 0, done.out[-6000:]
     passed = int(re.search(r"(\d+) passed", done.out)[1])
     assert passed >= 3

@@ -1,5 +1,6 @@
-"""What the serial line can do to the box, on a real kernel. In: a robot that is deaf, noisy or gone, a port that goes,
-another program. Out: sentences again by themselves, and meanwhile sweeps that are answered on the lines.
+"""What the serial line can do to the box, on a real kernel. In: a robot that is deaf, noisy or
+gone, a port that goes, another program. Out: sentences again by themselves, and meanwhile sweeps
+that are answered on the lines.
 """
 
 from __future__ import annotations
@@ -35,19 +36,28 @@ def robot(shared: Cell) -> None:
 
 
 def shown(cell: Cell) -> Touch:
-    """A sweep that is answered on the lines at least: RESULT VALID rises over the code of what was touched, or of nothing."""
+    """A sweep that is answered on the lines at least: RESULT VALID rises over the code of what was
+    touched, or of nothing."""
     cell.until_ready()
     before, touch = len(cell.lines.log), cell.touch()
     end = cell.clock.now_s() + 60
-    while ("RESULT-VALID", True) not in [(name, level) for _, name, level in cell.lines.log[before:]]:
-        assert cell.clock.now_s() < end, f"the sweep was not answered; the box says: {cell.journal()}"
+    while ("RESULT-VALID", True) not in [
+        (name, level) for _, name, level in cell.lines.log[before:]
+    ]:
+        assert cell.clock.now_s() < end, (
+            f"the sweep was not answered; the box says: {cell.journal()}"
+        )
         cell.wait(0.02)
-    assert cell.lines.code() in (0, 1 + bundle.load(bundle.DEFAULT).manifest.labels.index(touch.act.label))
+    assert cell.lines.code() in (
+        0,
+        1 + bundle.load(bundle.DEFAULT).manifest.labels.index(touch.act.label),
+    )
     return touch
 
 
 def test_cable_out(cell: Cell, note: Note) -> None:
-    """Without a robot at the other end sweeps are shown on the lines; when it is back, it hears the next sentence."""
+    """Without a robot at the other end sweeps are shown on the lines; when it is back, it hears the
+    next sentence."""
     answered = int(cell.state()[3])
     cell.serial.close()
     try:
@@ -60,7 +70,8 @@ def test_cable_out(cell: Cell, note: Note) -> None:
 
 
 def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
-    """Sentences pile up, the oldest are dropped and counted, no frame is lost; when it reads the newest come, whole."""
+    """Sentences pile up, the oldest are dropped and counted, no frame is lost; when it reads the
+    newest come, whole."""
     begun, before = cell.clock.now_s(), cell.state()
     cell.serial.deaf = True
     since = len(cell.serial.heard)
@@ -69,7 +80,9 @@ def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
         cell.wait(0.01)
     touch = shown(cell)
     cell.clock.sleep_until(round((begun + count(8, 60)) * 1e9))
-    assert len(cell.serial.heard) <= since + 9  # a last look had begun, and may have brought several lines
+    assert (
+        len(cell.serial.heard) <= since + 9
+    )  # a last look had begun, and may have brought several lines
     cell.serial.deaf = False
     cell.serial.say(b"$PPLP,ID\r\n")
     cell.serial.wait_for("$PPLP,ANS,ID,ok", 30, since)  # all that waited is out before this
@@ -86,7 +99,9 @@ def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
     # 200 answers, a result and a state each second were said; what was not dropped came out
     assert 200 + 1 - dropped < len(heard) < 200 + 1 - dropped + 2 * count(8, 60)
     note(
-        f"robot does not read for {count(8, 60)} s", "sweep shown on the lines, sentences dropped and counted", dropped
+        f"robot does not read for {count(8, 60)} s",
+        "sweep shown on the lines, sentences dropped and counted",
+        dropped,
     )
 
 
@@ -97,7 +112,8 @@ def sound(line: str) -> bool:
 
 
 def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
-    """After a break, noise, half sentences and a line without end, each whole command is answered, and not twice."""
+    """After a break, noise, half sentences and a line without end, each whole command is answered,
+    and not twice."""
     for _ in range(count(3, 100)):
         cell.machine.qmp("chardev-send-break", id="robot")
         assert cell.serial.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")
@@ -107,9 +123,20 @@ def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
     for _ in range(times):
         junk = rng.bytes(int(rng.integers(1, MAX_LINE - 16))).translate(None, b"\r\n$")
         since = len(cell.serial.heard)
-        cell.serial.say(junk + b"$PPLP,ID\r\n" + junk[:20] + b"\r\n$PPLP,STA" + junk[20:40] + b"$PPLP,NEW\r\n$PPLP,TES")
+        cell.serial.say(
+            junk
+            + b"$PPLP,ID\r\n"
+            + junk[:20]
+            + b"\r\n$PPLP,STA"
+            + junk[20:40]
+            + b"$PPLP,NEW\r\n$PPLP,TES"
+        )
         cell.serial.wait_for("$PPLP,ANS,NEW,ok", 10, since)
-        answers = [line.split("*")[0].split(",")[2:4] for _, line in cell.serial.heard[since:] if ",ANS," in line]
+        answers = [
+            line.split("*")[0].split(",")[2:4]
+            for _, line in cell.serial.heard[since:]
+            if ",ANS," in line
+        ]
         assert [a for a in answers if a[1] == "ok"] == [["ID", "ok"], ["NEW", "ok"]]
         assert len(answers) <= 4
         cell.serial.say(b"\n")
@@ -130,9 +157,12 @@ def tries(cell: Cell, port: str) -> str:
     return cell.machine.run(f"{AS_NOBODY} sh -c ': < {port}'").out
 
 
-def test_another_program_and_an_adapter(cell: Cell, tmp_path: Path, count: Count, note: Note) -> None:
-    """The kernel keeps other users off the port, but not root, until the box is killed; a port that another program holds
-    is taken when it is free; an adapter is pulled and put in again. The last test of this guest: the settings stay.
+def test_another_program_and_an_adapter(
+    cell: Cell, tmp_path: Path, count: Count, note: Note
+) -> None:
+    """The kernel keeps other users off the port, but not root, until the box is killed; a port that
+    another program holds is taken when it is free; an adapter is pulled and put in again. The last
+    test of this guest: the settings stay.
     """
     assert "busy" in tries(cell, PORT)
     assert cell.machine.run(f": < {PORT}").rc == 0
@@ -153,7 +183,11 @@ def test_another_program_and_an_adapter(cell: Cell, tmp_path: Path, count: Count
     assert far.heard == []
     cell.machine.run("kill $(cat /run/holder)", check=True)
     far.wait_for("$PPLP,STA,", 10)
-    note("port held by another program", "reported, taken when it is free; it is refused to others", 1)
+    note(
+        "port held by another program",
+        "reported, taken when it is free; it is refused to others",
+        1,
+    )
     assert "busy" in tries(cell, ADAPTER)
     times = count(2, 30)
     for i in range(times):
@@ -179,7 +213,12 @@ def plug(cell: Cell, path: Path, *, first: bool = False) -> FarEnd:
     cell.machine.qmp("chardev-add", id="adapter", backend=backend)
     far = FarEnd(path, cell.clock)
     cell.machine.qmp(
-        "device_add", driver="usb-serial", id="adapter", chardev="adapter", bus="xhci.0", serial="R1",
+        "device_add",
+        driver="usb-serial",
+        id="adapter",
+        chardev="adapter",
+        bus="xhci.0",
+        serial="R1",
         **{"always-plugged": True},
-    )  # fmt: skip
+    )
     return far

@@ -1,8 +1,10 @@
-"""Killed at random moments. In: a box that keeps its sweeps, a robot that sweeps. Out: it is there again, nothing is lost.
+"""Killed at random moments. In: a box that keeps its sweeps, a robot that sweeps. Out: it is there
+again, nothing is lost.
 
-`make test-rig COUNTS=full` kills the program 200 times and cuts the power 50 times; counts so far are kept in build/rig,
-so that a campaign that was broken off goes on. What was in QEMU's memory is gone with a cut: the disk's tables of newly
-written clusters, which it writes when the guest flushes. So a cut costs what a disk's own memory costs.
+`make test-rig COUNTS=full` kills the program 200 times and cuts the power 50 times; counts so far
+are kept in build/rig, so that a campaign that was broken off goes on. What was in QEMU's memory is
+gone with a cut: the disk's tables of newly written clusters, which it writes when the guest
+flushes. So a cut costs what a disk's own memory costs.
 """
 
 from __future__ import annotations
@@ -67,7 +69,8 @@ class EndlessRobot:
         return not touch.played.is_set() or self.cell.clock.now_ns() < touch.stop_ns + 300_000_000
 
     def harmed(self, kills: list[int]) -> list[str]:
-        """Answers with a window to sweeps in which the box was killed, each with its times; kills: ns."""
+        """Answers with a window to sweeps in which the box was killed, each with its times; kills:
+        ns."""
         wrong = []
         for heard_ns, line in self.cell.serial.heard:
             touched = [t for t in self.touches if t.played.is_set() and t.stop_ns < heard_ns]
@@ -75,7 +78,11 @@ class EndlessRobot:
                 last = touched[-1]
                 at = [kill for kill in kills if last.start_ns < kill < last.stop_ns]
                 wrong += (
-                    [f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, killed {at}"] if at else []
+                    [
+                        f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, killed {at}"
+                    ]
+                    if at
+                    else []
                 )
         return wrong
 
@@ -87,7 +94,8 @@ def statuses(cell: Cell) -> Counter[str]:
 
 
 def kill(cell: Cell) -> int:
-    """SIGKILL, as soon as there is a program to kill; when, in ns. READY falls, although nobody is there to lower it."""
+    """SIGKILL, as soon as there is a program to kill; when, in ns. READY falls, although nobody is
+    there to lower it."""
     cell.machine.run(
         "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; kill -KILL $pid",
         timeout_s=60,
@@ -99,7 +107,8 @@ def kill(cell: Cell) -> int:
 
 
 def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.Random) -> None:
-    """Kill the program `n` times: mostly at any moment after the last kill, now and then once it is READY."""
+    """Kill the program `n` times: mostly at any moment after the last kill, now and then once it is
+    READY."""
     with Guest(image, folder, snapshot=True) as machine:
         cell = Cell(machine)
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
@@ -131,7 +140,8 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
 
 
 def test_killed(image: Image, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
-    """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept sweep is lost."""
+    """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept
+    sweep is lost."""
     ledger, rng = CampaignLog("kills", image.disk), random.Random()
     wanted = count(ledger.sum("back") + 1, 200)
     while (left := wanted - ledger.sum("back")) > 0:
@@ -161,9 +171,17 @@ def disk(image: Image, tmp_path: Path) -> Path:
 
 
 def cut(
-    image: Image, disk: Path, folder: Path, ledger: CampaignLog, rng: random.Random, *, booting: bool, had: int = 0
+    image: Image,
+    disk: Path,
+    folder: Path,
+    ledger: CampaignLog,
+    rng: random.Random,
+    *,
+    booting: bool,
+    had: int = 0,
 ) -> int:
-    """One life of a box: power on, READY, sweeps, power off at a random moment; or off already while it boots.
+    """One life of a box: power on, READY, sweeps, power off at a random moment; or off already
+    while it boots.
 
     had: sweeps that earlier lives have kept on this disk. What is there now.
     """
@@ -183,20 +201,31 @@ def cut(
     kept = sweeps(files)
     counts = lost(cell.serial.heard, kept) | {"parts": parts, "fsck": code}
     counts["lost"] += max(0, had - len(kept))
-    ledger.add(doing=doing, back=int(not booting), cut=1, ready_s=ready_s, statuses=statuses(cell), **counts)
+    ledger.add(
+        doing=doing,
+        back=int(not booting),
+        cut=1,
+        ready_s=ready_s,
+        statuses=statuses(cell),
+        **counts,
+    )
     assert {counts[name] for name in ("lost", "parts", "fsck")} == {0}
     return len(kept)
 
 
 @pytest.mark.skipif(HOW != "full", reason="boots for each cut; make test-rig COUNTS=full")
-def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
-    """The power goes at random moments, while booting, idle and sweeping: it boots again, the file system is sound, no
-    kept sweep is lost."""
+def test_power_cut(
+    image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]
+):
+    """The power goes at random moments, while booting, idle and sweeping: it boots again, the file
+    system is sound, no kept sweep is lost."""
     ledger, rng = CampaignLog("cuts", image.disk), random.Random()
     wanted, kept = count(ledger.sum("cut") + 1, 50), 0
     while (n := ledger.sum("cut")) < wanted:
         # twice while it boots, then a life that has to get to READY; such a one is the last, too
-        kept = cut(image, disk, tmp_path, ledger, rng, booting=n % 3 < 2 and n < wanted - 1, had=kept)
+        kept = cut(
+            image, disk, tmp_path, ledger, rng, booting=n % 3 < 2 and n < wanted - 1, had=kept
+        )
     kinds = [line["doing"] for line in ledger.lines]
     where = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("starting", "idle", "sweeping"))
     assert ledger.sum("lost") == ledger.sum("fsck") == ledger.sum("parts") == 0 < ledger.sum("owed")
@@ -209,11 +238,16 @@ def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Callable[...
 
 
 def test_what_is_owed():
-    """An answer before a state sentence of the same run is owed; the last of a run, and damaged lines, are not."""
+    """An answer before a state sentence of the same run is owed; the last of a run, and damaged
+    lines, are not."""
     heard = [
-        sentence("RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""),
+        sentence(
+            "RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""
+        ),
         sentence("STA", "6.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
-        sentence("RES", 2, "9.021", "recorded", "", "0.0", "0.0", 1, 0, "21.00", "9f", "usb", "1.00", ""),
+        sentence(
+            "RES", 2, "9.021", "recorded", "", "0.0", "0.0", 1, 0, "21.00", "9f", "usb", "1.00", ""
+        ),
         b"$PPLP,ST",
         sentence("STA", "12.0", "streaming", 0, 0, 1, 0, 0, 1, 0, "9f", "usb"),
         sentence("RES", 1, "15.0", "gap", "", "0.0", "0.0", 0, 9, "1.00", "9f", "usb", "1.00", ""),

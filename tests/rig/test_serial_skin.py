@@ -1,7 +1,9 @@
-"""A skin that people own, behind a USB serial adapter: matrix, through the kernel's ftdi_sio, pulled and put back at any moment.
+"""A skin that people own, behind a USB serial adapter: matrix, through the kernel's ftdi_sio,
+pulled and put back at any moment.
 
-In: a guest whose settings name the profile and the adapter's port. Out: the answers of the service that classifies, of one
-that records, and what `palpate check` says. The skin is played on the host into a terminal, which is the adapter's line.
+In: a guest whose settings name the profile and the adapter's port. Out: the answers of the service
+that classifies, of one that records, and what `palpate check` says. The skin is played on the host
+into a terminal, which is the adapter's line.
 """
 
 from __future__ import annotations
@@ -56,7 +58,8 @@ class SerialCell(Cell):
         self._playing.start()
 
     def plug(self, board: rig.Board | None = None) -> rig.Board | None:
-        """Plug the adapter in; one that is in is pulled first, and a box that runs has seen it: FAULT."""
+        """Plug the adapter in; one that is in is pulled first, and a box that runs has seen it:
+        FAULT."""
         if self._plugged:
             self.unplug()
             assert self.lines.wait("FAULT", True, SEEN_S)
@@ -65,12 +68,15 @@ class SerialCell(Cell):
         line = {"type": "serial", "data": {"device": str(self.player.path)}}
         self.machine.qmp("chardev-add", id="adapter", backend=line)
         how = {"serial": "R1", "always-plugged": True}
-        self.machine.qmp("device_add", driver="usb-serial", id="adapter", chardev="adapter", bus="xhci.0", **how)
+        self.machine.qmp(
+            "device_add", driver="usb-serial", id="adapter", chardev="adapter", bus="xhci.0", **how
+        )
         self._plugged = True
         return board
 
     def unplug(self) -> None:
-        """Pull the adapter. Its line goes first: QEMU dies of bytes that come for an adapter that it takes away."""
+        """Pull the adapter. Its line goes first: QEMU dies of bytes that come for an adapter that
+        it takes away."""
         with self._hold:
             self.player.unplug()
         self.machine.qmp("device_del", id="adapter")
@@ -99,7 +105,8 @@ class SerialCell(Cell):
 
 @pytest.fixture(scope="module")
 def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """A guest for this file; its settings name the profile, and the service has been started with them."""
+    """A guest for this file; its settings name the profile, and the service has been started with
+    them."""
     folder = tmp_path_factory.mktemp("guest")
     with Guest(image, folder, snapshot=True) as machine:
         cell = SerialCell(machine, folder)
@@ -111,10 +118,17 @@ def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 
 @pytest.mark.parametrize("when", [before, during, after])
-def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]):
-    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, then a right sweep."""
+def test_pulled_and_put_back(
+    cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]
+):
+    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, then a right
+    sweep."""
     check_recovers(cell)
-    wanted = {before: {"not-ready"}, during: {"sensor-lost"}, after: {"sensor-lost", "ok", "gap", "unsure"}}[when]
+    wanted = {
+        before: {"not-ready"},
+        during: {"sensor-lost"},
+        after: {"sensor-lost", "ok", "gap", "unsure"},
+    }[when]
     n, outcomes = count(1, 10), Counter[str]()
     for i in range(n):
         had = int(state(cell)["enumerations"])
@@ -124,17 +138,26 @@ def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callabl
         cell.until_ready()
         assert int(state(cell)["enumerations"]) > had
         check_recovers(cell)
-    note(f"serial adapter of a skin unplugged and replugged {when.__name__} a sweep", f"{dict(outcomes)}; back", n)
+    note(
+        f"serial adapter of a skin unplugged and replugged {when.__name__} a sweep",
+        f"{dict(outcomes)}; back",
+        n,
+    )
 
 
 def test_check_finds_it_through_the_kernels_driver(cell: Cell):
-    """`palpate check` as the user of the service: the skin is there, on the port of ftdi_sio that the settings name."""
+    """`palpate check` as the user of the service: the skin is there, on the port of ftdi_sio that
+    the settings name."""
     run = cell.machine.run
-    assert "/ftdi_sio" in run("readlink -f /sys/bus/usb-serial/devices/ttyUSB*/driver", check=True).out
+    assert (
+        "/ftdi_sio" in run("readlink -f /sys/bus/usb-serial/devices/ttyUSB*/driver", check=True).out
+    )
     assert run(f"readlink -f {ADAPTER}", check=True).out.startswith("/dev/ttyUSB")
     run("systemctl stop palpate", check=True)
     try:
-        done = run(f"runuser -u palpate -G dialout -G gpio -G plugdev -- {PALPATE} check", timeout_s=90)
+        done = run(
+            f"runuser -u palpate -G dialout -G gpio -G plugdev -- {PALPATE} check", timeout_s=90
+        )
         assert done.rc == 0, done.out
         assert "FAIL" not in done.out
         assert "matrix R1, 4x4 uint8 at 750 Hz" in done.out
@@ -145,8 +168,8 @@ def test_check_finds_it_through_the_kernels_driver(cell: Cell):
 
 
 def test_recorded_through_a_replug(cell: Cell, note: Note):
-    """`palpate record` without a bundle: the open sweep is answered sensor-lost, later ones are taken, nothing is owed. The
-    last test of this guest: the service goes on recording.
+    """`palpate record` without a bundle: the open sweep is answered sensor-lost, later ones are
+    taken, nothing is owed. The last test of this guest: the service goes on recording.
     """
     runs_with(cell.machine, f"record --material cork --position a --out {SWEEPS}")
     cell.machine.run("systemctl restart --no-block palpate", check=True)
@@ -162,9 +185,15 @@ def test_recorded_through_a_replug(cell: Cell, note: Note):
     kept = cell.machine.run(f"ls {SWEEPS} | grep -c npy").out.strip()
     assert int(state(cell)["answered"]) == len(received)
     assert int(kept) == sum(answer.status == "recorded" for answer in received)
-    unseen = cell.machine.run(f"grep -l '\"loss_known\": false' {SWEEPS}/*.json | wc -l").out.strip()
+    unseen = cell.machine.run(
+        f"grep -l '\"loss_known\": false' {SWEEPS}/*.json | wc -l"
+    ).out.strip()
     assert unseen == kept, "sidecars say that lost frames cannot be seen"
-    note("serial adapter of a skin pulled while its sweeps are recorded", "sensor-lost; later ones are kept", 1)
+    note(
+        "serial adapter of a skin pulled while its sweeps are recorded",
+        "sensor-lost; later ones are kept",
+        1,
+    )
 
 
 def recorded(cell: Cell) -> None:

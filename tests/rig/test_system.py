@@ -1,5 +1,6 @@
-"""The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions. In: a guest whose
-service keeps its sweeps on small file systems. Out: answers as before, what is missing logged once, recovery without help.
+"""The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions.
+In: a guest whose service keeps its sweeps on small file systems. Out: answers as before, what is
+missing logged once, recovery without help.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/default
 SITE = "/etc/palpate/palpate.toml"
 SECOND = "echo {} > /sys/devices/system/cpu/cpu1/online"
 """Turns the guest's second processor on or off."""
-needs_time = pytest.mark.skipif(HOW != "full", reason="starts the service again; make test-rig COUNTS=full")
+needs_time = pytest.mark.skipif(
+    HOW != "full", reason="starts the service again; make test-rig COUNTS=full"
+)
 DAMAGE = """
 import pathlib, shutil
 from appliance.bundle import bundle
@@ -55,12 +58,15 @@ for name in sorted(p.name for p in whole.iterdir()):
 
 @pytest.fixture(scope="module")
 def keeping(shared: Cell) -> Cell:
-    """The guest's service keeps sweeps and captures, each on a file system of its own that can be made as small as a
-    test wants."""
+    """The guest's service keeps sweeps and captures, each on a file system of its own that can be
+    made as small as a test wants."""
     guest = shared.machine
     shared.acts, shared.packet_frames = known(script.tubes(2)), 48
     for place in (KEPT, CAPTURE):
-        guest.run(f"mkdir -p {place} && mount -t tmpfs -o size=96k,uid=palpate,mode=755 none {place}", check=True)
+        guest.run(
+            f"mkdir -p {place} && mount -t tmpfs -o size=96k,uid=palpate,mode=755 none {place}",
+            check=True,
+        )
     runs_with(guest, f"record --out {KEPT} --capture {CAPTURE}/all", f"ReadWritePaths={CAPTURE}")
     guest.run("systemctl restart --no-block palpate", check=True)
     shared.plug()
@@ -76,8 +82,8 @@ def box(keeping: Cell, cell: Cell) -> Cell:
 
 
 def sound(cell: Cell) -> Answer:
-    """A sweep that is answered `recorded`, as a box does that keeps its sweeps, when all that follows an answer in its turn
-    has been done too."""
+    """A sweep that is answered `recorded`, as a box does that keeps its sweeps, when all that
+    follows an answer in its turn has been done too."""
     answers = []
     for _ in range(TRIES):
         touch, answer = cell.sweep(ANSWER_S)
@@ -90,7 +96,9 @@ def sound(cell: Cell) -> Answer:
 
 def journal_count(cell: Cell, text: str) -> int:
     """How many lines of the journal hold a text."""
-    return int(cell.machine.run(f"journalctl -u palpate -o cat | grep -cF '{text}'", timeout_s=60).out)
+    return int(
+        cell.machine.run(f"journalctl -u palpate -o cat | grep -cF '{text}'", timeout_s=60).out
+    )
 
 
 def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
@@ -103,7 +111,9 @@ def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START
 
 def files(cell: Cell) -> dict[str, str]:
     """Name and digest of each file of kept sweeps."""
-    lines = cell.machine.run(f"cd {KEPT} && find . -type f -exec md5sum {{}} +", check=True).out.splitlines()
+    lines = cell.machine.run(
+        f"cd {KEPT} && find . -type f -exec md5sum {{}} +", check=True
+    ).out.splitlines()
     return {line.split()[1]: line.split()[0] for line in lines}
 
 
@@ -113,7 +123,8 @@ def used_k(cell: Cell) -> int:
 
 
 def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
-    """Space for n pages, or for no file: every sweep is answered, the first failure is logged, and only whole files stay."""
+    """Space for n pages, or for no file: every sweep is answered, the first failure is logged, and
+    only whole files stay."""
     empty = used_k(box)
     sound(box)
     before, used = files(box), used_k(box)
@@ -137,11 +148,17 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
-    """The capture's disk is full: logged once, it ends, sweeps go on, and what it holds can be played."""
-    until_logged(box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here")
+    """The capture's disk is full: logged once, it ends, sweeps go on, and what it holds can be
+    played."""
+    until_logged(
+        box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here"
+    )
     sound(box)
     assert journal_count(box, "capture:") == journal_count(box, "it ends here") == 1
-    pieces = [box.machine.run(f"dd if={CAPTURE}/all bs=12k skip={n} count=1 2>/dev/null | base64") for n in range(8)]
+    pieces = [
+        box.machine.run(f"dd if={CAPTURE}/all bs=12k skip={n} count=1 2>/dev/null | base64")
+        for n in range(8)
+    ]
     (tmp_path / "all").write_bytes(b"".join(base64.b64decode(piece.out) for piece in pieces))
     play, frames = Playback(tmp_path / "all"), 0
     while not play.finished:
@@ -149,12 +166,15 @@ def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., N
         play.edges(play.now_ns())
         play.commands()
     assert frames > 750
-    note("disk full while a capture is written", "ends there, logged once; what was written plays", 1)
+    note(
+        "disk full while a capture is written", "ends there, logged once; what was written plays", 1
+    )
 
 
 @needs_time
 def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
-    """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when there is space."""
+    """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when
+    there is space."""
     fill = "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; dd if=/dev/zero of={0}/fill2 2>/dev/null;"
     try:
         box.machine.run(fill.format("/run") + fill.format("/var"), timeout_s=200)
@@ -170,25 +190,40 @@ def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
     until_logged(box, "skin: ", logged)
     box.plug()
     box.until_ready()
-    note("no space on any disk, journal included", "answered; replugged skin taken; journal goes on", 1)
+    note(
+        "no space on any disk, journal included",
+        "answered; replugged skin taken; journal goes on",
+        1,
+    )
 
 
 def test_clock_set(box: Cell, note: Callable[..., None]):
-    """An hour back and a year forward in the middle of sweeps: answers, times and files know nothing of it."""
+    """An hour back and a year forward in the middle of sweeps: answers, times and files know
+    nothing of it."""
     for change in ("-1 hour", "+1 year"):
         touch, since = begin(box)
         box.machine.run(f"date -s \"$(date -d '{change}')\"", check=True)
         assert not_wrong(touch, box.answer(since, ANSWER_S)) in ("recorded", "gap")
-        times = [float(line.split(",")[2]) for _, line in box.serial.heard[since:] if line.startswith("$PPLP,STA,")]
+        times = [
+            float(line.split(",")[2])
+            for _, line in box.serial.heard[since:]
+            if line.startswith("$PPLP,STA,")
+        ]
         assert times == sorted(times)
     sound(box)
     box.machine.run(f"hwclock -s || date -s @{int(time.time())}")
-    texts = box.machine.run(f"cd {KEPT} && for f in *.json; do tr -d '\\n' < $f; echo; done", check=True).out
+    texts = box.machine.run(
+        f"cd {KEPT} && for f in *.json; do tr -d '\\n' < $f; echo; done", check=True
+    ).out
     about = [json.loads(text) for text in texts.splitlines()]
     assert [a["start_ns"] for a in about] == sorted(a["start_ns"] for a in about)
     assert all(0 < a["stop_ns"] - a["start_ns"] < 6e9 for a in about)
     assert all(name[2:8] == "sweep-" for name in files(box))
-    note("clock set back an hour, forward a year, during a sweep", "answered; times and files unmoved", 2)
+    note(
+        "clock set back an hour, forward a year, during a sweep",
+        "answered; times and files unmoved",
+        2,
+    )
 
 
 def by_hand(cell: Cell) -> str:
@@ -203,7 +238,8 @@ def by_hand(cell: Cell) -> str:
 
 
 def swept(cell: Cell) -> str:
-    """The status of a sweep; by hand where the board cannot know when its frames reach a box that is behind."""
+    """The status of a sweep; by hand where the board cannot know when its frames reach a box that
+    is behind."""
     since = len(cell.serial.heard)
     touch = cell.touch()
     if cell.clock.until(touch.played.is_set, 10):
@@ -213,10 +249,12 @@ def swept(cell: Cell) -> str:
 
 
 def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
-    """Four programs that want all of the processor: each sweep is answered, what was lost is counted, none is wrong.
+    """Four programs that want all of the processor: each sweep is answered, what was lost is
+    counted, none is wrong.
 
-    The guest has only one meanwhile: before release 8.1, QEMU that counts instructions gives the second a turn when the
-    first leaves time, so that whatever was on it stood still for minutes (QEMU's commit 83ecdb18eb).
+    The guest has only one meanwhile: before release 8.1, QEMU that counts instructions gives the
+    second a turn when the first leaves time, so that whatever was on it stood still for minutes
+    (QEMU's commit 83ecdb18eb).
     """
     silent = "skin: the skin is there but sent no frame for"
     lost, logged = int(state(box)["lost"]), journal_count(box, silent)
@@ -226,18 +264,24 @@ def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[.
         box.machine.run(hogs, timeout_s=START_S, check=True)
         answers = Counter(swept(box) for _ in range(count(1, 8)))
     finally:
-        box.machine.run(f"systemctl stop 'hog*' && {SECOND.format(1)}", timeout_s=START_S, check=True)
+        box.machine.run(
+            f"systemctl stop 'hog*' && {SECOND.format(1)}", timeout_s=START_S, check=True
+        )
     # without a turn for half a second it takes the skin for silent, and starts it again
     assert answers.keys() <= {"recorded", "no-contact", "gap", "sensor-lost"}, box.journal(40)
     assert answers["sensor-lost"] <= journal_count(box, silent) - logged
     sound(box)
     more = int(state(box)["lost"]) - lost
-    note("four busy loops on one core", f"answered {dict(answers)}, {more} frames lost", answers.total())
+    note(
+        "four busy loops on one core",
+        f"answered {dict(answers)}, {more} frames lost",
+        answers.total(),
+    )
 
 
 def test_permission_lost(box: Cell, note: Callable[..., None]):
-    """The skin's node and the folder are taken away from the service: named, sweeps `not-ready` or not kept; given back,
-    both are used again."""
+    """The skin's node and the folder are taken away from the service: named, sweeps `not-ready` or
+    not kept; given back, both are used again."""
     guest = box.machine
     guest.run("chmod 000 /dev/bus/usb/*/*", check=True)
     sound(box)  # what is open stays open
@@ -248,27 +292,41 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
         until_state(box, "denied")
         assert box.lines.wait("FAULT", True, 10)
         assert by_hand(box) == "not-ready"
-        until_logged(box, "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev")
+        until_logged(
+            box,
+            "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev",
+        )
     finally:
-        guest.run(f"mv /root/rules {RULES} && udevadm control --reload && udevadm trigger -c add -s usb", check=True)
+        guest.run(
+            f"mv /root/rules {RULES} && udevadm control --reload && udevadm trigger -c add -s usb",
+            check=True,
+        )
     box.until_ready()
     before = files(box)
     guest.run(f"chown root {KEPT}", check=True)
     answer = sound(box)
     assert (
-        journal_count(box, f"record: sweep {answer.sweep} is not stored: Permission denied; see that {KEPT} may be")
+        journal_count(
+            box,
+            f"record: sweep {answer.sweep} is not stored: Permission denied; see that {KEPT} may be",
+        )
         == 1
     )
     assert files(box) == before
     guest.run(f"chown palpate {KEPT}", check=True)
     sound(box)
     assert files(box).items() > before.items()
-    note("permission lost: device node, folder", "denied and not-ready, or logged; used again when given back", 3)
+    note(
+        "permission lost: device node, folder",
+        "denied and not-ready, or logged; used again when given back",
+        3,
+    )
 
 
 @needs_time
 def test_memory_limit(box: Cell, note: Callable[..., None]):
-    """The unit's memory is cut to nothing: the program is killed, started again, and READY once it has its memory."""
+    """The unit's memory is cut to nothing: the program is killed, started again, and READY once it
+    has its memory."""
     restarts = "systemctl show -P NRestarts palpate"
     before, streamed = int(box.machine.run(restarts).out), journal_count(box, "skin: streaming")
     limit = "systemctl set-property --runtime palpate MemoryMax="
@@ -284,7 +342,8 @@ def test_memory_limit(box: Cell, note: Callable[..., None]):
 
 @needs_time
 def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
-    """A misspelt key, a bundle cut short: each is named, READY stays low, no restart; mended and started, it comes up."""
+    """A misspelt key, a bundle cut short: each is named, READY stays low, no restart; mended and
+    started, it comes up."""
     guest, again = box.machine, "systemctl restart --no-block palpate"
     settings = guest.get(SITE)
     guest.run(f"cp -r {BUNDLE} /run/bundle && truncate -s 1000 /run/bundle/model.onnx", check=True)
@@ -305,11 +364,16 @@ def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
     guest.put(DROP_IN, recording)
     guest.run(f"systemctl daemon-reload && {again}", check=True, timeout_s=60)
     box.until_ready(START_S)
-    note("settings with a misspelt key; bundle cut short", "named; exit 78, no loop; READY once mended and started", 2)
+    note(
+        "settings with a misspelt key; bundle cut short",
+        "named; exit 78, no loop; READY once mended and started",
+        2,
+    )
 
 
 def test_bundle_files_broken(box: Cell, note: Callable[..., None]):
-    """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a BundleError that names it."""
+    """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a
+    BundleError that names it."""
     logged = box.machine.run(
         "cd / && /opt/palpate/bin/python -I -", stdin=DAMAGE.encode(), timeout_s=200, check=True
     ).out
@@ -319,4 +383,8 @@ def test_bundle_files_broken(box: Cell, note: Callable[..., None]):
         name, _, what, why = line.split(" ", 3)
         assert what == "BundleError", line
         assert name.removesuffix(".json") in why or "no bundle at" in why, line
-    note("each file of a bundle cut, empty, missing, altered", "BundleError that names it", len(lines))
+    note(
+        "each file of a bundle cut, empty, missing, altered",
+        "BundleError that names it",
+        len(lines),
+    )

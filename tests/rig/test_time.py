@@ -1,8 +1,10 @@
-"""Trigger and frames on one time line, on a real kernel: is the middle of a window what was taken between the edges?
+"""Trigger and frames on one time line, on a real kernel: is the middle of a window what was taken
+between the edges?
 
-In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the board outside knows.
-What the guest's kernel calls its time is put to the clock by which the board goes by the shortest of many round trips, so that edges as the guest's kernel stamped
-them can be held against the moments at which the board took its frames.
+In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the
+board outside knows. What the guest's kernel calls its time is put to the clock by which the board
+goes by the shortest of many round trips, so that edges as the guest's kernel stamped them can be
+held against the moments at which the board took its frames.
 """
 
 from __future__ import annotations
@@ -25,16 +27,19 @@ from tests.rig.sound import LATE, known, not_wrong
 
 Note = Callable[[str, str, int], None]
 
-pytestmark = pytest.mark.skipif(HOW != "full", reason="one of the full run's: the service is started anew")
+pytestmark = pytest.mark.skipif(
+    HOW != "full", reason="one of the full run's: the service is started anew"
+)
 FRAME_NS = skin.FORMAT.period_ns
 TRIPS, SWEEPS, ATTEMPTS = 400, 5, 3
-"""More than one attempt, since the shortest way through an emulator that is busy changes by milliseconds in as many
-seconds, which looks as if the board's clock drifted.
+"""More than one attempt, since the shortest way through an emulator that is busy changes by
+milliseconds in as many seconds, which looks as if the board's clock drifted.
 """
 SLOPE_PPM, SPAN_S = 200, 20
 """What appliance.core.clock.DeviceClock takes for possible, and how far it looks back."""
 LONGEST_WAY_NS = 5_000_000
-"""From a frame to the program by the shortest way, in an emulator: the box cannot separate it from the clock's offset."""
+"""From a frame to the program by the shortest way, in an emulator: the box cannot separate it from
+the clock's offset."""
 CASES = {
     "80 ppm fast, latency spikes": 80,
     "80 ppm slow, latency spikes": -80,
@@ -62,7 +67,8 @@ class Offset:
 
 
 class KernelClock:
-    """Asks the guest's kernel for its time. Each trip's answer was read between its two ends, so the offset lies in all of them."""
+    """Asks the guest's kernel for its time. Each trip's answer was read between its two ends, so
+    the offset lies in all of them."""
 
     def __init__(self, machine: Guest) -> None:
         machine.put("/run/report_time.py", REPORT_TIME.encode())
@@ -78,7 +84,9 @@ class KernelClock:
             self._port.sendall(b".")
             (guest_ns,) = struct.unpack("<q", self._port.recv(8))
             low, high = max(low, sent_ns - guest_ns), min(high, self._clock.now_ns() - guest_ns)
-        assert low <= high, f"the guest's clock went {(low - high) / 1e6:.3f} ms away during {TRIPS} trips"
+        assert low <= high, (
+            f"the guest's clock went {(low - high) / 1e6:.3f} ms away during {TRIPS} trips"
+        )
         return Offset((low + high) // 2, (high - low) // 2)
 
 
@@ -88,7 +96,9 @@ def clock(shared: Cell) -> KernelClock:
     shared.acts, shared.packet_frames = known(script.tubes(2)), 12
     runs_with(shared.machine, f"record --out {KEPT}")
     shared.plug()  # a box that records ends where there is no skin, and is started again
-    shared.machine.run("systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60)
+    shared.machine.run(
+        "systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60
+    )
     shared.serial.wait_for("$PPLP,STA,", 120, len(shared.serial.heard))
     return KernelClock(shared.machine)
 
@@ -104,8 +114,8 @@ def kept(cell: Cell, number: int, folder: Path) -> Sweep:
 
 
 def errors(sweep: Sweep, board: rig.Board, offset: Offset) -> tuple[float, float]:
-    """(ns by which the box's stamp of the window's middle frame is later than the truth, ns by which that frame was truly
-    taken after the middle of the edges)."""
+    """(ns by which the box's stamp of the window's middle frame is later than the truth, ns by
+    which that frame was truly taken after the middle of the edges)."""
     half = len(sweep.frames) // 2
     taken_ns = board.frame_ns(int(sweep.frames.seq[half]) & ((1 << EPOCH_BITS) - 1))
     middle_ns = (sweep.start_ns + sweep.stop_ns) / 2 + offset.ns
@@ -113,13 +123,15 @@ def errors(sweep: Sweep, board: rig.Board, offset: Offset) -> tuple[float, float
 
 
 def spikes(seed: int) -> Callable[[], int]:
-    """0.15 ms as a rule; one packet in a hundred comes 50 to 200 ms late, and those behind it wait."""
+    """0.15 ms as a rule; one packet in a hundred comes 50 to 200 ms late, and those behind it
+    wait."""
     rng = np.random.default_rng(seed)
     return lambda: 150_000 + int(rng.integers(50_000_000, 200_000_000)) * (rng.random() < 0.01)
 
 
 def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
-    """The windows of `n` sweeps, none of which was answered wrong. Raises AssertionError where they do not come."""
+    """The windows of `n` sweeps, none of which was answered wrong. Raises AssertionError where they
+    do not come."""
     for _ in range(3 * n):
         touch, answer = cell.sweep()
         if not_wrong(touch, answer) not in LATE - {"unsure", "unknown"}:
@@ -131,9 +143,12 @@ def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
 
 
 @pytest.mark.parametrize("what", CASES)
-def test_windows_lie_in_the_middle(cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str):
-    """The window's middle is the frame taken half-way between the edges: within one frame at 80 ppm, and beyond what the
-    box takes for possible within what it then cannot know. All stamps are late alike, by a transfer's shortest way."""
+def test_windows_lie_in_the_middle(
+    cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str
+):
+    """The window's middle is the frame taken half-way between the edges: within one frame at 80
+    ppm, and beyond what the box takes for possible within what it then cannot know. All stamps are
+    late alike, by a transfer's shortest way."""
     ppm, seen = CASES[what], []
     for _ in range(ATTEMPTS):
         board = cell.plug(cell.board(ppm=ppm, latency=spikes(abs(ppm))))
@@ -142,8 +157,13 @@ def test_windows_lie_in_the_middle(cell: Cell, clock: KernelClock, note: Note, t
         offset = clock.offset()
         found = [errors(sweep, board, offset) for sweep in windows(cell, tmp_path, SWEEPS)]
         later = clock.offset()
-        assert abs(later.ns - offset.ns) <= offset.within_ns + later.within_ns, "the clocks do not go alike"
-        way_ns, worst_ns = min(stamp for stamp, _ in found), max((apart for _, apart in found), key=abs)
+        assert abs(later.ns - offset.ns) <= offset.within_ns + later.within_ns, (
+            "the clocks do not go alike"
+        )
+        way_ns, worst_ns = (
+            min(stamp for stamp, _ in found),
+            max((apart for _, apart in found), key=abs),
+        )
         seen.append(
             f"at most {worst_ns / FRAME_NS:+.2f} frames beside the middle, {way_ns / 1e6:.2f} ms of them a transfer's way, "
             f"known to {offset.within_ns / 1e6:.2f} ms"

@@ -1,4 +1,5 @@
-"""The skin's cable, pulled and put back at any moment; other boards on it; resets. In: a guest. Out: what it answered.
+"""The skin's cable, pulled and put back at any moment; other boards on it; resets. In: a guest.
+Out: what it answered.
 
 Nothing may hang, no answer may name what was not touched, and a sound skin is taken up by itself.
 """
@@ -17,7 +18,17 @@ from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
 from tests.rig.pulled import SECOND, after, before, during
-from tests.rig.sound import begin, check_recovers, known, let_go, not_wrong, only_answer, state, until, until_state
+from tests.rig.sound import (
+    begin,
+    check_recovers,
+    known,
+    let_go,
+    not_wrong,
+    only_answer,
+    state,
+    until,
+    until_state,
+)
 from tests.rig.usbredir import UsbRedirPeer
 
 Count = Callable[[int, int], int]
@@ -38,9 +49,16 @@ def robot(shared: Cell) -> None:
 
 
 @pytest.mark.parametrize("when", [before, during, after])
-def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]):
-    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, each time another enumeration."""
-    wanted = {before: {"not-ready"}, during: {"sensor-lost"}, after: {"sensor-lost", "ok", "gap", "unsure"}}[when]
+def test_pulled_and_put_back(
+    cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]
+):
+    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, each time
+    another enumeration."""
+    wanted = {
+        before: {"not-ready"},
+        during: {"sensor-lost"},
+        after: {"sensor-lost", "ok", "gap", "unsure"},
+    }[when]
     n = count(1, 35 if when is during else 33)  # 101 in all
     outcomes = Counter[str]()
     for i in range(n):
@@ -52,11 +70,16 @@ def test_pulled_and_put_back(cell: Cell, count: Count, note: Note, when: Callabl
         assert int(state(cell)["enumerations"]) > had
         if i % 5 == 4:
             check_recovers(cell)
-    note(f"skin unplugged and replugged {when.__name__} a sweep", f"{dict(outcomes)}; back each time", n)
+    note(
+        f"skin unplugged and replugged {when.__name__} a sweep",
+        f"{dict(outcomes)}; back each time",
+        n,
+    )
 
 
 def test_other_boards(cell: Cell, count: Count, note: Note):
-    """Another serial number streams and is reported by ID; another format or protocol is refused, until a fitting one comes."""
+    """Another serial number streams and is reported by ID; another format or protocol is refused,
+    until a fitting one comes."""
     cell.plug(cell.board(serial="SIM0002"))
     cell.until_ready()
     assert " SIM0002 " in cell.serial.ask("$PPLP,ID")
@@ -81,13 +104,16 @@ def test_other_boards(cell: Cell, count: Count, note: Note):
     check_recovers(cell)
     note("skin of another serial number", "streams, reported by ID", 1)
     note(
-        "skin of another format or protocol version", "mismatch; the next fitting one is taken up", count(2, len(unfit))
+        "skin of another format or protocol version",
+        "mismatch; the next fitting one is taken up",
+        count(2, len(unfit)),
     )
 
 
 @pytest.mark.parametrize("what", RESETS if HOW == "full" else list(RESETS)[:1])
 def test_resets(cell: Cell, count: Count, note: Note, what: str):
-    """The kernel takes the skin away for a moment, in mid sweep: the sweep is lost, the skin is taken up again."""
+    """The kernel takes the skin away for a moment, in mid sweep: the sweep is lost, the skin is
+    taken up again."""
     n, outcomes = count(1, 3), Counter[str]()
     for _ in range(n):
         touch, since = begin(cell)
@@ -112,7 +138,11 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
     listener.listen(1)
     address = {"type": "unix", "data": {"path": str(tmp_path / "hub")}}
     qmp("device_add", driver="usb-hub", id="hub", bus="xhci.0", port="2")
-    qmp("chardev-add", id="far", backend={"type": "socket", "data": {"addr": address, "server": False}})
+    qmp(
+        "chardev-add",
+        id="far",
+        backend={"type": "socket", "data": {"addr": address, "server": False}},
+    )
     qmp("device_add", driver="usb-redir", id="behind", chardev="far", bus="xhci.0", port="2.1")
     listener.settimeout(20)
     peer = UsbRedirPeer(listener.accept()[0], cell.clock)
@@ -122,7 +152,8 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
 
 @pytest.mark.skipif(HOW != "full", reason="one of the full run's")
 def test_behind_a_hub(cell: Cell, behind_a_hub: UsbRedirPeer, count: Count, note: Note):
-    """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is lost, no more than that."""
+    """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is
+    lost, no more than that."""
     behind_a_hub.plug(cell.board())
     check_recovers(cell)
     n = count(1, 3)

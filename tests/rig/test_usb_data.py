@@ -1,6 +1,8 @@
-"""A skin that sends what it should not, or does not answer as it should. In: a guest. Out: what became of each fault.
+"""A skin that sends what it should not, or does not answer as it should. In: a guest. Out: what
+became of each fault.
 
-A sweep that was harmed says so; what harms none is answered right; a sound skin is taken up by itself.
+A sweep that was harmed says so; what harms none is answered right; a sound skin is taken up by
+itself.
 """
 
 from __future__ import annotations
@@ -17,7 +19,16 @@ from appliance.io import packets
 from appliance.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
-from tests.rig.sound import begin, check_recovers, known, not_wrong, only_answer, state, until, until_state
+from tests.rig.sound import (
+    begin,
+    check_recovers,
+    known,
+    not_wrong,
+    only_answer,
+    state,
+    until,
+    until_state,
+)
 
 Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
@@ -30,7 +41,8 @@ ALL = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens to so many transfers from `begin_s` after the start edge on, and how the sweep may be answered.
+    """What happens to so many transfers from `begin_s` after the start edge on, and how the sweep
+    may be answered.
 
     make: a new mangle for one sweep. counter: a field of the state sentence that goes up.
     """
@@ -43,7 +55,8 @@ class Fault:
 
 
 def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
-    """Transfers whose packets have another number and another time, as `change` gives them; all else is right, the CRC too."""
+    """Transfers whose packets have another number and another time, as `change` gives them; all
+    else is right, the CRC too."""
 
     def mangle(data: bytes) -> bytes:
         packet = packets.unpack(data).packets[0]
@@ -54,7 +67,8 @@ def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[],
 
 
 def mirrored(pace: int) -> Callable[[], Mangle]:
-    """The board's clock goes on at `pace` times its own from the first transfer on: -1 is backwards, 0 stands still."""
+    """The board's clock goes on at `pace` times its own from the first transfer on: -1 is
+    backwards, 0 stands still."""
 
     def make() -> Mangle:
         first: list[int] = []
@@ -81,7 +95,8 @@ def babble() -> Mangle:
 
 
 def stale(fresh: bool) -> Callable[[], Mangle]:
-    """Packets from a moment ago, again and again: with the fresh ones in one transfer, or in their place."""
+    """Packets from a moment ago, again and again: with the fresh ones in one transfer, or in their
+    place."""
 
     def make() -> Mangle:
         old: list[bytes] = []
@@ -102,10 +117,16 @@ FAULTS = {
     "more bytes than were asked for": Fault(babble, 1.3, 1, HARMED, "lost"),
     "frames from the past beside the fresh ones": Fault(stale(True), 0.3, 100, UNHARMED),
     "nothing but frames from the past": Fault(stale(False), 1.0, 60, LOST, "enumerations"),
-    "count 10,000 ahead": Fault(changed(lambda p: (p.seq + 10_000, p.t_us)), 1.3, 4, LOST, "enumerations"),
+    "count 10,000 ahead": Fault(
+        changed(lambda p: (p.seq + 10_000, p.t_us)), 1.3, 4, LOST, "enumerations"
+    ),
     "count 200,000 back": Fault(changed(lambda p: (p.seq - 200_000, p.t_us)), 1.3, 4, LOST),
-    "clock 1 s ahead": Fault(changed(lambda p: (p.seq, p.t_us + 1_000_000)), 1.3, 4, LOST, "enumerations"),
-    "clock 1 s back": Fault(changed(lambda p: (p.seq, p.t_us - 1_000_000)), 1.3, ALL, LOST, "enumerations"),
+    "clock 1 s ahead": Fault(
+        changed(lambda p: (p.seq, p.t_us + 1_000_000)), 1.3, 4, LOST, "enumerations"
+    ),
+    "clock 1 s back": Fault(
+        changed(lambda p: (p.seq, p.t_us - 1_000_000)), 1.3, ALL, LOST, "enumerations"
+    ),
     "clock runs backwards": Fault(mirrored(-1), 1.3, ALL, LOST, "enumerations"),
     "clock stands still": Fault(mirrored(0), 1.3, ALL, LOST, "enumerations"),
     "clock at twice its pace": Fault(mirrored(2), 1.3, ALL, LOST, "enumerations"),
@@ -136,13 +157,16 @@ def robot(shared: Cell) -> None:
 
 @pytest.mark.parametrize("what", FAULTS if HOW == "full" else QUICK)
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
-    """Harmed in mid sweep: one answer that says so, none that is wrong; what lies beside the window harms nothing."""
+    """Harmed in mid sweep: one answer that says so, none that is wrong; what lies beside the window
+    harms nothing."""
     n = count(1, 3)
     fault, outcomes = FAULTS[what], Counter[str]()
     for _ in range(n):
         had = int(state(cell)[fault.counter]) if fault.counter else 0
         touch, since = begin(cell)
-        cell.cable.mangle = cable = Cable(fault, cell.clock, touch.start_ns + round(fault.begin_s * SECOND))
+        cell.cable.mangle = cable = Cable(
+            fault, cell.clock, touch.start_ns + round(fault.begin_s * SECOND)
+        )
         status = not_wrong(touch, cell.answer(since))
         until(cell, touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
@@ -160,7 +184,8 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
 
 @pytest.mark.parametrize("what", ["halted", "silent"] if HOW == "full" else ["halted"])
 def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: str):
-    """Silent, or its endpoint stalled, in mid sweep: the sweep is lost, and it is started again without being replugged."""
+    """Silent, or its endpoint stalled, in mid sweep: the sweep is lost, and it is started again
+    without being replugged."""
     n = count(1, 3)
     for _ in range(n):
         touch, since = begin(cell)
@@ -176,7 +201,8 @@ def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: s
 
 
 def test_a_skin_that_does_not_answer(cell: Cell, count: Count, note: Note):
-    """Requests unanswered, refused or answered late: never READY, a start edge is answered, and it ends by itself."""
+    """Requests unanswered, refused or answered late: never READY, a start edge is answered, and it
+    ends by itself."""
     fates = {
         "deaf": lambda: setattr(cell.cable, "deaf", True),
         "stalls each request": lambda: setattr(cell.cable.board, "request", lambda number: None),
@@ -199,7 +225,8 @@ def test_a_skin_that_does_not_answer(cell: Cell, count: Count, note: Note):
 
 
 def test_a_skin_that_answers_slowly(cell: Cell, count: Count, note: Note):
-    """Late for each request, its descriptors too, but within what PROTOCOL.md allows: it takes longer, and is a sound skin."""
+    """Late for each request, its descriptors too, but within what PROTOCOL.md allows: it takes
+    longer, and is a sound skin."""
     cell.unplug()
     cell.cable.slow_s = count(1, 25) / 100
     cell.plug()

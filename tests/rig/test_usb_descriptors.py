@@ -1,6 +1,8 @@
-"""Devices that lie about what they are, under the skin's ids. In: a guest. Out: none is taken for what it is not.
+"""Devices that lie about what they are, under the skin's ids. In: a guest. Out: none is taken for
+what it is not.
 
-The kernel refuses some, libusb or the box others; the service neither dies nor hangs, and the sound skin streams after.
+The kernel refuses some, libusb or the box others; the service neither dies nor hangs, and the sound
+skin streams after.
 """
 
 from __future__ import annotations
@@ -25,10 +27,13 @@ FACE, END = SOUND.configuration[9:18], SOUND.configuration[18:]
 
 
 def whole(*parts: bytes, total: int | None = None, faces: int = 1) -> Descriptors:
-    """A device with this configuration. total, faces: length and number of interfaces that it claims."""
+    """A device with this configuration. total, faces: length and number of interfaces that it
+    claims."""
     body = b"".join(parts)
     total = 9 + len(body) if total is None else total
-    return Descriptors(configuration=struct.pack("<BBHBBBBB", 9, 2, total, faces, 1, 0, 0x80, 50) + body)
+    return Descriptors(
+        configuration=struct.pack("<BBHBBBBB", 9, 2, total, faces, 1, 0, 0x80, 50) + body
+    )
 
 
 def put(data: bytes, at: int, *new: int) -> bytes:
@@ -68,7 +73,9 @@ LIARS = {
     "a device descriptor of length 8": Descriptors(device=put(SOUND.device, 0, 8)),
     "requests of 0 bytes": Descriptors(device=put(SOUND.device, 7, 0)),
     "an empty configuration": Descriptors(configuration=b""),
-    "a configuration of noise": Descriptors(configuration=bytes((i * 37 + 11) & 255 for i in range(300))),
+    "a configuration of noise": Descriptors(
+        configuration=bytes((i * 37 + 11) & 255 for i in range(300))
+    ),
     "strings of odd length": Spoken(raw=b"\x05\x03a\0b"),
     "strings that claim 255 bytes": Spoken(raw=b"\xff\x03a\0"),
     "strings of no bytes": Spoken(raw=b""),
@@ -76,14 +83,22 @@ LIARS = {
 }
 QUICK = list(LIARS)[:3]
 HARMLESS = {
-    "255 endpoints claimed", "255 interfaces claimed", "a total length of 65535", "packets of 65535 bytes",
-    "255 configurations", "a device descriptor of length 8", "strings of odd length", "strings that claim 255 bytes",
-    "strings of no bytes", "strings that are no UTF-16",
-}  # fmt: skip
+    "255 endpoints claimed",
+    "255 interfaces claimed",
+    "a total length of 65535",
+    "packets of 65535 bytes",
+    "255 configurations",
+    "a device descriptor of length 8",
+    "strings of odd length",
+    "strings that claim 255 bytes",
+    "strings of no bytes",
+    "strings that are no UTF-16",
+}
 """What the kernel or libusb puts right, or nobody asks about: such a device may stream."""
 OPINIONS = {"streaming", "mismatch", "lost", "silent", "busy"}
 QUIET_S, LOOK_S = 1.0, 30
-"""The kernel has done with a device when it has asked it nothing for so long; the longest wait for that."""
+"""The kernel has done with a device when it has asked it nothing for so long; the longest wait for
+that."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -98,11 +113,14 @@ def service(cell: Cell) -> str:
 
 
 def looked_at(cell: Cell) -> set[str]:
-    """The states that the skin is in until the box has an opinion of it, or the kernel has given it up."""
+    """The states that the skin is in until the box has an opinion of it, or the kernel has given it
+    up."""
     seen, asked, since = set[str](), cell.cable.asked, cell.clock.now_s()
     end = since + LOOK_S
     while not seen & OPINIONS and (cell.cable.asked == 0 or cell.clock.now_s() < since + QUIET_S):
-        assert cell.clock.now_s() < end, f"the kernel goes on asking; the box says: {cell.journal()}"
+        assert cell.clock.now_s() < end, (
+            f"the kernel goes on asking; the box says: {cell.journal()}"
+        )
         seen.add(state(cell)["state"])
         if cell.cable.asked != asked:
             asked, since = cell.cable.asked, cell.clock.now_s()
@@ -110,7 +128,8 @@ def looked_at(cell: Cell) -> set[str]:
 
 
 def test_hostile_descriptors(cell: Cell, note: Note):
-    """Each liar is refused or works; commands are answered all the while by the same process, and the sound skin streams."""
+    """Each liar is refused or works; commands are answered all the while by the same process, and
+    the sound skin streams."""
     running = service(cell)
     for what in LIARS if HOW == "full" else QUICK:
         cell.unplug()

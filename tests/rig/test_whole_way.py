@@ -1,4 +1,5 @@
-"""The whole way on a real kernel: skin on xHCI, edges on a GPIO chip, sentences on a serial port, as a service on arm64."""
+"""The whole way on a real kernel: skin on xHCI, edges on a GPIO chip, sentences on a serial port,
+as a service on arm64."""
 
 from __future__ import annotations
 
@@ -12,14 +13,16 @@ LABELS = bundle.load(bundle.DEFAULT).manifest.labels
 
 
 def test_sweeps_become_sentences_and_codes(cell: Cell, note: Callable[[str, str, int], None]):
-    """Six tubes: each start edge has one answer, right or with the reason, in words and on the lines; no frame is lost."""
+    """Six tubes: each start edge has one answer, right or with the reason, in words and on the
+    lines; no frame is lost."""
     before, ms, right = cell.state(), [], 0
     for _ in range(6):
         touch, answer = cell.sweep()
         heard_ns = next(t for t, line in reversed(cell.serial.heard) if ",RES," in line)
         ms.append((heard_ns - touch.stop_ns) / 1e6)
         assert cell.lines.wait("RESULT-VALID", True, 10)
-        # `gap`: an emulator that lags brought frames more than late_ms after the stop edge, or edges as late to its kernel
+        # `gap`: an emulator that lags brought frames more than late_ms after the stop edge, or
+        # edges as late to its kernel
         assert answer.status in ("ok", "unsure", "unknown", "gap")
         if answer.status == "ok":
             assert answer.label == touch.act.label
@@ -30,7 +33,11 @@ def test_sweeps_become_sentences_and_codes(cell: Cell, note: Callable[[str, str,
     assert after[5] == before[5], "frames lost"
     assert after[7] == before[7], "enumerations"
     assert right
-    note("none", f"{right} right, others said why not; {statistics.median(ms):.0f} ms median from edge to sentence", 6)
+    note(
+        "none",
+        f"{right} right, others said why not; {statistics.median(ms):.0f} ms median from edge to sentence",
+        6,
+    )
 
 
 def test_the_golden_sweeps_are_the_same_on_arm64(cell: Cell):
@@ -41,10 +48,15 @@ def test_the_golden_sweeps_are_the_same_on_arm64(cell: Cell):
 
 
 def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
-    """User palpate with no capability, device nodes by group, /etc out of reach; nothing of the unit failed to apply."""
+    """User palpate with no capability, device nodes by group, /etc out of reach; nothing of the
+    unit failed to apply."""
     run = cell.machine.run
     pid = run("systemctl show -P MainPID palpate", check=True).out.strip()
-    about = dict(line.split(":\t", 1) for line in run(f"cat /proc/{pid}/status").out.splitlines() if ":\t" in line)
+    about = dict(
+        line.split(":\t", 1)
+        for line in run(f"cat /proc/{pid}/status").out.splitlines()
+        if ":\t" in line
+    )
     palpate = run("id -u palpate", check=True).out.strip()
     assert set(about["Uid"].split()) == {palpate}
     assert {about[kind] for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb")} == {"0" * 16}
@@ -56,11 +68,15 @@ def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
 
 
 def test_check_names_each_part(cell: Cell):
-    """`palpate check` in the place of the service: bundle, golden sweeps, skin, lines and port are there."""
+    """`palpate check` in the place of the service: bundle, golden sweeps, skin, lines and port are
+    there."""
     run = cell.machine.run
     run("systemctl stop palpate", check=True)
     try:
-        done = run("runuser -u palpate -G dialout -G gpio -G plugdev -- /opt/palpate/bin/palpate check", timeout_s=90)
+        done = run(
+            "runuser -u palpate -G dialout -G gpio -G plugdev -- /opt/palpate/bin/palpate check",
+            timeout_s=90,
+        )
         assert done.rc == 0, done.out
         assert "FAIL" not in done.out
     finally:
@@ -70,4 +86,6 @@ def test_check_names_each_part(cell: Cell):
 
 def test_the_skin_has_its_name(cell: Cell):
     """udev calls the skin's node by its name."""
-    assert cell.machine.run("readlink -f /dev/palpate-skin", check=True).out.startswith("/dev/bus/usb/")
+    assert cell.machine.run("readlink -f /dev/palpate-skin", check=True).out.startswith(
+        "/dev/bus/usb/"
+    )

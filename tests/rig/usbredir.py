@@ -1,7 +1,9 @@
-"""The far end of a USB cable that leads into the guest. In: a board of the rig. Out: the usbredir protocol's messages.
+"""The far end of a USB cable that leads into the guest. In: a board of the rig. Out: the usbredir
+protocol's messages.
 
-QEMU's usb-redir device sits on the guest's xHCI port and passes on what the guest's kernel asks of a device
-(messages as in usbredirproto.h of usbredir 0.13); a Board answers, as it does under the simulated bus.
+QEMU's usb-redir device sits on the guest's xHCI port and passes on what the guest's kernel asks of
+a device (messages as in usbredirproto.h of usbredir 0.13); a Board answers, as it does under the
+simulated bus.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ FULL_SPEED = 1
 KEPT = 64
 """Replies that are remembered; a cancellation is on its way for milliseconds."""
 ABLE = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6
-"""connect_device_version, ep_info_max_packet_size, 64bits_ids, 32bits_bulk_length; the guest's side agrees."""
+"""connect_device_version, ep_info_max_packet_size, 64bits_ids, 32bits_bulk_length; the guest's side
+agrees."""
 
 
 @dataclass(slots=True)
@@ -37,7 +40,21 @@ class Descriptors:
     """What the device says of itself when the kernel asks; anything may be put here."""
 
     device: bytes = struct.pack(
-        "<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, MAX_PACKET, VENDOR_ID, PRODUCT_ID, 0x0100, 1, 2, 3, 1
+        "<BBHBBBBHHHBBBB",
+        18,
+        1,
+        0x0200,
+        0,
+        0,
+        0,
+        MAX_PACKET,
+        VENDOR_ID,
+        PRODUCT_ID,
+        0x0100,
+        1,
+        2,
+        3,
+        1,
     )
     configuration: bytes = (
         struct.pack("<BBHBBBBB", 9, 2, 25, 1, 1, 0, 0x80, 50)
@@ -55,12 +72,14 @@ class Descriptors:
 
 
 class UsbRedirPeer:
-    """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any thread.
+    """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any
+    thread.
 
-    mangle: what the cable does to a transfer; more than was asked for is a babble. silent: transfers never end.
-    deaf: requests are never answered. slow_s: they are answered so late. All times are those of `clock`, the guest's.
-    halted: the endpoint stalls until it is cleared.
-    sent: transfers that the guest took. asked: requests that it made. opened: how often the guest's kernel has set up a device.
+    mangle: what the cable does to a transfer; more than was asked for is a babble. silent:
+    transfers never end. deaf: requests are never answered. slow_s: they are answered so late. All
+    times are those of `clock`, the guest's. halted: the endpoint stalls until it is cleared. sent:
+    transfers that the guest took. asked: requests that it made. opened: how often the guest's
+    kernel has set up a device.
     """
 
     def __init__(self, connection: socket.socket, clock: Clock) -> None:
@@ -71,10 +90,14 @@ class UsbRedirPeer:
         self.descriptors = Descriptors()
         self.sent = self.asked = self.opened = 0
         self._socket, self._clock, self._wide = connection, clock, False
-        self._waiting: deque[tuple[int, int]] = deque()  # (id, length) of bulk transfers that the guest has asked for
+        self._waiting: deque[tuple[int, int]] = (
+            deque()
+        )  # (id, length) of bulk transfers that the guest has asked for
         self._replied: dict[int, bytes] = {}
         self._again: deque[bytes] = deque()
-        self._later: deque[tuple[int, bytes, int]] = deque()  # (ns, body, id) of answers to requests
+        self._later: deque[tuple[int, bytes, int]] = (
+            deque()
+        )  # (ns, body, id) of answers to requests
         self._jobs: deque[Callable[[], None]] = deque()
         self._wake, self._woken = socket.socketpair()
         self._said_hello = threading.Event()
@@ -91,7 +114,8 @@ class UsbRedirPeer:
         self.do(self._disconnect)
 
     def do(self, job: Callable[[], None]) -> None:
-        """Do something between two messages, and return when it is done: a board belongs to one thread."""
+        """Do something between two messages, and return when it is done: a board belongs to one
+        thread."""
         done = threading.Event()
 
         def noted() -> None:
@@ -119,7 +143,9 @@ class UsbRedirPeer:
         kinds[0] = kinds[16] = 0  # endpoint 0, both ways: control
         kinds[16 + (IN & 15)] = 2  # bulk
         sizes[0] = sizes[16] = sizes[16 + (IN & 15)] = MAX_PACKET
-        self._send(INTERFACES, 0, struct.pack("<I", 1) + bytes(32) + b"\xff" + bytes(31) + bytes(64))
+        self._send(
+            INTERFACES, 0, struct.pack("<I", 1) + bytes(32) + b"\xff" + bytes(31) + bytes(64)
+        )
         self._send(ENDPOINTS, 0, bytes(kinds) + bytes(64) + struct.pack("<32H", *sizes))
         ids = struct.unpack_from("<HHH", descriptors.device, 8)
         self._send(CONNECT, 0, struct.pack("<BBBBHHH", FULL_SPEED, 0, 0, 0, *ids))
@@ -145,7 +171,9 @@ class UsbRedirPeer:
         data = b""
         try:
             while True:
-                readable, _, _ = select.select([self._socket, self._woken], [], [], self._patience_s())
+                readable, _, _ = select.select(
+                    [self._socket, self._woken], [], [], self._patience_s()
+                )
                 if self._woken in readable:
                     self._woken.recv(64)
                 while self._jobs:
@@ -197,7 +225,8 @@ class UsbRedirPeer:
                     self._waiting.remove(waiting)
                     self._reply(ident, CANCELLED, b"")
                 if ident in self._replied:
-                    # it crossed our reply, which QEMU throws away; a controller on a board would have delivered it
+                    # it crossed our reply, which QEMU throws away; a controller on a board would
+                    # have delivered it
                     self._again.append(self._replied.pop(ident))
             case 100:
                 self._control(ident, body)
@@ -219,7 +248,9 @@ class UsbRedirPeer:
             reply = self.descriptors.reply(value >> 8, value & 0xFF)
         elif kind & 0x80:
             reply = bytes(length)  # status and the like
-        status, data = (STALL, b"") if reply is None else (DONE, reply[:length] if kind & 0x80 else b"")
+        status, data = (
+            (STALL, b"") if reply is None else (DONE, reply[:length] if kind & 0x80 else b"")
+        )
         size = len(data) if kind & 0x80 else length
         answer = struct.pack("<BBBBHHH", ep, request, kind, status, value, index, size) + data
         self._later.append((self._clock.now_ns() + round(self.slow_s * 1e9), answer, ident))

@@ -1,1 +1,2 @@
-"""Measures what each connection to a robot costs: docs/robots/latency.json, the table of docs/robots/README.md."""
+"""Measures what each connection to a robot costs: docs/robots/latency.json, the table of
+docs/robots/README.md."""

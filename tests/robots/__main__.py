@@ -1,7 +1,9 @@
-"""`python -m tests.robots`: from a verdict in the box to the robot's program, by each connection, side by side in one run.
+"""`python -m tests.robots`: from a verdict in the box to the robot's program, by each connection,
+side by side in one run.
 
-Two boxes sweep simulated tubes in real time: one with a serial line and the bridges on its feed, one behind `bridge tcp`.
-Needs ROS 2 (make ros). On a machine with other work: chrt -f 10 python -m tests.robots.
+Two boxes sweep simulated tubes in real time: one with a serial line and the bridges on its feed,
+one behind `bridge tcp`. Needs ROS 2 (make ros). On a machine with other work: chrt -f 10 python -m
+tests.robots.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ Seen = Callable[[int], None]
 
 
 class Times:
-    """When each sweep was judged, and when each connection had the answer, in ns of the one monotonic clock."""
+    """When each sweep was judged, and when each connection had the answer, in ns of the one
+    monotonic clock."""
 
     def __init__(self) -> None:
         self._judged: dict[tuple[str, int], int] = {}
@@ -67,14 +70,22 @@ class Times:
 
     def done(self, sweeps: int) -> bool:
         """Whether each connection has so many answers."""
-        there = {*self._there} >= {("serial", "A"), ("tcp", "B"), ("feed", "A"), ("modbus", "A"), ("ros", "A")}
+        there = {*self._there} >= {
+            ("serial", "A"),
+            ("tcp", "B"),
+            ("feed", "A"),
+            ("modbus", "A"),
+            ("ros", "A"),
+        }
         return there and min(map(len, self._there.values())) >= sweeps
 
     def latencies_ms(self) -> dict[str, list[float]]:
         """By connection."""
         return {
             connection: [
-                (at - self._judged[box, sweep]) / 1e6 for sweep, at in there.items() if (box, sweep) in self._judged
+                (at - self._judged[box, sweep]) / 1e6
+                for sweep, at in there.items()
+                if (box, sweep) in self._judged
             ]
             for (connection, box), there in self._there.items()
         }
@@ -84,9 +95,21 @@ class Times:
 def box(port: str, feed: Path) -> Iterator[None]:
     """A box that sweeps simulated tubes in real time."""
     command = [
-        sys.executable, "-m", "appliance", "run", "--sim", "skin", "--set", f"serial.port={port}", "--set", f"feed.socket={feed}",
-        "--set", "store.status=", "--set", "store.folder=/nonexistent",
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "appliance",
+        "run",
+        "--sim",
+        "skin",
+        "--set",
+        f"serial.port={port}",
+        "--set",
+        f"feed.socket={feed}",
+        "--set",
+        "store.status=",
+        "--set",
+        "store.folder=/nonexistent",
+    ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
         try:
             yield
@@ -123,7 +146,8 @@ def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
 
 
 def lines_ms(sweeps: int) -> list[float]:
-    """From a verdict to RESULT VALID, in this process, on simulated lines: what the program adds to a real line."""
+    """From a verdict to RESULT VALID, in this process, on simulated lines: what the program adds to
+    a real line."""
     current = bundle.load(bundle.DEFAULT)
     simulated = devices.build(current.format, script.tubes(3, sweeps), SystemClock(), "sim")
     settings = config.load(None, site=NO_SITE)
@@ -132,7 +156,11 @@ def lines_ms(sweeps: int) -> list[float]:
         one = assembly.box(settings, current, simulated, None, stack)
         while len(found) < sweeps:
             for verdict in one.step():
-                rises = [t for t, name, level in simulated.gpio.written if name == devices.RESULT_VALID and level]
+                rises = [
+                    t
+                    for t, name, level in simulated.gpio.written
+                    if name == devices.RESULT_VALID and level
+                ]
                 found.append((rises[-1] - verdict.time_ns) / 1e6)
     return found
 
@@ -144,9 +172,13 @@ def run(sweeps: int) -> dict[str, list[float]]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         feeds = {"A": folder / "a.sock", "B": folder / "b.sock"}
         line = LinkPort(folder / "line")
-        stack.enter_context(Palpate("line", opener=lambda: line, listener=noting(times.seen("serial", "A"))))
+        stack.enter_context(
+            Palpate("line", opener=lambda: line, listener=noting(times.seen("serial", "A")))
+        )
         tcp = stack.enter_context(bridge("tcp", "--link", folder / "tcp"))
-        stack.enter_context(Palpate(f"socket://{tcp[0]}:{tcp[1]}", listener=noting(times.seen("tcp", "B"))))
+        stack.enter_context(
+            Palpate(f"socket://{tcp[0]}:{tcp[1]}", listener=noting(times.seen("tcp", "B")))
+        )
         for name, port in (("A", folder / "line"), ("B", folder / "tcp")):
             stack.enter_context(box(str(port), feeds[name]))
         modbus = stack.enter_context(bridge("modbus", "--feed", feeds["A"]))
@@ -155,7 +187,9 @@ def run(sweeps: int) -> dict[str, list[float]]:
         stack.callback(ending.set)
         for name, path in feeds.items():
             threading.Thread(target=follow, args=(path, name, times, ending), daemon=True).start()
-        threading.Thread(target=poll, args=(modbus, times.seen("modbus", "A"), ending), daemon=True).start()
+        threading.Thread(
+            target=poll, args=(modbus, times.seen("modbus", "A"), ending), daemon=True
+        ).start()
         while not times.done(sweeps):
             ending.wait(1)
             for heard in peer.on("verdict"):
@@ -174,11 +208,18 @@ def main() -> int:
         name: {"n": len(ms), "median_ms": round(median(ms), 2), "longest_ms": round(max(ms), 2)}
         for name, ms in found.items()
     }
-    policy = {os.SCHED_FIFO: "FIFO", os.SCHED_OTHER: "other"}.get(os.sched_getscheduler(0), "another")
+    policy = {os.SCHED_FIFO: "FIFO", os.SCHED_OTHER: "other"}.get(
+        os.sched_getscheduler(0), "another"
+    )
     about = {
-        "connections": figures, "poll_ms": 1000 * POLL_S, "scheduler": policy, "load": os.getloadavg()[0],
-        "cores": os.cpu_count(), "machine": platform.machine(), "commit": commit(),
-    }  # fmt: skip
+        "connections": figures,
+        "poll_ms": 1000 * POLL_S,
+        "scheduler": policy,
+        "load": os.getloadavg()[0],
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "commit": commit(),
+    }
     RESULTS.write_text(json.dumps(about, indent=1) + "\n")
     page.write(RESULTS.with_name("README.md"), "latency", page.table(about))
     print(json.dumps(figures, indent=1))

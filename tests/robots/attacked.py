@@ -1,9 +1,11 @@
-"""What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes 2`. In: minutes for each
-case. Out: a table, docs/robots/attacked.json; exit code 1 if a frame, a sentence or an answer was lost.
+"""What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes
+2`. In: minutes for each case. Out: a table, docs/robots/attacked.json; exit code 1 if a frame, a
+sentence or an answer was lost.
 
-One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had the same machine: no bridge;
-Modbus and ROS 2 on its feed and TCP on its line; the same with peers that flood Modbus and TCP bridge with requests, noise and
-connections. Box and listener run with real-time priority where `chrt` may be used.
+One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had
+the same machine: no bridge; Modbus and ROS 2 on its feed and TCP on its line; the same with peers
+that flood Modbus and TCP bridge with requests, noise and connections. Box and listener run with
+real-time priority where `chrt` may be used.
 """
 
 from __future__ import annotations
@@ -28,13 +30,18 @@ from tests.robots import page
 from tests.robots.shared_line import SharedLine
 
 CASES = {
-    "0": "no bridge", "bridges": "Modbus and ROS 2 on the feed, TCP on the line", "attacked": "the same, Modbus and TCP attacked",
-}  # fmt: skip
+    "0": "no bridge",
+    "bridges": "Modbus and ROS 2 on the feed, TCP on the line",
+    "attacked": "the same, Modbus and TCP attacked",
+}
 
 
 def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
     """Peers that mean it ill; they end with their input, and say what they did."""
-    command, pipe = [sys.executable, "-m", "tests.robots.attackers", kind, str(port)], subprocess.PIPE
+    command, pipe = (
+        [sys.executable, "-m", "tests.robots.attackers", kind, str(port)],
+        subprocess.PIPE,
+    )
     return stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
 
 
@@ -81,7 +88,10 @@ def measure(minutes: float, before: list[str]) -> dict[str, Any]:
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
             for name, kind in kinds.items():
                 slot(name, feed, box, listener, kind)
-                print(f"{turn + 1}  {CASES[name]}: {100 * kind.shares[-1]:.2f} % of a core", flush=True)
+                print(
+                    f"{turn + 1}  {CASES[name]}: {100 * kind.shares[-1]:.2f} % of a core",
+                    flush=True,
+                )
         box.stop()
     return result(kinds, rss_kib)
 
@@ -95,7 +105,9 @@ def table(figures: dict[str, Any]) -> str:
     for name, one in figures.items():
         late, within, peers = one["late_ms"], one["latency_ms"], one["lines"]
         bore = (
-            f"{peers['attempts']} connections, {peers['answers of the bridge']} answers to good ones" if peers else ""
+            f"{peers['attempts']} connections, {peers['answers of the bridge']} answers to good ones"
+            if peers
+            else ""
         )
         rows.append(
             f"| {CASES[name]} | {100 * one['share']:.2f} % | {late['p50']:.1f} / {late['p99']:.1f} ms | {within['p50']:.2f} / "
@@ -106,11 +118,15 @@ def table(figures: dict[str, Any]) -> str:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=2.0, help="for each case (%(default)s)")
     args = parser.parse_args()
     ros.required()
-    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    real_time = (
+        subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    )
     if real_time:  # this process alone, which listens: bridges and peers are ordinary programs
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
     figures = measure(args.minutes, [*REAL_TIME] if real_time else [])
@@ -118,7 +134,11 @@ def main() -> int:
     (ROOT / "docs" / "robots" / "attacked.json").write_text(json.dumps(content, indent=1) + "\n")
     page.write(ROOT / "docs" / "robots" / "README.md", "attacked", table(figures))
     print(table(figures))
-    bad = [name for name, one in figures.items() if one["frames_lost"] or one["sentences_dropped"] or one["faults"]]
+    bad = [
+        name
+        for name, one in figures.items()
+        if one["frames_lost"] or one["sentences_dropped"] or one["faults"]
+    ]
     return 1 if bad else 0
 
 

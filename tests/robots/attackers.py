@@ -1,7 +1,9 @@
-"""Peers that mean a bridge or the page ill: `python -m tests.robots.attackers KIND PORT` until its input ends. In: modbus, tcp or
-page, and where it listens on loopback. Out: one line of JSON, how many connections it had to bear, and what a good peer got.
+"""Peers that mean a bridge or the page ill: `python -m tests.robots.attackers KIND PORT` until its
+input ends. In: modbus, tcp or page, and where it listens on loopback. Out: one line of JSON, how
+many connections it had to bear, and what a good peer got.
 
-All are in one process of low priority, which pauses between its rounds, so that it takes less than a core.
+All are in one process of low priority, which pauses between its rounds, so that it takes less than
+a core.
 """
 
 from __future__ import annotations
@@ -16,19 +18,35 @@ from collections import Counter
 from functools import partial
 
 from appliance.core.sentences import sentence
-from tests.campaigns.feed_readers import PAUSE_S, Act, Address, asker, connected, send, storm, talker
+from tests.campaigns.feed_readers import (
+    PAUSE_S,
+    Act,
+    Address,
+    asker,
+    connected,
+    send,
+    storm,
+    talker,
+)
 
 READ = bytes.fromhex("000100000006ff0400000028")
 """A request of Modbus TCP for all registers."""
 ASK = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 FLOODS = {
     "modbus": (READ * 50, b"\0\1\0\0\0\xff"),
-    "tcp": (sentence("STATE") * 20, sentence("START") * 20 + sentence("ABORT") * 20, b"x" * 300, b"$PPLP,START*00\r\n" * 20),
+    "tcp": (
+        sentence("STATE") * 20,
+        sentence("START") * 20 + sentence("ABORT") * 20,
+        b"x" * 300,
+        b"$PPLP,START*00\r\n" * 20,
+    ),
     "page": (
-        ASK + b"\r\n", ASK.replace(b"/", b"/../../etc/passwd", 1) + b"\r\n", ASK + b"X: " + b"y" * 2000,
+        ASK + b"\r\n",
+        ASK.replace(b"/", b"/../../etc/passwd", 1) + b"\r\n",
+        ASK + b"X: " + b"y" * 2000,
         ASK.replace(b"/", b"/events", 1) + b"Authorization: Bearer wrong\r\n\r\n",
     ),
-}  # fmt: skip
+}
 """What is sent without end: requests, refused ones, endless ones, wrong ones."""
 HALVES = {"modbus": READ[:7], "tcp": b"$PPLP,STA", "page": ASK[:20]}
 GOOD = {"modbus": READ, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
@@ -52,15 +70,26 @@ def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
     """A good peer, and all that is bad."""
     bad: Counter[str] = Counter()
     floods = [
-        talker(there, bad, partial(bytes, said), reads=reads) for said in FLOODS[kind] for reads in (True, True, False)
+        talker(there, bad, partial(bytes, said), reads=reads)
+        for said in FLOODS[kind]
+        for reads in (True, True, False)
     ]
-    noise = [talker(there, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(3)]
+    noise = [
+        talker(there, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(3)
+    ]
 
     def note() -> None:
         seen["attempts"] = bad["attempts"]
 
     good = asker(there, seen, GOOD[kind])
-    return [good, *floods, *noise, deaf(there, GOOD[kind]), storm(there, bad, HALVES[kind], BURST), note]
+    return [
+        good,
+        *floods,
+        *noise,
+        deaf(there, GOOD[kind]),
+        storm(there, bad, HALVES[kind], BURST),
+        note,
+    ]
 
 
 def main(kind: str, port: int) -> None:

@@ -1,7 +1,9 @@
-"""`build/ros/bin/python tests/robots/messages.py`: builds palpate_msgs into the virtual environment that runs this, as
-colcon does it in an installation of ROS 2. Needs the extras `ros` and `ros-build`, cmake, a C++ compiler and Python's headers.
+"""`build/ros/bin/python tests/robots/messages.py`: builds palpate_msgs into the virtual environment
+that runs this, as colcon does it in an installation of ROS 2. Needs the extras `ros` and
+`ros-build`, cmake, a C++ compiler and Python's headers.
 
-The wheels were built elsewhere: their CMake files name that machine's headers of Python and numpy, and no prefix is set.
+The wheels were built elsewhere: their CMake files name that machine's headers of Python and numpy,
+and no prefix is set.
 """
 
 from __future__ import annotations
@@ -41,11 +43,19 @@ def main() -> None:
     environment = {**os.environ, "AMENT_PREFIX_PATH": str(prefix)}
     with tempfile.TemporaryDirectory() as folder:
         settings = {
-            "CMAKE_PREFIX_PATH": prefix, "CMAKE_INSTALL_PREFIX": prefix, "Python3_EXECUTABLE": sys.executable,
-            "Python3_FIND_VIRTUALENV": "ONLY", "Python3_ROOT_DIR": sys.base_prefix, "BUILD_TESTING": "OFF",
-        }  # fmt: skip
+            "CMAKE_PREFIX_PATH": prefix,
+            "CMAKE_INSTALL_PREFIX": prefix,
+            "Python3_EXECUTABLE": sys.executable,
+            "Python3_FIND_VIRTUALENV": "ONLY",
+            "Python3_ROOT_DIR": sys.base_prefix,
+            "BUILD_TESTING": "OFF",
+        }
         options = [f"-D{name}={value}" for name, value in settings.items()]
-        for arguments in (["-S", SOURCE, "-B", folder, *options], ["--build", folder], ["--install", folder]):
+        for arguments in (
+            ["-S", SOURCE, "-B", folder, *options],
+            ["--build", folder],
+            ["--install", folder],
+        ):
             subprocess.run(["cmake", *arguments], env=environment, check=True)
 
 

@@ -1,4 +1,5 @@
-"""The tables of docs/robots/README.md. In: figures, texts. Out: the lines between the markers, and no other."""
+"""The tables of docs/robots/README.md. In: figures, texts. Out: the lines between the markers, and
+no other."""
 
 from __future__ import annotations
 
@@ -33,13 +34,16 @@ def table(found: Mapping[str, Any]) -> str:
             f"Measured by `python -m tests.robots`, all but the first at the same time, on {found['cores']} cores ({found['machine']}), which",
             f"other work shares: load average {found['load']:.1f}, scheduling class {found['scheduler']}; commit {found['commit'][:12]}. From the verdict to the robot's",
             f"program. On a wire at {BAUD} baud a RES of {len(SENTENCE)} characters takes {wire:.1f} ms more; networks add their own time.",
-            "", *rows,
+            "",
+            *rows,
         ]
-    )  # fmt: skip
+    )
 
 
 def write(path: Path, marker: str, text: str) -> None:
     """Put a text between the markers of this name."""
     page = path.read_text("utf-8")
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
-    path.write_text(re.sub(f"{begin}.*{end}", lambda m: f"{begin}\n{text}\n{end}", page, flags=re.S), "utf-8")
+    path.write_text(
+        re.sub(f"{begin}.*{end}", lambda m: f"{begin}\n{text}\n{end}", page, flags=re.S), "utf-8"
+    )

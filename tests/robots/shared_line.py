@@ -1,7 +1,9 @@
-"""A box whose serial line is heard here and by a bridge. In: the script of sweeps. Out: as ThisMachine, and the bridge's end.
+"""A box whose serial line is heard here and by a bridge. In: the script of sweeps. Out: as
+ThisMachine, and the bridge's end.
 
-The box's sentences are noted here first, in a process of real-time priority where that is allowed, and then passed on: what is
-measured of the box with a bridge on its line is measured as without one.
+The box's sentences are noted here first, in a process of real-time priority where that is allowed,
+and then passed on: what is measured of the box with a bridge on its line is measured as without
+one.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""A box with everything attached and attacked, beside one with nothing: `python -m tests.robots.side_by_side --minutes 5`. In:
-minutes. Out: docs/robots/side-by-side.json and the table of docs/robots/README.md; exit code 1 if the one was worse off.
+"""A box with everything attached and attacked, beside one with nothing: `python -m
+tests.robots.side_by_side --minutes 5`. In: minutes. Out: docs/robots/side-by-side.json and the
+table of docs/robots/README.md; exit code 1 if the one was worse off.
 
-Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this machine. At the one are the page,
-the TCP bridge (on its line), the Modbus bridge and readers (on its feed), and at each of these four peers that mean it ill.
-Boxes and listeners run with real-time priority where that is allowed, all else does not.
+Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this
+machine. At the one are the page, the TCP bridge (on its line), the Modbus bridge and readers (on
+its feed), and at each of these four peers that mean it ill. Boxes and listeners run with real-time
+priority where that is allowed, all else does not.
 """
 
 from __future__ import annotations
@@ -38,19 +40,21 @@ from tests.robots.shared_line import SharedLine
 from tests.skins.load import BOX, hurry
 
 START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
-"""Time for the boxes to start, for what is attached to come, and between two looks at the processes."""
+"""Time for the boxes to start, for what is attached to come, and between two looks at the
+processes."""
 RESULTS = ROOT / "docs" / "robots" / "side-by-side.json"
 SWEEP_S = 3.0
 """The robot sweeps no more often."""
 SHARE = 0.03
-"""Most additional share of a core: one hundredth for the feed's readers, two for fifty questions a second over TCP, which the box
-answers."""
+"""Most additional share of a core: one hundredth for the feed's readers, two for fifty questions a
+second over TCP, which the box answers."""
 MIB = 2.0
 
 
 @dataclass
 class BoxSide:
-    """One of the two boxes, and what was measured of it. looks: (seconds, processor seconds, KiB resident)."""
+    """One of the two boxes, and what was measured of it. looks: (seconds, processor seconds, KiB
+    resident)."""
 
     box: ThisMachine
     listener: LatencyListener
@@ -64,31 +68,46 @@ class BoxSide:
         self.looks.append((time.monotonic(), used[2], used[0]))
 
     def figures(self) -> dict[str, Any]:
-        """latency_ms: in the box. way_ms: from the verdict to the robot's end of the line. edge_ms: from the stop edge to
-        there, less the median: when the script began is not known outside the box; both boxes have the same sweeps."""
+        """latency_ms: in the box. way_ms: from the verdict to the robot's end of the line. edge_ms:
+        from the stop edge to there, less the median: when the script began is not known outside the
+        box; both boxes have the same sweeps."""
         kind = self.kind
         at_s, stop = np.array(kind.answers).T
         edge_s = at_s - stop / skin.FORMAT.rate_hz
         seconds, cpu_s, kib = (np.array(values) for values in zip(*self.looks, strict=True))
         shares = np.diff(cpu_s) / np.diff(seconds)
         return {
-            "seconds": round(float(seconds[-1] - seconds[0])), "answers": len(kind.answers),
+            "seconds": round(float(seconds[-1] - seconds[0])),
+            "answers": len(kind.answers),
             "share": round(float((cpu_s[-1] - cpu_s[0]) / (seconds[-1] - seconds[0])), 5),
             "shares": [round(float(share), 4) for share in shares],
-            "before_mib": round(self.before_kib / 1024, 1), "most_mib": round(int(kib.max()) / 1024, 1),
-            **{f"{name}_ms": spread(values) for name, values in
-               (("edge", 1e3 * (edge_s - np.median(edge_s))), ("latency", kind.latency_ms), ("way", kind.way_ms))},
-            "frames_lost": kind.lost, "sentences_dropped": kind.dropped,
+            "before_mib": round(self.before_kib / 1024, 1),
+            "most_mib": round(int(kib.max()) / 1024, 1),
+            **{
+                f"{name}_ms": spread(values)
+                for name, values in (
+                    ("edge", 1e3 * (edge_s - np.median(edge_s))),
+                    ("latency", kind.latency_ms),
+                    ("way", kind.way_ms),
+                )
+            },
+            "frames_lost": kind.lost,
+            "sentences_dropped": kind.dropped,
             "faults": {name: n for name, n in kind.faults.items() if n},
-        }  # fmt: skip
+        }
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
     """Median, 99th percentile and the largest."""
-    return {name: round(float(np.percentile(values, q)), 2) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
+    return {
+        name: round(float(np.percentile(values, q)), 2)
+        for name, q in (("p50", 50), ("p99", 99), ("max", 100))
+    }
 
 
-def sides(stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequence[str]) -> dict[str, BoxSide]:
+def sides(
+    stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequence[str]
+) -> dict[str, BoxSide]:
     """Both boxes, started."""
     found = {}
     for name, box in (
@@ -96,7 +115,9 @@ def sides(stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequen
         ("attacked", SharedLine(before, [f"feed.socket={feed}"])),
     ):
         sweeps = Script(seed)
-        sweeps[sweeps_n]  # worked out now: later it would keep a listener from noting when a sentence comes
+        sweeps[
+            sweeps_n
+        ]  # worked out now: later it would keep a listener from noting when a sentence comes
         stack.callback(box.close)
         box.start(seed, sweeps)
         found[name] = BoxSide(box, LatencyListener(box, sweeps))
@@ -104,7 +125,8 @@ def sides(stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequen
 
 
 def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
-    """Hear both boxes so long, each in a thread that goes before all else; look at their processes meanwhile."""
+    """Hear both boxes so long, each in a thread that goes before all else; look at their processes
+    meanwhile."""
     failed: list[BaseException] = []
 
     def one(side: BoxSide) -> None:
@@ -132,7 +154,16 @@ def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
 @contextmanager
 def page_of(feed: Path) -> Iterator[int]:
     """The page of the box with this feed; its port."""
-    command = [sys.executable, "-m", "appliance", "watch", "--web", "0", "--set", f"feed.socket={feed}"]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "watch",
+        "--web",
+        "0",
+        "--set",
+        f"feed.socket={feed}",
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             line = process.stderr.readline()  # type: ignore[union-attr]
@@ -145,7 +176,9 @@ def page_of(feed: Path) -> Iterator[int]:
 def readers(feed: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Good and bad readers of the feed."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(feed), "attacked"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
+    ) as process:
         try:
             yield process
         finally:
@@ -174,21 +207,31 @@ def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
         listen(both, COME_S, measured=False)
         listen(both, 60 * minutes, measured=True)
         seen = {kind: said(process) for kind, process in peers.items()}
-        return {**line.about(), "peers": seen, "boxes": {name: side.figures() for name, side in both.items()}}
+        return {
+            **line.about(),
+            "peers": seen,
+            "boxes": {name: side.figures() for name, side in both.items()},
+        }
 
 
 def worse(boxes: dict[str, Any]) -> list[str]:
     """In what the attacked box was worse off, in words."""
     alone, one = boxes["alone"], boxes["attacked"]
     checks = {
-        f"{one['frames_lost']} frames lost, alone {alone['frames_lost']}": one["frames_lost"] > alone["frames_lost"],
-        f"{one['sentences_dropped']} sentences dropped": one["sentences_dropped"] > alone["sentences_dropped"],
-        f"{one['faults']}, alone {alone['faults']}": bool(one["faults"].keys() - alone["faults"].keys()),
+        f"{one['frames_lost']} frames lost, alone {alone['frames_lost']}": one["frames_lost"]
+        > alone["frames_lost"],
+        f"{one['sentences_dropped']} sentences dropped": one["sentences_dropped"]
+        > alone["sentences_dropped"],
+        f"{one['faults']}, alone {alone['faults']}": bool(
+            one["faults"].keys() - alone["faults"].keys()
+        ),
         f"{100 * one['share']:.2f} % of a core, alone {100 * alone['share']:.2f} %": one["share"]
         > alone["share"] + SHARE,
-        f"{one['most_mib']} MiB, before {one['before_mib']}": one["most_mib"] - one["before_mib"] > MIB,
+        f"{one['most_mib']} MiB, before {one['before_mib']}": one["most_mib"] - one["before_mib"]
+        > MIB,
     } | {
-        f"{name} {one[name]['p50']} ms, alone {alone[name]['p50']}": one[name]["p50"] > alone[name]["p50"] + LATE_MS
+        f"{name} {one[name]['p50']} ms, alone {alone[name]['p50']}": one[name]["p50"]
+        > alone[name]["p50"] + LATE_MS
         for name in ("latency_ms", "way_ms")
     }
     return [text for text, bad in checks.items() if bad]
@@ -210,7 +253,8 @@ def table(content: dict[str, Any]) -> str:
     ]
     for name, one in boxes.items():
         within, way = (
-            "{p50:.1f} / {p99:.1f} / {max:.1f} ms".format(**one[f"{kind}_ms"]) for kind in ("latency", "way")
+            "{p50:.1f} / {p99:.1f} / {max:.1f} ms".format(**one[f"{kind}_ms"])
+            for kind in ("latency", "way")
         )
         edge = "{p99:.1f} / {max:.1f} ms".format(**one["edge_ms"])
         rows.append(
@@ -219,7 +263,9 @@ def table(content: dict[str, Any]) -> str:
         )
     bore = [f"{kind} {seen['attempts']:,}" for kind, seen in peers.items()]
     good = [
-        f"{kind} {seen['answers of the bridge']:,}" for kind, seen in peers.items() if "answers of the bridge" in seen
+        f"{kind} {seen['answers of the bridge']:,}"
+        for kind, seen in peers.items()
+        if "answers of the bridge" in seen
     ]
     rows += [
         "",
@@ -230,14 +276,23 @@ def table(content: dict[str, Any]) -> str:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=5.0, help="for both boxes at once (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=5.0, help="for both boxes at once (%(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--out", type=Path, default=RESULTS, help="the table goes into README.md beside it, if there is one"
+        "--out",
+        type=Path,
+        default=RESULTS,
+        help="the table goes into README.md beside it, if there is one",
     )
     args = parser.parse_args()
-    real_time = subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    real_time = (
+        subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
+    )
     load = round(os.getloadavg()[2], 1)
     found = measure(args.minutes, args.seed, REAL_TIME if real_time else ())
     content = {"commit": commit(), "seed": args.seed, "real_time": real_time, "load": load, **found}

@@ -1,7 +1,9 @@
-"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/skins.json, tables of docs/skins.md.
+"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/skins.json,
+tables of docs/skins.md.
 
-way: record, describe, fit, export and run with each. noise: wrong frames on a bad cable. load: share of a core, lost frames
-and time to the answer, with the bundles of `way`. Without a word all of them, then the page.
+way: record, describe, fit, export and run with each. noise: wrong frames on a bad cable. load:
+share of a core, lost frames and time to the answer, with the bundles of `way`. Without a word all
+of them, then the page.
 """
 
 from __future__ import annotations
@@ -32,22 +34,32 @@ def _way(name: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _noise(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    return {fault.__name__: asdict(noise.count(subject(name), fault, FAULTS)) for fault in noise.FAULTS}
+    return {
+        fault.__name__: asdict(noise.count(subject(name), fault, FAULTS)) for fault in noise.FAULTS
+    }
 
 
 def _load(name: str, args: argparse.Namespace) -> dict[str, Any]:
     return load.measure(name, WORK / name / "bundle", args.seconds)
 
 
-PARTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {"way": _way, "noise": _noise, "load": _load}
+PARTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
+    "way": _way,
+    "noise": _noise,
+    "load": _load,
+}
 
 
 def main() -> int:
     """Run the parts, and write what they gave beside what others gave before."""
     parser = argparse.ArgumentParser(prog="python -m tests.skins", description=__doc__)
     parser.add_argument("part", nargs="?", choices=[*PARTS, "page"], help="all by default")
-    parser.add_argument("skins", nargs="*", metavar="SKIN", help=f"from {', '.join(NAMES)}; all by default")
-    parser.add_argument("--seconds", type=float, default=600, help="of `load` for each skin (%(default)s)")
+    parser.add_argument(
+        "skins", nargs="*", metavar="SKIN", help=f"from {', '.join(NAMES)}; all by default"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=600, help="of `load` for each skin (%(default)s)"
+    )
     args = parser.parse_args()
     if wrong := set(args.skins) - set(NAMES):
         parser.error(f"no skin {', '.join(sorted(wrong))}; there are {', '.join(NAMES)}")

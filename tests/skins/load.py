@@ -1,8 +1,10 @@
-"""What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle, seconds. Out: figures.
+"""What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle,
+seconds. Out: figures.
 
-The emulator plays in a process of its own, and each frame carries its number in two taxels, so that lost ones are seen
-whatever the skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box classifies one sweep after the other. Both run under
-real-time scheduling where that is allowed: what is measured is the box, and not what else the machine does.
+The emulator plays in a process of its own, and each frame carries its number in two taxels, so that
+lost ones are seen whatever the skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box
+classifies one sweep after the other. Both run under real-time scheduling where that is allowed:
+what is measured is the box, and not what else the machine does.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ SEED = 7
 
 
 class Sliding:
-    """A finger that slides without end: the middle of a simulated sweep, again and again, with numbers in two taxels."""
+    """A finger that slides without end: the middle of a simulated sweep, again and again, with
+    numbers in two taxels."""
 
     def __init__(self, name: str, profile: SkinProfile, fmt: SweepFormat) -> None:
         self._profile = profile
@@ -77,8 +80,8 @@ class Sliding:
 
 
 class FrameCheck(Observer):
-    """Notes what comes. came, missing: how many frames, and how many numbers between them. answer_ms: from each stop edge to
-    the sentence at the port. statuses: of all answers."""
+    """Notes what comes. came, missing: how many frames, and how many numbers between them.
+    answer_ms: from each stop edge to the sentence at the port. statuses: of all answers."""
 
     def __init__(self, clock: Clock) -> None:
         self.clear()
@@ -106,7 +109,8 @@ class FrameCheck(Observer):
 
 
 class PromptClock(SystemClock):
-    """The real clock. latest_ns: the most that a sleep ended late: so long the machine let nobody run."""
+    """The real clock. latest_ns: the most that a sleep ended late: so long the machine let nobody
+    run."""
 
     latest_ns = 0
 
@@ -126,7 +130,8 @@ def hurry(priority: int) -> bool:
 
 
 def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
-    """Let a box with the bundle in `folder` run so long on the skin `name`. Ends the program where the skin was lost."""
+    """Let a box with the bundle in `folder` run so long on the skin `name`. Ends the program where
+    the skin was lost."""
     current, clock = bundle.load(folder), SystemClock()
     check = FrameCheck(clock)
     with ExitStack() as stack:
@@ -147,21 +152,37 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         player.send_signal(signal.SIGTERM)
         emulator = json.loads(player.communicate()[0])
     return {
-        "skin": name, "format": str(current.format), "seconds": round(wall / 1e9, 1), "share": round(cpu / wall, 4),
-        "real_time": real_time, "came": check.came, "missing": check.missing, "counted_lost": box.counters.lost_frames - lost,
-        "garbage": box.counters.garbage_bytes, **emulator, "answers": len(check.answer_ms),
-        "statuses": {status: check.statuses.count(status) for status in sorted(set(check.statuses))},
-        "answer_ms": {f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)},
-    }  # fmt: skip
+        "skin": name,
+        "format": str(current.format),
+        "seconds": round(wall / 1e9, 1),
+        "share": round(cpu / wall, 4),
+        "real_time": real_time,
+        "came": check.came,
+        "missing": check.missing,
+        "counted_lost": box.counters.lost_frames - lost,
+        "garbage": box.counters.garbage_bytes,
+        **emulator,
+        "answers": len(check.answer_ms),
+        "statuses": {
+            status: check.statuses.count(status) for status in sorted(set(check.statuses))
+        },
+        "answer_ms": {
+            f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)
+        },
+    }
 
 
 def sets(name: str, fmt: SweepFormat, link: Path) -> list[str]:
     """Settings of a box with this skin and no lines."""
     sweep_s = fmt.window / fmt.rate_hz + LEAD_S
     chosen = {
-        "sensor.skin": name, "sensor.port": link, "sensor.rate_hz": fmt.rate_hz, "trigger.mode": "timed",
-        "trigger.sweep_s": sweep_s, "trigger.every_s": sweep_s + PAUSE_S,
-    }  # fmt: skip
+        "sensor.skin": name,
+        "sensor.port": link,
+        "sensor.rate_hz": fmt.rate_hz,
+        "trigger.mode": "timed",
+        "trigger.sweep_s": sweep_s,
+        "trigger.every_s": sweep_s + PAUSE_S,
+    }
     return [f"{key}={value}" for key, value in chosen.items()]
 
 
@@ -187,7 +208,8 @@ def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
 
 
 def play(name: str, rate_hz: float, link: Path) -> None:
-    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took, and how late it was itself at most."""
+    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took, and how late it was
+    itself at most."""
     stop = Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     profile = replace(skin_profile.load(name, [PROFILES]), rate_hz=rate_hz)
@@ -199,7 +221,9 @@ def play(name: str, rate_hz: float, link: Path) -> None:
     clock.latest_ns = 0
     player.run(stop.is_set)
     player.close()
-    print(json.dumps({"thrown": player.thrown, "emulator_late_ms": round(clock.latest_ns / 1e6, 1)}))
+    print(
+        json.dumps({"thrown": player.thrown, "emulator_late_ms": round(clock.latest_ns / 1e6, 1)})
+    )
 
 
 if __name__ == "__main__":

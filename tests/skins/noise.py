@@ -1,7 +1,8 @@
 """How often a bad cable makes a wrong frame. In: the bytes of each skin, faults. Out: counts.
 
-A frame is wrong if the box takes it and no such frame was sent. A skin with a checksum has none of them. One without
-cannot tell a changed number from a felt one; what can be asked of it is that lost and added bytes invent no frame.
+A frame is wrong if the box takes it and no such frame was sent. A skin with a checksum has none of
+them. One without cannot tell a changed number from a felt one; what can be asked of it is that lost
+and added bytes invent no frame.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ FAULTS: tuple[Fault, ...] = (lost, changed, added, twice)
 
 @dataclass(frozen=True, slots=True)
 class NoiseCount:
-    """faults: how many. taken: frames that the box took. wrong: those of them that were not sent. sent: frames sent."""
+    """faults: how many. taken: frames that the box took. wrong: those of them that were not sent.
+    sent: frames sent."""
 
     faults: int
     sent: int
@@ -60,7 +62,8 @@ class NoiseCount:
 
 
 def count(subject: Subject, fault: Fault, faults: int, seed: int = 1) -> NoiseCount:
-    """Play a stream in which one frame of APART is damaged, and compare what comes out with what was sent."""
+    """Play a stream in which one frame of APART is damaged, and compare what comes out with what
+    was sent."""
     known = {frame.tobytes() for frame in subject.frames}
     read, rest = codec(subject.profile), Rest()
     taken = wrong = 0

@@ -1,4 +1,5 @@
-"""The tables of docs/skins.md. In: docs/skins.json. Out: the page with each table between its markers."""
+"""The tables of docs/skins.md. In: docs/skins.json. Out: the page with each table between its
+markers."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ Json = dict[str, Any]
 
 
 def write(path: Path, results: Json) -> None:
-    """Put each table and the header into the page. Raises FormatError where a pair of markers is not there once."""
+    """Put each table and the header into the page. Raises FormatError where a pair of markers is
+    not there once."""
     text = path.read_text("utf-8")
     for part, table in TABLES.items():
         text = marked_text.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))
@@ -51,7 +53,8 @@ def _noise(found: dict[str, Json]) -> Iterator[str]:
 
 
 def _rate(wrong: int, faults: int) -> str:
-    """Wrong frames in so many faults; without any, the rule of three gives what they can be at most."""
+    """Wrong frames in so many faults; without any, the rule of three gives what they can be at
+    most."""
     if not wrong:
         return f"0 of {faults:,} (below {3 / faults:.2%})"
     return f"{wrong:,} of {faults:,} ({wrong / faults:.2%})"
@@ -68,4 +71,8 @@ def _load(found: dict[str, Json]) -> Iterator[str]:
         )
 
 
-TABLES: dict[str, Callable[[dict[str, Json]], Iterator[str]]] = {"way": _way, "noise": _noise, "load": _load}
+TABLES: dict[str, Callable[[dict[str, Json]], Iterator[str]]] = {
+    "way": _way,
+    "noise": _noise,
+    "load": _load,
+}

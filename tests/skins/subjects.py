@@ -1,4 +1,5 @@
-"""The skins that are measured. In: the name of a delivered profile. Out: its profile, its emulator, and numbered frames."""
+"""The skins that are measured. In: the name of a delivered profile. Out: its profile, its emulator,
+and numbered frames."""
 
 from __future__ import annotations
 
@@ -33,13 +34,15 @@ class Subject:
     def sent(self, skin: Wire, i: int) -> bytes:
         """The bytes of frame `i`."""
         return skin.frame(
-            on_wire(self.frames[i % len(self.frames)], self.profile), round(1e6 * i / self.profile.rate_hz)
+            on_wire(self.frames[i % len(self.frames)], self.profile),
+            round(1e6 * i / self.profile.rate_hz),
         )
 
 
 @lru_cache
 def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
-    """The skin with this name. Its numbers fill the range of the type, so that every marker occurs among them.
+    """The skin with this name. Its numbers fill the range of the type, so that every marker occurs
+    among them.
 
     rows, cols: the grid on the wire, by default the profile's.
     """
@@ -47,7 +50,9 @@ def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
     profile = replace(profile, rows=rows or profile.rows, cols=cols or profile.cols)
     fmt, rng = profile.format, np.random.default_rng(sum(name.encode()))
     if fmt.dtype == "float32":
-        values = rng.integers(-4000, 4000, (n, *fmt.shape)) / 4  # what two digits after the point can hold
+        values = (
+            rng.integers(-4000, 4000, (n, *fmt.shape)) / 4
+        )  # what two digits after the point can hold
     else:
         most = 0xF9FF if name == "xela-can" else np.iinfo(fmt.dtype).max
         values = rng.integers(0, most + 1, (n, *fmt.shape))

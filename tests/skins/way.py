@@ -1,6 +1,8 @@
-"""The whole way with a skin, by the commands that a person types: record, describe, fit, export, run.
+"""The whole way with a skin, by the commands that a person types: record, describe, fit, export,
+run.
 
-In: the name of a profile, a folder. Out: what the last command answered to sweeps at positions that no recording has.
+In: the name of a profile, a folder. Out: what the last command answered to sweeps at positions that
+no recording has.
 """
 
 from __future__ import annotations
@@ -37,33 +39,62 @@ def _command(package: str, *arguments: object) -> str:
     command = [sys.executable, "-m", package, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     if done.returncode:
-        raise SystemExit(f"{' '.join(command[2:])}: exit code {done.returncode}\n{done.stderr.strip()[-800:]}")
+        raise SystemExit(
+            f"{' '.join(command[2:])}: exit code {done.returncode}\n{done.stderr.strip()[-800:]}"
+        )
     return done.stdout
 
 
 def go(name: str, folder: Path) -> dict[str, Any]:
-    """Record, describe, fit, export and run with the skin `name`; everything made lies in `folder`."""
+    """Record, describe, fit, export and run with the skin `name`; everything made lies in
+    `folder`."""
     sweeps, fit, bundle = folder / "sweeps", folder / "fit.npz", folder / "bundle"
     chosen = ("--skin", name, "--virtual")
     for seed in TRAINED:
         for material in skin.MATERIALS:
             box(
-                "record", *chosen, "--sim", f"skin:{material}", "--seed", seed, "--sweeps", RECORDED,
-                "--material", material, "--position", f"p{seed}", "--out", sweeps,
-            )  # fmt: skip
+                "record",
+                *chosen,
+                "--sim",
+                f"skin:{material}",
+                "--seed",
+                seed,
+                "--sweeps",
+                RECORDED,
+                "--material",
+                material,
+                "--position",
+                f"p{seed}",
+                "--out",
+                sweeps,
+            )
     desktop("sets", "describe", sweeps)
     fitted = desktop("fit", "--set", sweeps, "--seed", 1, "--out", fit)
     desktop("export", fit, "--out", bundle, "--name", name, "--version", 1)
     right = total = lost = 0
     for seed in TESTED:
-        text = box("demo", *chosen, "--set", f"classifier.bundle={bundle}", "--seed", seed, "--sweeps", PLAYED)
+        text = box(
+            "demo",
+            *chosen,
+            "--set",
+            f"classifier.bundle={bundle}",
+            "--seed",
+            seed,
+            "--sweeps",
+            PLAYED,
+        )
         good, of = map(int, re.findall(r"all sweeps\s+(\d+) / (\d+)", text)[-1])
         right, total = right + good, total + of
         lost += int(re.findall(r"frames lost\s+(\d+)", text)[-1])
     chose = re.findall(r"chosen: (.*?);", fitted)
     return {
-        "skin": name, "sweeps": len(TRAINED) * RECORDED * len(skin.MATERIALS), "format": str(load(bundle).format),
-        "chosen": chose[0] if chose else "", "right": right, "total": total, "lost": lost,
+        "skin": name,
+        "sweeps": len(TRAINED) * RECORDED * len(skin.MATERIALS),
+        "format": str(load(bundle).format),
+        "chosen": chose[0] if chose else "",
+        "right": right,
+        "total": total,
+        "lost": lost,
         "interval": [round(v, 4) for v in wilson(right, total)],
         "bundle_kb": round(sum(f.stat().st_size for f in bundle.iterdir()) / 1000, 1),
-    }  # fmt: skip
+    }

@@ -1,4 +1,5 @@
-"""The bridges' unit under a real systemd, in a container: off at first, hardened; the feed and the line reach it."""
+"""The bridges' unit under a real systemd, in a container: off at first, hardened; the feed and the
+line reach it."""
 
 from __future__ import annotations
 
@@ -55,8 +56,12 @@ def ask(machine: Machine, program: str, *args: str) -> str:
 
 def until(machine: Machine, condition: str) -> None:
     """Wait for a shell command to succeed."""
-    done = machine.run("sh", "-c", f"for i in $(seq {2 * WAIT_S}); do {condition} && exit; sleep 0.5; done; exit 1")
-    assert done.returncode == 0, machine.get("journalctl", "-q", "-u", "palpate-bridge@*", "-o", "cat")
+    done = machine.run(
+        "sh", "-c", f"for i in $(seq {2 * WAIT_S}); do {condition} && exit; sleep 0.5; done; exit 1"
+    )
+    assert done.returncode == 0, machine.get(
+        "journalctl", "-q", "-u", "palpate-bridge@*", "-o", "cat"
+    )
 
 
 @pytest.fixture
@@ -68,7 +73,8 @@ def bridges(machine: Machine, service: Service) -> Iterator[Service]:
 
 
 def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
-    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install enables neither bridge."""
+    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install
+    enables neither bridge."""
     for unit in (TCP, MODBUS):
         done = machine.run("systemd-analyze", "verify", f"{unit}.service")
         assert (done.returncode, done.stderr) == (0, "")
@@ -80,7 +86,8 @@ def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]
 
 
 def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridges: Service):
-    """As delivered: the skin's state is read, as a user of its own; without the service the state is 0, the process goes on."""
+    """As delivered: the skin's state is read, as a user of its own; without the service the state
+    is 0, the process goes on."""
     bridges.start()
     bridges.until("StatusText", STREAMS)
     machine.get("systemctl", "start", MODBUS)
@@ -95,8 +102,8 @@ def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridge
 
 
 def test_the_line_over_tcp(machine: Machine, bridges: Service):
-    """The box opens the line that the bridge makes, another user does not; commands are refused until a setting allows
-    them; a killed bridge, and a killed service, find one another again."""
+    """The box opens the line that the bridge makes, another user does not; commands are refused
+    until a setting allows them; a killed bridge, and a killed service, find one another again."""
     machine.put(SITE, f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n')
     bridges.start()
     machine.get("systemctl", "start", TCP)
@@ -105,14 +112,19 @@ def test_the_line_over_tcp(machine: Machine, bridges: Service):
     assert found["state"] == "streaming"
     assert len(found["labels"]) > 1
     assert "read-only" in found["start"]
-    others = machine.run("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "sh", "-c", f": <>{LINE}")
+    others = machine.run(
+        "setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "sh", "-c", f": <>{LINE}"
+    )
     assert "Permission denied" in others.stderr
     machine.get("systemctl", "kill", "--signal=KILL", TCP)
     until(machine, f"systemctl is-active -q {TCP}")
     assert json.loads(ask(machine, ASK_TCP))["state"] == "streaming"
     bridges.kill("KILL")
     assert json.loads(ask(machine, ASK_TCP))["state"] == "streaming"
-    machine.put(SITE, f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n[bridge]\nallow_writes = true\n')
+    machine.put(
+        SITE,
+        f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n[bridge]\nallow_writes = true\n',
+    )
     machine.get("systemctl", "restart", TCP)
     until(machine, f"test -L {LINE}")
     assert json.loads(ask(machine, ASK_TCP))["start"] is None
@@ -135,8 +147,16 @@ def test_what_it_cannot_do(machine: Machine, bridges: Service):
     pid = machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID")
     assert re.search(r"(?m)^CapBnd:\t0+$", machine.get("cat", f"/proc/{pid}/status"))
     inside = machine.run(
-        "nsenter", "-t", pid, "-m", "setpriv", "--reuid=palpate-bridge", "--regid=palpate", "--clear-groups",
-        "ls", "/var/lib/palpate",
-    )  # fmt: skip
+        "nsenter",
+        "-t",
+        pid,
+        "-m",
+        "setpriv",
+        "--reuid=palpate-bridge",
+        "--regid=palpate",
+        "--clear-groups",
+        "ls",
+        "/var/lib/palpate",
+    )
     assert inside.returncode != 0
     assert "Permission denied" in inside.stderr

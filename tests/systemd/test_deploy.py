@@ -1,6 +1,8 @@
-"""Installing and delivering to real hosts: containers with systemd and sshd, reached as a bare user (see hosts.py).
+"""Installing and delivering to real hosts: containers with systemd and sshd, reached as a bare user
+(see hosts.py).
 
-The skin is simulated. That takes minutes, so only PALPATE_SYSTEMD=1 does it, which also makes what it needs.
+The skin is simulated. That takes minutes, so only PALPATE_SYSTEMD=1 does it, which also makes what
+it needs.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ PYINFRA = pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of this checkout."""
-    emulated_machines.wheel(folder := tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source"))
+    emulated_machines.wheel(
+        folder := tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("source")
+    )
     (file,) = folder.glob("*.whl")
     return file
 
@@ -52,11 +56,21 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
     """Installs the first host over loopback, as a user without a profile; the output of that."""
     (site.work / "signers").write_text(deliveries.line(deliveries.key(site.work / "keys")))
     done = site.desktop(
-        "install", "--host", f"{hosts.USER}@127.0.0.1", "--wheel", wheel, "--board", "rpi5",
-        "--signers", site.work / "signers", inside=site.hosts[0],
-    )  # fmt: skip
+        "install",
+        "--host",
+        f"{hosts.USER}@127.0.0.1",
+        "--wheel",
+        wheel,
+        "--board",
+        "rpi5",
+        "--signers",
+        site.work / "signers",
+        inside=site.hosts[0],
+    )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr  # told, not taken in silence
+    assert (
+        "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
+    )  # told, not taken in silence
     return done.stdout
 
 
@@ -89,7 +103,8 @@ def release(host: hosts.Host) -> str:
 
 
 def start_again(host: hosts.Host) -> None:
-    """As after a power cut: systemd reads the unit on the disk again and starts the release on the disk."""
+    """As after a power cut: systemd reads the unit on the disk again and starts the release on the
+    disk."""
     if host.service["MainPID"] != "0":
         host.service.kill("SIGKILL")
     host.machine.get("systemctl", "daemon-reload")
@@ -98,8 +113,11 @@ def start_again(host: hosts.Host) -> None:
 
 
 def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: str):
-    """From a Debian without Python to an active, enabled service; the board's name is in its settings."""
-    assert re.fullmatch(r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s after the command\n", installed)
+    """From a Debian without Python to an active, enabled service; the board's name is in its
+    settings."""
+    assert re.fullmatch(
+        r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s after the command\n", installed
+    )
     assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")
     name = release(host)
     assert host.machine.get("cat", "/opt/palpate/stamp") == name
@@ -109,16 +127,28 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
     assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
     assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
     files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
-    assert set(host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()) == {"root:palpate-watch 640"}
-    off = {"palpate-watch": "linked", "palpate-bridge@tcp": "disabled", "palpate-bridge@modbus": "disabled"}
-    assert {unit: host.machine.run("systemctl", "is-enabled", unit).stdout.strip() for unit in off} == off
+    assert set(host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()) == {
+        "root:palpate-watch 640"
+    }
+    off = {
+        "palpate-watch": "linked",
+        "palpate-bridge@tcp": "disabled",
+        "palpate-bridge@modbus": "disabled",
+    }
+    assert {
+        unit: host.machine.run("systemctl", "is-enabled", unit).stdout.strip() for unit in off
+    } == off
     assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
-def test_a_second_install_changes_nothing(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+def test_a_second_install_changes_nothing(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
+):
     """The same command again: the process goes on, settings and signers stay."""
     pid, name = host.service["MainPID"], release(host)
-    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi5", "--signers", site.work / "signers")
+    done = site.desktop(
+        "install", *at, "--wheel", wheel, "--board", "rpi5", "--signers", site.work / "signers"
+    )
     assert (done.returncode, done.stdout.partition(": ")[2].strip()) == (
         0,
         f"{name.removeprefix('palpate-')} runs already",
@@ -127,7 +157,9 @@ def test_a_second_install_changes_nothing(site: hosts.Hosts, host: hosts.Host, a
     assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
 
 
-def test_the_board_that_is_named_last_holds(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
+def test_the_board_that_is_named_last_holds(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
+):
     """It replaces a wrong one, what a person added stays, and the service starts with it."""
     file, pid = "/etc/palpate/palpate.toml", host.service["MainPID"]
     host.machine.put(file, 'board = "rpi9"\n# mine\n')
@@ -141,10 +173,20 @@ def test_the_board_that_is_named_last_holds(site: hosts.Hosts, host: hosts.Host,
 
 def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
     """With the boards that there are."""
-    command = [sys.executable, SCRIPTS / "install.py", "--host", "robot@127.0.0.1:1", "--wheel", __file__]
+    command = [
+        sys.executable,
+        SCRIPTS / "install.py",
+        "--host",
+        "robot@127.0.0.1:1",
+        "--wheel",
+        __file__,
+    ]
     done = subprocess.run([*command, "--board", "rpi9"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (1, "")
-    assert "BOARD=rpi9 has no file firmware_config/board-rpi9.toml; boards there: rpi4, rpi5" in done.stderr
+    assert (
+        "BOARD=rpi9 has no file firmware_config/board-rpi9.toml; boards there: rpi4, rpi5"
+        in done.stderr
+    )
 
 
 def test_signers_are_never_overwritten(
@@ -155,7 +197,10 @@ def test_signers_are_never_overwritten(
     before = host.machine.get("cat", "/etc/palpate/allowed_signers")
     done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
     assert done.returncode == 1
-    assert "FAILED: users, folders and settings: /etc/palpate/allowed_signers is another one there" in done.stdout
+    assert (
+        "FAILED: users, folders and settings: /etc/palpate/allowed_signers is another one there"
+        in done.stdout
+    )
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
 
 
@@ -163,23 +208,36 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
     """Nothing is changed there before the packages can be installed."""
     machine = site.hosts[1].machine
     machine.get("find", "/var/cache/apt/archives", "-name", "*.deb", "-delete")
-    done = site.desktop("install", "--host", f"{hosts.USER}@{site.hosts[1].address}", "--wheel", wheel, limit_s=120)
+    done = site.desktop(
+        "install", "--host", f"{hosts.USER}@{site.hosts[1].address}", "--wheel", wheel, limit_s=120
+    )
     assert done.returncode == 1
-    assert "FAILED: python3-venv libusb-1.0-0 openssl cannot be installed: apt-get: E: " in done.stdout
+    assert (
+        "FAILED: python3-venv libusb-1.0-0 openssl cannot be installed: apt-get: E: " in done.stdout
+    )
     assert "give the box a way to Debian's mirrors" in done.stdout
     assert machine.get("ls", "/opt") == ""
 
 
-def test_what_a_person_put_there_stays(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path):
-    """A settings file of theirs is kept and named; a file in the way of the program ends the install before anything
-    else."""
-    settings, program, pid = "/etc/palpate/sensor.toml", "/usr/local/bin/palpate", host.service["MainPID"]
+def test_what_a_person_put_there_stays(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
+):
+    """A settings file of theirs is kept and named; a file in the way of the program ends the
+    install before anything else."""
+    settings, program, pid = (
+        "/etc/palpate/sensor.toml",
+        "/usr/local/bin/palpate",
+        host.service["MainPID"],
+    )
     for path in (settings, program):
         host.machine.get("rm", path)
         host.machine.put(path, "# mine\n")
     done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 1
-    assert f"FAILED: users, folders and settings: {program} is a file there, not a link; move it away" in done.stdout
+    assert (
+        f"FAILED: users, folders and settings: {program} is a file there, not a link; move it away"
+        in done.stdout
+    )
     host.machine.get("rm", program)
     done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 0
@@ -197,7 +255,9 @@ def upgraded(
     folder, outputs = tmp_path_factory.mktemp("releases"), [(release(site.hosts[0]), installed)]
     at = ("--host", f"{hosts.USER}@{site.hosts[0].address}")
     for i in range(2):
-        done = site.desktop("install", *at, "--wheel", changed(wheel, folder, "appliance/more.py", f"# {i}\n"))
+        done = site.desktop(
+            "install", *at, "--wheel", changed(wheel, folder, "appliance/more.py", f"# {i}\n")
+        )
         outputs.append((release(site.hosts[0]), done.stdout + done.stderr))
     return outputs
 
@@ -207,7 +267,9 @@ def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tu
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
     for _, output in upgraded[1:]:
-        assert re.search(r"is READY [0-9.]+ s after the command, [0-9.]+ s without classifying\n", output), output
+        assert re.search(
+            r"is READY [0-9.]+ s after the command, [0-9.]+ s without classifying\n", output
+        ), output
     there = host.machine.get("sh", "-c", "ls -d /opt/palpate-*").split()
     assert there == sorted(f"/opt/{name}" for name in releases[1:])
     assert host.machine.get("readlink", "/opt/palpate.previous") == releases[1]
@@ -216,12 +278,16 @@ def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tu
 def test_a_release_that_does_not_start_gives_way_to_the_old_one(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
 ):
-    """It passes its self-test and then does not start: the link is swapped back, and the old release classifies."""
+    """It passes its self-test and then does not start: the link is swapped back, and the old
+    release classifies."""
     before = release(host)
     broken = changed(wheel, tmp_path, "appliance/service/systemd.py", "\nNotifier.turn = None\n")
     done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
-    assert "FAILED: the service does not come up: TypeError: 'NoneType' object is not callable" in done.stdout
+    assert (
+        "FAILED: the service does not come up: TypeError: 'NoneType' object is not callable"
+        in done.stdout
+    )
     assert done.stdout.endswith(f"; so {before} runs again\n")
     assert (release(host), host.service["ActiveState"]) == (before, "active")
 
@@ -231,20 +297,33 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
 ):
     """The process that classifies is not touched."""
     before, pid = release(host), host.service["MainPID"]
-    broken = changed(wheel, tmp_path, "appliance/inference/classifier.py", "\nraise OSError('not on this box')\n")
+    broken = changed(
+        wheel, tmp_path, "appliance/inference/classifier.py", "\nraise OSError('not on this box')\n"
+    )
     done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
     assert "FAILED: self-test: OSError: not on this box" in done.stdout
     assert (release(host), host.service["MainPID"]) == (before, pid)
 
 
-@pytest.mark.parametrize(("said", "after_s"), [("copying", 0.3), ("building", 0.5), ("building", 4.0)])
+@pytest.mark.parametrize(
+    ("said", "after_s"), [("copying", 0.3), ("building", 0.5), ("building", 4.0)]
+)
 def test_an_install_that_is_cut_is_finished_by_the_next(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path, said: str, after_s: float
+    site: hosts.Hosts,
+    host: hosts.Host,
+    at: tuple[str, str],
+    wheel: Path,
+    tmp_path: Path,
+    said: str,
+    after_s: float,
 ):
-    """The desktop dies during the copy, or while the box builds: the old release starts, and a second command
-    finishes."""
-    new, before = changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"), release(host)
+    """The desktop dies during the copy, or while the box builds: the old release starts, and a
+    second command finishes."""
+    new, before = (
+        changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"),
+        release(host),
+    )
     site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
     assert release(host) == before
     start_again(host)
@@ -255,9 +334,11 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 
 
 def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
-    """The box dies before the N-th command of the swap, for each N: it starts with one release or the other,
-    complete."""
-    new, old = (host.machine.get("readlink", link) for link in ("/opt/palpate", "/opt/palpate.previous"))
+    """The box dies before the N-th command of the swap, for each N: it starts with one release or
+    the other, complete."""
+    new, old = (
+        host.machine.get("readlink", link) for link in ("/opt/palpate", "/opt/palpate.previous")
+    )
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
     for n in range(1, 20):
@@ -299,8 +380,15 @@ def sha(folder: Path) -> str:
 
 def listed(host: hosts.Host) -> dict[str, str]:
     """The roles of the box's bundles by sha256."""
-    output = host.machine.get("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups",
-                            PALPATE, "bundles", "--json")  # fmt: skip
+    output = host.machine.get(
+        "setpriv",
+        "--reuid=palpate",
+        "--regid=palpate",
+        "--clear-groups",
+        PALPATE,
+        "bundles",
+        "--json",
+    )
     return {entry["sha"]: entry["role"] for entry in json.loads(output)}
 
 
@@ -316,16 +404,33 @@ def serves(host: hosts.Host) -> str:
 def test_a_bundle_is_delivered_and_runs_on_trial(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """READY with the new bundle, on trial, no files left behind; a second delivery changes nothing."""
+    """READY with the new bundle, on trial, no files left behind; a second delivery changes
+    nothing."""
     bundle = sender.made()
-    done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers", "--json", tmp_path / "report.json")
+    done = site.desktop(
+        "deploy",
+        *at,
+        bundle,
+        "--signers",
+        site.work / "signers",
+        "--json",
+        tmp_path / "report.json",
+    )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"is READY [0-9.]+ s after the command; [0-9.]+ s without classifying; on trial: ", done.stdout)
+    assert re.search(
+        r"is READY [0-9.]+ s after the command; [0-9.]+ s without classifying; on trial: ",
+        done.stdout,
+    )
     (figures,) = json.loads((tmp_path / "report.json").read_text())["boxes"].values()
     assert figures["lost_s"] <= figures["ready_s"]
     assert listed(host)[sha(bundle)] == "on trial"
     assert serves(host) == sha(bundle)[:8]
-    assert host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}").count(".palpate") == 0
+    assert (
+        host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}").count(
+            ".palpate"
+        )
+        == 0
+    )
     pid = host.service["MainPID"]
     done = site.desktop("deploy", *at, bundle)
     assert (done.returncode, done.stdout.strip().endswith("runs already")) == (0, True)
@@ -335,7 +440,8 @@ def test_a_bundle_is_delivered_and_runs_on_trial(
 def test_a_bundle_with_an_unknown_key_is_refused(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """By the desktop where it is given the signers, by the box always; the process that classifies goes on."""
+    """By the desktop where it is given the signers, by the box always; the process that classifies
+    goes on."""
     bundle = sender.made(99, deliveries.key(tmp_path))
     before, pid = serves(host), host.service["MainPID"]
     done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers")
@@ -359,10 +465,15 @@ def test_a_bundle_with_an_unknown_key_is_refused(
     ],
 )
 def test_a_delivery_that_is_cut_leaves_old_or_new(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, said: str, after_s: float
+    site: hosts.Hosts,
+    host: hosts.Host,
+    at: tuple[str, str],
+    sender: Sender,
+    said: str,
+    after_s: float,
 ):
-    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a second delivery
-    finishes."""
+    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a
+    second delivery finishes."""
     bundle, before = sender.made(), serves(host)
     site.cut("deploy", *at, bundle, "--verbose", words=said, after_s=after_s)
     start_again(host)
@@ -375,7 +486,8 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
 def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
 ):
-    """It is reported well before the deadline, and is no failure of the bundle; with the skin it is READY."""
+    """It is reported well before the deadline, and is no failure of the bundle; with the skin it is
+    READY."""
     host.machine.put("/opt/palpate/cable.py", CABLE)
     host.service.configure(CABLED)
     bundle = sender.made()
@@ -392,7 +504,9 @@ def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
         start_again(host)
 
 
-def test_a_candidate_is_delivered_beside(site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender):
+def test_a_candidate_is_delivered_beside(
+    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
+):
     """With --shadow the old bundle still answers."""
     bundle, before = sender.made(), serves(host)
     done = site.desktop("deploy", *at, bundle, "--shadow")
@@ -400,23 +514,37 @@ def test_a_candidate_is_delivered_beside(site: hosts.Hosts, host: hosts.Host, at
     assert (listed(host)[sha(bundle)], serves(host)) == ("candidate", before)
 
 
-def test_boxes_that_fail_do_not_stop_the_others(site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path):
-    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its reason, the good one
-    is READY."""
+def test_boxes_that_fail_do_not_stop_the_others(
+    site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path
+):
+    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its
+    reason, the good one is READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
         shared = {"ssh_user": hosts.USER, "ssh_key": str(site.work / ".ssh/id_ed25519")}
         there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
-        boxes = [(name, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for name, port in there.items()]
-        boxes += [(name, {"ssh_hostname": one.address}) for name, one in zip(("good", "bare"), site.hosts, strict=True)]
+        boxes = [
+            (name, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for name, port in there.items()
+        ]
+        boxes += [
+            (name, {"ssh_hostname": one.address})
+            for name, one in zip(("good", "bare"), site.hosts, strict=True)
+        ]
         (tmp_path / "fleet.py").write_text(f"boxes = ({boxes!r}, {shared!r})\n")
-        done = site.desktop("deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100)
+        done = site.desktop(
+            "deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100
+        )
     assert done.returncode == 1
     lines = dict(line.split(": ", 1) for line in done.stdout.splitlines() if ": " in line)
     assert "is READY" in lines["good"]
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
-    assert "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in" in lines["dumb"]
-    assert lines["bare"].startswith("FAILED: asking for its settings: no Palpate is installed there")
+    assert (
+        "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in"
+        in lines["dumb"]
+    )
+    assert lines["bare"].startswith(
+        "FAILED: asking for its settings: no Palpate is installed there"
+    )
     assert lines["hangs"].startswith("FAILED: ")
     assert "no answer within" in lines["hangs"] or "not done within 40 s" in lines["hangs"]
     assert done.stdout.splitlines()[-1] == "1 of 5 boxes done"
@@ -424,7 +552,8 @@ def test_boxes_that_fail_do_not_stop_the_others(site: hosts.Hosts, host: hosts.H
 
 @contextmanager
 def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
-    """A port that forwards to the host's sshd and stops after `most` bytes from it, which is after the login."""
+    """A port that forwards to the host's sshd and stops after `most` bytes from it, which is after
+    the login."""
 
     def carry(source: socket.socket, sink: socket.socket, left: float) -> None:
         with suppress(OSError):
@@ -432,7 +561,10 @@ def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
                 sink.sendall(data)
                 left -= len(data)
 
-    with socket.create_server(("127.0.0.1", 0)) as door, socket.create_connection((host.address, 22)) as far:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as door,
+        socket.create_connection((host.address, 22)) as far,
+    ):
 
         def serve() -> None:
             with suppress(OSError):
@@ -460,10 +592,16 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
 @pytest.mark.parametrize(
     ("stderr", "why"),
     [
-        ("tar: x: write error: No space left on device\ntar: Exiting with failure", "No space left.*; free some room"),
+        (
+            "tar: x: write error: No space left on device\ntar: Exiting with failure",
+            "No space left.*; free some room",
+        ),
         ("sudo: a password is required", "a password is required; let the user in without"),
         ("robot is not in the sudoers file.", "sudoers file.; let the user in"),
-        ("bash: line 1: sudo: command not found", "not found; log in as root, or install sudo there"),
+        (
+            "bash: line 1: sudo: command not found",
+            "not found; log in as root, or install sudo there",
+        ),
         ("E: one\nE: two", "^copying: E: two$"),
         ("", "no reason given"),
     ],
@@ -492,7 +630,8 @@ except fleet.Failed as e:
     ],
 )
 def test_a_box_that_cannot_be_reached_comes_with_what_to_do(said: str, do: str):
-    """By the words of pyinfra, which are looked up in its code, so that those of another version are missed here."""
+    """By the words of pyinfra, which are looked up in its code, so that those of another version
+    are missed here."""
     assert f'"{said}' in (Path(PYINFRA.__file__).parent / "connectors" / "ssh.py").read_text()
     assert f"; {do}" in run_here(f"import fleet; print(fleet.with_remedy('{said}: box'))")
 
@@ -512,7 +651,9 @@ for why in ("apt-get: E: Unable to locate package", "apt-get: sh: 1: sudo: not f
     except install.Failed as e: print(e)
 """
     plain, sudo = run_here(code).splitlines()
-    assert plain.endswith("Unable to locate package; give the box a way to Debian's mirrors, or install it there")
+    assert plain.endswith(
+        "Unable to locate package; give the box a way to Debian's mirrors, or install it there"
+    )
     assert sudo.endswith("sudo: not found; log in as root, or install sudo there")
 
 
@@ -527,14 +668,19 @@ try:
 except fleet.Failed as e:
     print(e)
 """
-    assert run_here(code) == "copying bundle.tar: Failure; see whether its disk is full (df -h) and try again"
+    assert (
+        run_here(code)
+        == "copying bundle.tar: Failure; see whether its disk is full (df -h) and try again"
+    )
 
 
 def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     """Its error is a line without the names of classes, as the box itself says it."""
     (tmp_path / "sensor.toml").write_text("[sensor]\nbuad = 9600\n")
     script = run_here("import install; print(install.SELF_TEST)")
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 1
     assert "buad" in done.stderr
     assert "Error" not in done.stderr
@@ -545,7 +691,8 @@ def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
 
 @pytest.mark.slow
 def test_another_system_is_refused_with_what_is_needed():
-    """Not Debian, another architecture, /opt on its own file system, an old Python: a line says what is needed."""
+    """Not Debian, another architecture, /opt on its own file system, an old Python: a line says
+    what is needed."""
     code = """
 import install
 class Box:
@@ -574,13 +721,19 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
     found = fleet.NAME.fullmatch(text)
     print(found and "|".join(value or "" for value in found.groups()))
 """
-    assert run_here(code).splitlines() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", "None", "None"]
+    assert run_here(code).splitlines() == [
+        "pi|box|",
+        "|Box.lab|2222",
+        "pi|[fe80::1]|22",
+        "None",
+        "None",
+    ]
 
 
 @pytest.mark.slow
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
-    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay with their
-    packages."""
+    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay
+    with their packages."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):
         code = f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, 'aarch64'))"
         lock = run_here(code)

@@ -1,5 +1,5 @@
-"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes, stop, privileges,
-journal."""
+"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes,
+stop, privileges, journal."""
 
 from __future__ import annotations
 
@@ -18,34 +18,52 @@ pytestmark = pytest.mark.slow
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 START_S = 8
-"""Time to start, and by how much each sign of life extends it: more than a busy machine needs to import the packages."""
+"""Time to start, and by how much each sign of life extends it: more than a busy machine needs to
+import the packages."""
 
 
 def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, before: list[bool]):
-    """User, groups and folders, with owners and modes; none of them existed before, and a second run changes
-    nothing."""
+    """User, groups and folders, with owners and modes; none of them existed before, and a second
+    run changes nothing."""
     assert before == [False, False, False]
     for _ in range(2):
-        assert set(machine.get("id", "-nG", "palpate").split()) == {"palpate", "dialout", "gpio", "plugdev"}
-        assert machine.get("getent", "passwd", "palpate").endswith(":/var/lib/palpate:/usr/sbin/nologin")
+        assert set(machine.get("id", "-nG", "palpate").split()) == {
+            "palpate",
+            "dialout",
+            "gpio",
+            "plugdev",
+        }
+        assert machine.get("getent", "passwd", "palpate").endswith(
+            ":/var/lib/palpate:/usr/sbin/nologin"
+        )
         assert len(machine.get("getent", "group", "gpio", "dialout", "plugdev").splitlines()) == 3
         own = [f"/var/lib/palpate{folder}" for folder in ("", "/incoming", "/bundles")]
         folders = machine.get("stat", "-c", "%n %U:%G %a", "/etc/palpate", *own).splitlines()
-        assert folders == ["/etc/palpate root:root 755", *(f"{folder} palpate:palpate 750" for folder in own)]
+        assert folders == [
+            "/etc/palpate root:root 755",
+            *(f"{folder} palpate:palpate 750" for folder in own),
+        ]
         machine.get("systemd-sysusers")
         machine.get("systemd-tmpfiles", "--create", nspawn.PLACES["palpate.tmpfiles"])
 
 
 def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
-    """systemd reports no problem and reads the times as meant; the exposure is at most 1.5 of 10."""
+    """systemd reports no problem and reads the times as meant; the exposure is at most 1.5 of
+    10."""
     done = machine.run("systemd-analyze", "verify", nspawn.PLACES["palpate.service"])
     assert (done.returncode, done.stderr) == (0, "")
-    shown = dict(line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines())
+    shown = dict(
+        line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines()
+    )
     wanted = {"Type": "notify", "NotifyAccess": "main", "Restart": "always", "RestartUSec": "2s"}
     wanted |= {"TimeoutStartUSec": "1min", "TimeoutStopUSec": "10s", "StartLimitIntervalUSec": "0"}
     assert {name: shown[name] for name in wanted} == wanted
     done = machine.run(
-        "systemd-analyze", "security", "--offline=true", "--threshold=15", nspawn.PLACES["palpate.service"]
+        "systemd-analyze",
+        "security",
+        "--offline=true",
+        "--threshold=15",
+        nspawn.PLACES["palpate.service"],
     )
     print(done.stdout.splitlines()[-1])
     assert done.returncode == 0, done.stdout
@@ -64,7 +82,9 @@ def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
     """multi-user.target wants the service, and is reached without it."""
     machine.get("systemctl", "enable", "palpate")
     try:
-        assert "palpate.service" in machine.get("systemctl", "show", "multi-user.target", "-p", "Wants")
+        assert "palpate.service" in machine.get(
+            "systemctl", "show", "multi-user.target", "-p", "Wants"
+        )
         machine.get("systemctl", "stop", "multi-user.target")
         service.configure(CABLED)
         machine.get("systemctl", "start", "multi-user.target")
@@ -74,7 +94,8 @@ def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
 
 
 def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, service: Service):
-    """Without a skin it stays in its start and says why; with one it becomes active, and stays active without it."""
+    """Without a skin it stays in its start and says why; with one it becomes active, and stays
+    active without it."""
     service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}")
     machine.get("systemctl", "start", "--no-block", "palpate")
     absent = r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps answered: \d"
@@ -101,7 +122,9 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
 
 def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
     """Before READY there is no watchdog, but a start whose loop hangs times out."""
-    service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}\nRestartSec=100ms")
+    service.configure(
+        CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}\nRestartSec=100ms"
+    )
     machine.get("systemctl", "start", "--no-block", "palpate")
     service.until("StatusText", "skin absent.*")
     service.kill("SIGSTOP")
@@ -123,7 +146,8 @@ def test_a_process_that_stands_still_is_killed_and_started_again(service: Servic
 
 
 def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service):
-    """A read that never returns: the watchdog kills the program, and the journal shows where it hung."""
+    """A read that never returns: the watchdog kills the program, and the journal shows where it
+    hung."""
     machine.put("/run/skin", "")
     service.start(CABLED + "WatchdogSec=3\nRestartSec=100ms")
     machine.put("/run/hang", "")
@@ -137,26 +161,40 @@ def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service
 
 @pytest.mark.parametrize("signal", ["SIGKILL", "SIGSEGV"])
 def test_a_killed_process_is_started_again(machine: Machine, service: Service, signal: str):
-    """However it dies, it restarts two seconds later; in between the lines of the same settings are lowered."""
-    machine.put(SITE, "[output]\nready = 'GPIO23'\n")  # the simulated skin has lines of its own and ignores it
+    """However it dies, it restarts two seconds later; in between the lines of the same settings are
+    lowered."""
+    machine.put(
+        SITE, "[output]\nready = 'GPIO23'\n"
+    )  # the simulated skin has lines of its own and ignores it
     first = service.start()
     service.kill(signal)
     service.until("NRestarts", "1")
     service.until("ActiveState", "active")
     assert int(service["MainPID"]) not in (0, first)
-    assert sum("Main process exited, code=killed, status=" in line for line in service.journal()) == 1
-    lowered = [line for line in service.log_lines() if line.startswith("palpate: outputs may not be low:")]
-    assert [line.split(": ")[2].split(";")[0] for line in lowered] == ["this machine has no /dev/gpiochip*"]
+    assert (
+        sum("Main process exited, code=killed, status=" in line for line in service.journal()) == 1
+    )
+    lowered = [
+        line for line in service.log_lines() if line.startswith("palpate: outputs may not be low:")
+    ]
+    assert [line.split(": ")[2].split(";")[0] for line in lowered] == [
+        "this machine has no /dev/gpiochip*"
+    ]
 
 
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
-    """Exit 78: the reason is logged once, and there is no restart; once it is corrected, it starts."""
+    """Exit 78: the reason is logged once, and there is no restart; once it is corrected, it
+    starts."""
     service.start()
     machine.put(SITE, "[sweep]\nmax_duration_s = 'for ever'\n")
     service.kill("SIGKILL")
     service.until("ActiveState", "failed")
     time.sleep(2.5)  # longer than RestartSec
-    assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == ("1", "78", "failed")
+    assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == (
+        "1",
+        "78",
+        "failed",
+    )
     named = f"palpate: {SITE}: sweep.max_duration_s = 'for ever'"
     assert sum(line.startswith(named) for line in service.log_lines()) == 1
     machine.get("rm", SITE)
@@ -165,7 +203,8 @@ def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service)
 
 
 def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, service: Service):
-    """Exit 69: no GPIO chip; a start every two seconds until there is one, each with one line in the journal."""
+    """Exit 69: no GPIO chip; a start every two seconds until there is one, each with one line in
+    the journal."""
     machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
     service.configure("")
     machine.get("systemctl", "start", "--no-block", "palpate")
@@ -175,12 +214,17 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
     print(f"three starts in {took_s:.1f} s")
     assert took_s > 4
     assert service["ExecMainStatus"] in ("0", "69")
-    named = [line for line in service.log_lines() if line.startswith("palpate: this machine has no /dev/gpiochip*")]
+    named = [
+        line
+        for line in service.log_lines()
+        if line.startswith("palpate: this machine has no /dev/gpiochip*")
+    ]
     assert len(named) in (3, 4)
 
 
 def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
-    """The open sweep is answered `aborted`, and the program ends by itself well within the limit."""
+    """The open sweep is answered `aborted`, and the program ends by itself well within the
+    limit."""
     service.start()
     end = time.monotonic() + WAIT_S
     while not (status := service.status()).get("sweeping") or not status["answered"]:
@@ -190,12 +234,18 @@ def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
     assert time.monotonic() - begin < 10
     assert "palpate.service: Deactivated successfully." in service.journal()
     answers = service.answers()
-    assert [line.split(":")[0] for line in answers] == [f"sweep {i + 1}" for i in range(len(answers))]
-    assert answers[-1] == f"sweep {len(answers)}: no answer, aborted: by command, or because the box was stopping"
+    assert [line.split(":")[0] for line in answers] == [
+        f"sweep {i + 1}" for i in range(len(answers))
+    ]
+    assert (
+        answers[-1]
+        == f"sweep {len(answers)}: no answer, aborted: by command, or because the box was stopping"
+    )
 
 
 def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
-    """It has the skin's state and a line for each sweep; no sentences, nothing periodic; the lost skin is a warning."""
+    """It has the skin's state and a line for each sweep; no sentences, nothing periodic; the lost
+    skin is a warning."""
     machine.put("/run/skin", "")
     service.start(CABLED)
     end = time.monotonic() + WAIT_S
@@ -214,14 +264,18 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
 
 
 def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
-    """`palpate status` by a user without privileges: running, skin away (exit 69), stopped (exit 1)."""
+    """`palpate status` by a user without privileges: running, skin away (exit 69), stopped (exit
+    1)."""
     ask = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", PALPATE, "status")
     machine.put("/run/skin", "")
     pid = service.start(CABLED)
     service.until("StatusText", STREAMS)
     done = machine.run(*ask)
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.match(rf"running for \d+ s \(process {pid}, palpate [0-9.]+, source sim\)\nskin +streaming", done.stdout)
+    assert re.match(
+        rf"running for \d+ s \(process {pid}, palpate [0-9.]+, source sim\)\nskin +streaming",
+        done.stdout,
+    )
     assert service.status()["pid"] == pid
     machine.get("rm", "/run/skin")
     service.until("StatusText", "skin absent.*")
@@ -245,29 +299,46 @@ def test_systemctl_says_how_it_is(machine: Machine, service: Service):
 
 
 def test_it_is_nobody_in_particular(machine: Machine, service: Service):
-    """Not root, no capability, no new privileges, system calls filtered; /etc/palpate can be read and not written."""
+    """Not root, no capability, no new privileges, system calls filtered; /etc/palpate can be read
+    and not written."""
     pid = service.start()
-    status = dict(re.findall(r"^(\w+):\t(.*)$", machine.get("cat", f"/proc/{pid}/status"), re.MULTILINE))
+    status = dict(
+        re.findall(r"^(\w+):\t(.*)$", machine.get("cat", f"/proc/{pid}/status"), re.MULTILINE)
+    )
     uid = machine.get("id", "-u", "palpate")
     assert set(status["Uid"].split()) == {uid} != {"0"}
     assert {int(status[name], 16) for name in ("CapPrm", "CapEff", "CapBnd", "CapAmb")} == {0}
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     machine.put(SITE, "")
-    as_palpate = ("nsenter", "-t", str(pid), "-m", "setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
+    as_palpate = (
+        "nsenter",
+        "-t",
+        str(pid),
+        "-m",
+        "setpriv",
+        "--reuid=palpate",
+        "--regid=palpate",
+        "--clear-groups",
+    )
     assert machine.run(*as_palpate, "cat", SITE).returncode == 0
     for path in (SITE, "/etc/palpate/new", "/opt/palpate/new", "/root/new"):
         assert machine.run(*as_palpate, "touch", path).returncode != 0
-        assert "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr  # not even root could
+        assert (
+            "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr
+        )  # not even root could
     machine.get(*as_palpate, "touch", "/var/lib/palpate/new")
 
 
 def test_what_it_can_write_it_cannot_execute(machine: Machine, service: Service):
-    """It can execute nothing in folders that it can write; Python and ssh-keygen it can, and libusb is found."""
+    """It can execute nothing in folders that it can write; Python and ssh-keygen it can, and libusb
+    is found."""
     pid = service.start()
     as_palpate = ("nsenter", "-t", str(pid), "-m", "--")
     for folder in ("/var/lib/palpate", "/run/palpate", "/tmp", "/var/tmp", "/dev/shm"):
         machine.get(*as_palpate, "cp", "/bin/true", f"{folder}/own")
-        assert machine.run(*as_palpate, f"{folder}/own").stderr.endswith("Permission denied\n"), folder
+        assert machine.run(*as_palpate, f"{folder}/own").stderr.endswith("Permission denied\n"), (
+            folder
+        )
         machine.get(*as_palpate, "rm", f"{folder}/own")
     assert "ssh-keygen" in machine.run(*as_palpate, "ssh-keygen", "-Y", "help").stderr
     look = "import usb.backend.libusb1 as b; print(b.get_backend().lib)"

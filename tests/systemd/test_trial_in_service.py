@@ -1,4 +1,5 @@
-"""A new bundle under a real systemd: its trial, what ends it, what does not, and the shadow of a candidate.
+"""A new bundle under a real systemd: its trial, what ends it, what does not, and the shadow of a
+candidate.
 
 Bundle A is deployed and committed; each test deploys another, B, signed and with a higher counter.
 """
@@ -33,7 +34,8 @@ import os, signal, sys, time
 from appliance.__main__ import main
 from appliance.sim import usb
 class Cursed(usb.RigBackend):
-    # a second and a half after it has begun, while the current bundle is the one in /run/cursed: do what stands there
+    # a second and a half after it has begun, while the current bundle is the one in /run/cursed: do
+    # what stands there
     begin = time.monotonic()
     def _touch(self, what=""):
         super()._touch(what)
@@ -51,12 +53,15 @@ LEFT = "has failed its trial, and "
 
 
 class DeliveredStore:
-    """The store on the machine, for a person who deploys to it. a: the sha256 of bundle A's manifest."""
+    """The store on the machine, for a person who deploys to it. a: the sha256 of bundle A's
+    manifest."""
 
     def __init__(self, machine: Machine, folder: Path) -> None:
         self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
         self._key = folder / "key"
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key], check=True)
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key], check=True
+        )
         kind, key, _ = self._key.with_suffix(".pub").read_text().split()
         machine.put("/etc/palpate/allowed_signers", f"me {kind} {key}\n")
         machine.put("/opt/palpate/cursed.py", CURSED)
@@ -68,7 +73,8 @@ class DeliveredStore:
         return self.machine.get(*AS_PALPATE, *command)
 
     def deploy(self, *options: str, **changes: Any) -> str:
-        """Copy a new bundle, A with changes to its manifest, to the box and install it; its sha256."""
+        """Copy a new bundle, A with changes to its manifest, to the box and install it; its
+        sha256."""
         counter = next(self._counters)
         made = self._folder / f"b{counter}"
         made.mkdir()
@@ -101,7 +107,9 @@ class DeliveredStore:
 
 
 @pytest.fixture(scope="module")
-def stored(machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPathFactory) -> DeliveredStore:
+def stored(
+    machine: Machine, before: list[bool], tmp_path_factory: pytest.TempPathFactory
+) -> DeliveredStore:
     """The store with bundle A committed."""
     return DeliveredStore(machine, tmp_path_factory.mktemp("bundles"))
 
@@ -127,9 +135,11 @@ def serves(service: Service, sha: str) -> None:
         time.sleep(0.2)
 
 
-def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Service, store: DeliveredStore):
-    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a line in the
-    journal."""
+def test_a_bundle_that_does_its_work_is_committed(
+    machine: Machine, service: Service, store: DeliveredStore
+):
+    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a
+    line in the journal."""
     new = store.deploy()
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
@@ -152,7 +162,8 @@ def test_a_bundle_that_does_its_work_is_committed(machine: Machine, service: Ser
 def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     machine: Machine, service: Service, store: DeliveredStore, does: str, more: str
 ):
-    """Each start becomes READY and then fails or hangs: after three starts A serves again, without help."""
+    """Each start becomes READY and then fails or hangs: after three starts A serves again, without
+    help."""
     new = store.deploy()
     machine.put("/run/cursed", f"{new} {does}")
     begin = time.monotonic()
@@ -175,7 +186,9 @@ def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     """Altered on the card after it was installed: A serves in the same start, without a restart."""
     new = store.deploy()
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
-    machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")
+    machine.get(
+        "sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc"
+    )
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
@@ -184,40 +197,53 @@ def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
     assert "model.onnx was altered" in lines[0]
 
 
-def test_a_bundle_that_does_not_fit_the_settings_is_left(machine: Machine, service: Service, store: DeliveredStore):
+def test_a_bundle_that_does_not_fit_the_settings_is_left(
+    machine: Machine, service: Service, store: DeliveredStore
+):
     """The new bundle does not fit the settings and A does: A serves in the same start."""
     new = store.deploy(early=None)
     machine.put(SITE, "[classifier]\nearly = true\n")
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
-    assert any(f"bundle {new[:8]} {LEFT}" in line and "classifier.early" in line for line in service.log_lines())
+    assert any(
+        f"bundle {new[:8]} {LEFT}" in line and "classifier.early" in line
+        for line in service.log_lines()
+    )
 
 
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """Exit 78, no restarts, and the journal says what to do; after `palpate rollback` and a start, A serves."""
+    """Exit 78, no restarts, and the journal says what to do; after `palpate rollback` and a start,
+    A serves."""
     new = store.deploy()
     store.do("commit")
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
-    machine.get("sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc")
+    machine.get(
+        "sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc"
+    )
     service.configure(RUN)
     machine.run("systemctl", "start", "palpate")
     service.until("ActiveState", "failed")
     assert (service["ExecMainStatus"], service["NRestarts"]) == ("78", "0")
-    assert any("model.onnx was altered" in line and "palpate rollback" in line for line in service.log_lines())
+    assert any(
+        "model.onnx was altered" in line and "palpate rollback" in line
+        for line in service.log_lines()
+    )
     store.do("rollback")
     service.start(RUN)
     serves(service, store.a)
 
 
-@pytest.mark.parametrize("end", ["stopped in order", "killed without a skin", "without a GPIO chip"])
+@pytest.mark.parametrize(
+    "end", ["stopped in order", "killed without a skin", "without a GPIO chip"]
+)
 def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
     machine: Machine, service: Service, store: DeliveredStore, end: str
 ):
-    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial, at its first
-    start."""
+    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial,
+    at its first start."""
     new = store.deploy()
     if end == "without a GPIO chip":
         machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
@@ -235,7 +261,10 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
         service.configure(CABLED + "RestartSec=100ms")
         machine.get("systemctl", "start", "--no-block", "palpate")
         for i in range(4):
-            wait_for(lambda: store.starts(new) == 0 and service["StatusText"].startswith("skin absent"), service)
+            wait_for(
+                lambda: store.starts(new) == 0 and service["StatusText"].startswith("skin absent"),
+                service,
+            )
             service.kill("SIGKILL")
             service.until("NRestarts", str(i + 1))
         wait_for(lambda: store.starts(new) == 0, service)
@@ -251,9 +280,12 @@ def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) ->
         time.sleep(0.1)
 
 
-def test_a_candidate_classifies_beside_and_becomes_the_one(machine: Machine, service: Service, store: DeliveredStore):
-    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status` and `palpate
-    bundles` show its figures; once promoted it is on trial, and no longer in the shadow."""
+def test_a_candidate_classifies_beside_and_becomes_the_one(
+    machine: Machine, service: Service, store: DeliveredStore
+):
+    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status`
+    and `palpate bundles` show its figures; once promoted it is on trial, and no longer in the
+    shadow."""
     new = store.deploy("--shadow")
     assert store.current == store.a
     service.start(RUN)

@@ -1,4 +1,5 @@
-"""The page's unit under a real systemd, in a container: off at first, hardened, over TLS with the install's token."""
+"""The page's unit under a real systemd, in a container: off at first, hardened, over TLS with the
+install's token."""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def page(machine: Machine, service: Service) -> Iterator[Machine]:
 
 
 def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
-    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install does not enable it."""
+    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install
+    does not enable it."""
     place = nspawn.PLACES[f"{UNIT}.service"]
     done = machine.run("systemd-analyze", "verify", place)
     assert (done.returncode, done.stderr) == (0, "")
@@ -60,7 +62,8 @@ def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]
 
 
 def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
-    """Over TLS with the certificate that was made there: the box's name, state and verdicts come through."""
+    """Over TLS with the certificate that was made there: the box's name, state and verdicts come
+    through."""
     found = json.loads(page.get("/opt/palpate/bin/python", "-c", ASK))
     assert found["hello"]["source"] == "sim"
     assert found["box"] == {"there": True, "why": ""}
@@ -72,14 +75,17 @@ def test_it_goes_on_without_the_service(page: Machine, service: Service):
     """The service stops under it: the page says so, and is there when it starts again."""
     before = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
     page.get("systemctl", "stop", "palpate")
-    assert json.loads(page.get("/opt/palpate/bin/python", "-c", ASK, "away"))["box"]["there"] is False
+    assert (
+        json.loads(page.get("/opt/palpate/bin/python", "-c", ASK, "away"))["box"]["there"] is False
+    )
     page.get("systemctl", "start", "palpate")
     assert json.loads(page.get("/opt/palpate/bin/python", "-c", ASK))["box"]["there"] is True
     assert page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID") == before
 
 
 def test_the_token_is_for_root_and_the_page_alone(page: Machine):
-    """Another user reads neither token nor key, nor the feed; the page reads nothing of what the service keeps."""
+    """Another user reads neither token nor key, nor the feed; the page reads nothing of what the
+    service keeps."""
     other = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "cat")
     for name in ("token", "key.pem", "certificate.pem"):
         path = f"/etc/palpate/watch/{name}"
@@ -92,9 +98,17 @@ def test_the_token_is_for_root_and_the_page_alone(page: Machine):
     )
     assert uid == page.get("id", "-u", UNIT)
     inside = page.run(
-        "nsenter", "-t", pid, "-m", "setpriv", f"--reuid={uid}", f"--regid={uid}", f"--groups={groups.replace(' ', ',')}",
-        "ls", "/var/lib/palpate",
-    )  # fmt: skip
+        "nsenter",
+        "-t",
+        pid,
+        "-m",
+        "setpriv",
+        f"--reuid={uid}",
+        f"--regid={uid}",
+        f"--groups={groups.replace(' ', ',')}",
+        "ls",
+        "/var/lib/palpate",
+    )
     assert inside.returncode != 0
     assert "Permission denied" in inside.stderr
 
@@ -104,7 +118,11 @@ def test_without_a_token_it_does_not_start_on_the_network(machine: Machine, serv
     machine.run("rm", "-rf", "/etc/palpate/watch")
     machine.put(SITE, '[watch]\naddress = "0.0.0.0"\n')
     machine.get("systemctl", "start", UNIT)
-    machine.get("sh", "-c", f"for i in $(seq 60); do systemctl is-failed -q {UNIT} && exit; sleep 0.5; done; exit 1")
+    machine.get(
+        "sh",
+        "-c",
+        f"for i in $(seq 60); do systemctl is-failed -q {UNIT} && exit; sleep 0.5; done; exit 1",
+    )
     assert machine.get("systemctl", "show", UNIT, "--value", "-p", "ExecMainStatus") == "78"
     journal = machine.get("journalctl", "-q", "-u", UNIT, "-o", "cat")
     assert "/etc/palpate/watch/token cannot be read" in journal

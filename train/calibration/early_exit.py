@@ -1,7 +1,9 @@
-"""Early decisions. In: an embedding of each tenth of a sweep. Out: a head for each tenth, and the rule.
+"""Early decisions. In: an embedding of each tenth of a sweep. Out: a head for each tenth, and the
+rule.
 
-The box asks after each tenth of the window; it decides when the last few heads agree and the newest is certain enough.
-The probability required is found on sweeps that the heads did not see; where these do not support one there is no rule.
+The box asks after each tenth of the window; it decides when the last few heads agree and the newest
+is certain enough. The probability required is found on sweeps that the heads did not see; where
+these do not support one there is no rule.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ MAX_SHARE = 0.95
 
 @dataclass(frozen=True)
 class Heads:
-    """One linear head for each step: logits = z @ weight + bias. weight: float32 [D, r, K]; bias: float32 [D, K]."""
+    """One linear head for each step: logits = z @ weight + bias. weight: float32 [D, r, K]; bias:
+    float32 [D, K]."""
 
     weight: Array
     bias: Array
@@ -47,15 +50,17 @@ class Heads:
     def cooled(self, temperatures: Array) -> Heads:
         """The same, divided by the temperature of each step [D]."""
         by = np.asarray(temperatures)[:, None]
-        return Heads((self.weight / by[..., None]).astype(np.float32), (self.bias / by).astype(np.float32))
+        return Heads(
+            (self.weight / by[..., None]).astype(np.float32), (self.bias / by).astype(np.float32)
+        )
 
 
 @dataclass(frozen=True)
 class EarlyRule:
     """What was found. early: for the manifest; None where there is no rule, and then `why`.
 
-    share: mean share of the sweep that it needs; lost: share of sweeps that it turns from right to wrong, both on the
-    sweeps it was found on; n: their number.
+    share: mean share of the sweep that it needs; lost: share of sweeps that it turns from right to
+    wrong, both on the sweeps it was found on; n: their number.
     """
 
     early: Early | None
@@ -66,7 +71,8 @@ class EarlyRule:
 
 
 def heads(z: Array, labels: Array, classes: int) -> Heads:
-    """Heads for all rows but the last of the embeddings z [N, D + 1, r]: shrinkage LDA with equal priors, temperature 1.
+    """Heads for all rows but the last of the embeddings z [N, D + 1, r]: shrinkage LDA with equal
+    priors, temperature 1.
 
     A label without a sweep among `labels` gets logits far below all others.
     """
@@ -75,15 +81,20 @@ def heads(z: Array, labels: Array, classes: int) -> Heads:
 
 
 def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
-    """Weight [F, K] and bias [K], float32, of shrinkage LDA with equal priors on x [N, F]; labels without a sweep as in
-    `heads`."""
+    """Weight [F, K] and bias [K], float32, of shrinkage LDA with equal priors on x [N, F]; labels
+    without a sweep as in `heads`."""
     present = np.unique(labels)
     weight, bias = np.zeros((x.shape[1], classes), np.float32), np.full(classes, ABSENT, np.float32)
     prior = np.full(len(present), 1 / len(present))
-    fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior).fit(x, labels)
+    fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior).fit(
+        x, labels
+    )
     coefficients, intercepts = fitted.coef_, fitted.intercept_
     if len(present) == 2:  # of two labels scikit-learn gives only the difference
-        coefficients, intercepts = np.vstack([0 * coefficients, coefficients]), np.append(0, intercepts)
+        coefficients, intercepts = (
+            np.vstack([0 * coefficients, coefficients]),
+            np.append(0, intercepts),
+        )
     weight[:, present], bias[present] = coefficients.T, intercepts
     return weight, bias
 
@@ -91,17 +102,20 @@ def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
 def cross_fitted_logits(
     tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
 ) -> tuple[Array, Array]:
-    """Logits [n, D + 1, K], temperature 1, of each step and the whole sweep, and the numbers [n] of their sweeps.
+    """Logits [n, D + 1, K], temperature 1, of each step and the whole sweep, and the numbers [n] of
+    their sweeps.
 
-    tenths: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding and heads that did not
-    see its group (int [N]); sweeps of a material that occurs in no other part are left out.
-    Raises FormatError as novelty.parts.
+    tenths: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding and
+    heads that did not see its group (int [N]); sweeps of a material that occurs in no other part
+    are left out. Raises FormatError as novelty.parts.
     """
     classes, logits, numbers = int(labels.max()) + 1, [], []
     for fit, judges in parts(groups, judged):
         embedding, present = embed_present(tenths[fit, -1], labels[fit], fixed)
         judges = judges[np.isin(labels[judges], present)]
-        steps = heads(embedding(tenths[fit]), labels[fit], classes).logits(embedding(tenths[judges]))
+        steps = heads(embedding(tenths[fit]), labels[fit], classes).logits(
+            embedding(tenths[judges])
+        )
         whole = np.full((len(judges), 1, classes), ABSENT)
         whole[:, 0, present] = embedding.logits(tenths[judges, -1])
         logits.append(np.concatenate([steps, whole], axis=1))
@@ -110,15 +124,17 @@ def cross_fitted_logits(
 
 
 def fit_temperatures(logits: Array, labels: Array, groups: Array) -> Array:
-    """One for each step and the whole: logits [n, D + 1, K] of sweeps that the heads did not see -> [D + 1]."""
+    """One for each step and the whole: logits [n, D + 1, K] of sweeps that the heads did not see ->
+    [D + 1]."""
     return np.array([fit_temperature(step, labels, groups) for step in logits.swapaxes(0, 1)])
 
 
 def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
-    """What the box answers, and when: probabilities [n, D + 1, K] -> labels [n], share of the sweep [n].
+    """What the box answers, and when: probabilities [n, D + 1, K] -> labels [n], share of the sweep
+    [n].
 
-    As the appliance's inference.early_exit decides, for many sweeps at once; the last row, the whole window, always
-    decides.
+    As the appliance's inference.early_exit decides, for many sweeps at once; the last row, the
+    whole window, always decides.
     """
     n, steps, _ = probabilities.shape
     label, certain = probabilities.argmax(2), probabilities.max(2) >= np.append(early.least, 0)
@@ -129,18 +145,26 @@ def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
 
 
 def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
-    """The rule that needs the least of the sweep, found on probabilities [n, D + 1, K] of sweeps that the heads did not
-    see.
+    """The rule that needs the least of the sweep, found on probabilities [n, D + 1, K] of sweeps
+    that the heads did not see.
 
-    For each number of steps that must agree, levels are tried from the strictest on, and none after the first that turns
-    more than MAX_LOSS of the sweeps from right to wrong: a looser one that seems to do better does so by chance (fixed
-    sequence testing; Maurer et al. 1995).
+    For each number of steps that must agree, levels are tried from the strictest on, and none after
+    the first that turns more than MAX_LOSS of the sweeps from right to wrong: a looser one that
+    seems to do better does so by chance (fixed sequence testing; Maurer et al. 1995).
     """
     if (n := len(labels)) < MIN_SWEEPS:
-        return EarlyRule(None, f"{n} sweeps were held out, and a rule needs at least {MIN_SWEEPS}; record more", n=n)
+        return EarlyRule(
+            None,
+            f"{n} sweeps were held out, and a rule needs at least {MIN_SWEEPS}; record more",
+            n=n,
+        )
     right = probabilities[:, -1].argmax(1) == labels
-    best = EarlyRule(None, f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {MAX_LOSS:.1%} of {n} "
-                     "held-out sweeps wrong", n=n)  # fmt: skip
+    best = EarlyRule(
+        None,
+        f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {MAX_LOSS:.1%} of {n} "
+        "held-out sweeps wrong",
+        n=n,
+    )
     for agree in AGREE:
         for level in LEVELS:
             early = Early((level,) * (probabilities.shape[1] - 1), agree)

@@ -1,8 +1,9 @@
-"""Sweeps of a moved skin. In: features of augmented copies of sweeps. Out: their distances, and the rule for them.
+"""Sweeps of a moved skin. In: features of augmented copies of sweeps. Out: their distances, and the
+rule for them.
 
-A skin that was put back elsewhere changes a known material more than another material would. Where the contact shows that
-it has moved, distances are therefore measured as augmented copies of the training sweeps scatter, and certainty as copies
-of held-out sweeps are named rightly.
+A skin that was put back elsewhere changes a known material more than another material would. Where
+the contact shows that it has moved, distances are therefore measured as augmented copies of the
+training sweeps scatter, and certainty as copies of held-out sweeps are named rightly.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from train.models.compact.augment import Augmentation
 
 Array = NDArray[Any]
 MOST_WRONG = 0.0125
-"""Share of held-out copies that may be named wrongly with status ok. Heads that have learnt from copies name these better than
-sweeps of a skin that really moved: with .0125 a fit for a skin that is put back names 4 % of sim:T-HARD:201-236:2 wrongly."""
+"""Share of held-out copies that may be named wrongly with status ok. Heads that have learnt from
+copies name these better than sweeps of a skin that really moved: with .0125 a fit for a skin that
+is put back names 4 % of sim:T-HARD:201-236:2 wrongly."""
 UNSURE = np.arange(50, 100) / 100
 """Least probabilities that a moved sweep may need."""
 NEVER = 1.01
@@ -33,9 +35,9 @@ NEVER = 1.01
 class AugmentedCopies:
     """The sweeps again, augmented: features [M, F], labels [M], groups [M].
 
-    They show the head that names the material how materials vary. The embedding does not see them: with them an unknown
-    material would lie among the known ones. held: bool [M], those of sweeps that the trunk did not see; no head is fitted
-    to them, they judge.
+    They show the head that names the material how materials vary. The embedding does not see them:
+    with them an unknown material would lie among the known ones. held: bool [M], those of sweeps
+    that the trunk did not see; no head is fitted to them, they judge.
     """
 
     features: Array
@@ -45,7 +47,9 @@ class AugmentedCopies:
 
     def take(self, index: Array) -> AugmentedCopies:
         """Those that `index` (bool [M]) names."""
-        return AugmentedCopies(self.features[index], self.labels[index], self.groups[index], self.held[index])
+        return AugmentedCopies(
+            self.features[index], self.labels[index], self.groups[index], self.held[index]
+        )
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,16 @@ class MovedFit:
     def classes(self, classes: Classes) -> Classes:
         """`classes` of the embedding z, with those of moved sweeps."""
         turned = self.turned
-        return replace(classes, moved=MovedClasses(turned.projection, turned.means - turned.offset, turned.shapes))
+        return replace(
+            classes,
+            moved=MovedClasses(turned.projection, turned.means - turned.offset, turned.shapes),
+        )
 
 
 def displaced(augmentation: Augmentation) -> Augmentation:
-    """What a skin that was put back elsewhere changes: an augmentation without what is no matter of its place. With noise and
-    dead taxels in them, copies are named so much worse than any moved skin that certainty limited by them says nothing."""
+    """What a skin that was put back elsewhere changes: an augmentation without what is no matter of
+    its place. With noise and dead taxels in them, copies are named so much worse than any moved
+    skin that certainty limited by them says nothing."""
     return replace(augmentation, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0, clipped=0.0)
 
 
@@ -72,15 +80,20 @@ def fit_moved(
 ) -> MovedFit | None:
     """The rule for moved sweeps; None where there are no copies to fit it or to judge by.
 
-    whole, labels, judged: features [N, F], labels [N] and bool [N] as for posthoc.fit_posthoc. logits: [m, K] of the
-    copies that are held out, calibrated for sweeps in place, by a head that saw none of their groups.
+    whole, labels, judged: features [N, F], labels [N] and bool [N] as for posthoc.fit_posthoc.
+    logits: [m, K] of the copies that are held out, calibrated for sweeps in place, by a head that
+    saw none of their groups.
     """
     fitted, judging = copied.take(~copied.held), copied.take(copied.held)
-    if not len(judging.labels) or min(len(np.unique(of)) for of in (fitted.labels, labels[~judged])) <= labels.max():
+    if (
+        not len(judging.labels)
+        or min(len(np.unique(of)) for of in (fitted.labels, labels[~judged])) <= labels.max()
+    ):
         return None
 
     def turn(fit: Array) -> tuple[Embedding, Embedding]:
-        """An embedding fitted to the sweeps `fit`, bool [N], and that of what it makes of the copies."""
+        """An embedding fitted to the sweeps `fit`, bool [N], and that of what it makes of the
+        copies."""
         z = embed(whole[fit], labels[fit], fixed)
         return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
 
@@ -90,5 +103,10 @@ def fit_moved(
     temperature = fit_temperature(logits, judging.labels, judging.groups)
     p = softmax(logits / temperature)
     wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)
-    enough = [float(level) for level in UNSURE if np.mean(wrong & (p.max(1) >= level)) <= MOST_WRONG]
-    return MovedFit(turn(np.ones(len(labels), bool))[1], Moved(beyond, temperature, enough[0] if enough else NEVER))
+    enough = [
+        float(level) for level in UNSURE if np.mean(wrong & (p.max(1) >= level)) <= MOST_WRONG
+    ]
+    return MovedFit(
+        turn(np.ones(len(labels), bool))[1],
+        Moved(beyond, temperature, enough[0] if enough else NEVER),
+    )

@@ -1,8 +1,10 @@
-"""Detection of unknown materials. In: features of sweeps, labels, groups. Out: an Embedding, the limit of its distances.
+"""Detection of unknown materials. In: features of sweeps, labels, groups. Out: an Embedding, the
+limit of its distances.
 
-The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps of every material
-scatter around its mean with covariance 1. The nearest mean names the material, as LDA does, and a sweep far from all of
-them is of an unknown material. The box needs only this map and the means.
+The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps
+of every material scatter around its mean with covariance 1. The nearest mean names the material, as
+LDA does, and a sweep far from all of them is of an unknown material. The box needs only this map
+and the means.
 """
 
 from __future__ import annotations
@@ -23,23 +25,28 @@ from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 KEPT = 0.985
-"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the network gave
-(docs/decisions/0006)."""
+"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the
+network gave (docs/decisions/0006)."""
 PARTS = 10
-"""Into how many parts groups are divided at most; each part is judged by what was fitted to the others."""
+"""Into how many parts groups are divided at most; each part is judged by what was fitted to the
+others."""
 FLAT = 1e-9
-"""Least variance of a direction, relative to that of the widest one: a silent channel stays finite."""
+"""Least variance of a direction, relative to that of the widest one: a silent channel stays
+finite."""
 
 
 @dataclass(frozen=True)
 class Embedding:
-    """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each label.
+    """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each
+    label.
 
-    The projection [F, r] is in two parts, for most of it only selects: directions [F, d] and the last F' features as they
-    are, side by side, times turn [d + F', r]. F' is 0 where that would save nothing.
+    The projection [F, r] is in two parts, for most of it only selects: directions [F, d] and the
+    last F' features as they are, side by side, times turn [d + F', r]. F' is 0 where that would
+    save nothing.
 
-    The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et al. 2018). shapes:
-    float16 [K, b, b], how each material's own sweeps scatter in the last b directions; see the box's shaped_distances.
+    The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et
+    al. 2018). shapes: float16 [K, b, b], how each material's own sweeps scatter in the last b
+    directions; see the box's shaped_distances.
     """
 
     directions: Array
@@ -75,42 +82,57 @@ class Embedding:
     def classes(self) -> Classes:
         """The means as a bundle holds them, each counted as trained."""
         bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
-        return Classes(self.means, bias.astype(np.float32), np.zeros(k, np.int64), np.ones(k, np.float32), self.shapes)
+        return Classes(
+            self.means,
+            bias.astype(np.float32),
+            np.zeros(k, np.int64),
+            np.ones(k, np.float32),
+            self.shapes,
+        )
 
     def novelty(self, features: Array) -> Array:
-        """Squared distance [...] of features [..., F] to the nearest mean, each material's scatter being its own: what the
-        limit is compared with."""
+        """Squared distance [...] of features [..., F] to the nearest mean, each material's scatter
+        being its own: what the limit is compared with."""
         away = self(features)[..., None, :] - self.means.astype(np.float64)
         nearest: Array = shaped_distances(away, self.shapes.astype(np.float64)).min(axis=-1)
         return nearest
 
     def logits(self, features: Array, temperature: float = 1.0) -> Array:
-        """Features [..., F] -> logits [..., K] of LDA with equal priors, up to a term that all labels share."""
+        """Features [..., F] -> logits [..., K] of LDA with equal priors, up to a term that all
+        labels share."""
         means = self.means.astype(np.float64)
         logits: Array = (self(features) @ means.T - (means**2).sum(1) / 2) / temperature
         return logits
 
 
 def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
-    """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 + fixed, F) directions.
+    """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 +
+    fixed, F) directions.
 
-    The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1 directions hold everything
-    that LDA uses; more are added until the last `fixed` features, which were not trained (see spectrum.py), are in it
-    completely: trained materials do not differ there, but an unknown one may. There each material has its own shape.
-    Raises FormatError where there is one material, a label is missing, or each material has only one sweep.
+    The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1
+    directions hold everything that LDA uses; more are added until the last `fixed` features, which
+    were not trained (see spectrum.py), are in it completely: trained materials do not differ there,
+    but an unknown one may. There each material has its own shape. Raises FormatError where there is
+    one material, a label is missing, or each material has only one sweep.
     """
     labels = np.asarray(labels)
     if len(missing := np.setdiff1d(np.arange(labels.max(initial=0) + 1), labels)):
-        raise FormatError(f"no sweep has the label {missing[0]}; number the materials that occur from 0 on")
+        raise FormatError(
+            f"no sweep has the label {missing[0]}; number the materials that occur from 0 on"
+        )
     if (classes := int(labels.max(initial=0)) + 1) < 2:
         raise FormatError("all sweeps are of one material; a classifier needs two")
     if len(labels) <= classes:
-        raise FormatError(f"{len(labels)} sweeps of {classes} materials say nothing of how they vary; record more")
+        raise FormatError(
+            f"{len(labels)} sweeps of {classes} materials say nothing of how they vary; record more"
+        )
     x = np.asarray(features, np.float64)
     middle, size = x.mean(axis=0), x.shape[1]
     means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
     white = _whitening(x, labels)
-    axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][: classes - 1].T
+    axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][
+        : classes - 1
+    ].T
     orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
     if fixed and classes - 1 + fixed < size:  # what is whitened after its inverse is as it was
         directions, turn = white.apply(axes), np.linalg.inv(mixed)
@@ -124,14 +146,17 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     own = min(fixed, projection.shape[1])
     away = ((x - middle) @ projection - means[labels])[:, projection.shape[1] - own :]
     shapes = np.stack([_shape(away[labels == k]) for k in range(classes)])
-    return replace(bare, offset=(-middle @ projection).astype(np.float32), means=means, shapes=shapes)
+    return replace(
+        bare, offset=(-middle @ projection).astype(np.float32), means=means, shapes=shapes
+    )
 
 
 def _shape(away: Array) -> Array:
-    """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n, b] from a class mean.
+    """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n,
+    b] from a class mean.
 
-    The covariance is that of the class's own sweeps, pulled towards 1, that of all classes, as if b more sweeps had it
-    (regularized discriminant analysis; Friedman 1989).
+    The covariance is that of the class's own sweeps, pulled towards 1, that of all classes, as if b
+    more sweeps had it (regularized discriminant analysis; Friedman 1989).
     """
     n, b = away.shape
     covariance = (away.T @ away + b * np.eye(b)) / (n + b) if b else np.eye(0)
@@ -140,17 +165,20 @@ def _shape(away: Array) -> Array:
 
 
 def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
-    """The Embedding of sweeps among which a label may be missing, and the labels [K] of its means."""
+    """The Embedding of sweeps among which a label may be missing, and the labels [K] of its
+    means."""
     present, numbered = np.unique(labels, return_inverse=True)
     return embed(features, numbered, fixed), present
 
 
 @dataclass(frozen=True)
 class _Whitening:
-    """W [F, F] with W' C W = 1, C being the covariance within materials: a diagonal matrix and that of a few directions.
+    """W [F, F] with W' C W = 1, C being the covariance within materials: a diagonal matrix and that
+    of a few directions.
 
-    C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of R. directions: V [F, n],
-    orthonormal; variances: the diagonal [n] of S. Nothing of the size [F, F] is computed where there are fewer sweeps.
+    C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of
+    R. directions: V [F, n], orthonormal; variances: the diagonal [n] of S. Nothing of the size [F,
+    F] is computed where there are fewer sweeps.
     """
 
     root: Array
@@ -177,8 +205,9 @@ class _Whitening:
 
 
 def _whitening(x: Array, labels: Array) -> _Whitening:
-    """Of the covariance that LinearDiscriminantAnalysis(shrinkage="auto") has: Ledoit and Wolf's of each material's features
-    [n, F], scaled to the same spread, and their mean, each as often as it occurs."""
+    """Of the covariance that LinearDiscriminantAnalysis(shrinkage="auto") has: Ledoit and Wolf's of
+    each material's features [n, F], scaled to the same spread, and their mean, each as often as it
+    occurs."""
     diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
@@ -194,18 +223,22 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
     variances, vectors = np.linalg.eigh(scattered @ scattered.T if few else scattered.T @ scattered)
     seen = variances > FLAT * max(float(variances.max()), FLAT)
     variances, vectors = variances[seen], vectors[:, seen]
-    return _Whitening(root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances)
+    return _Whitening(
+        root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances
+    )
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:
     """Pairs (bool [N] to fit on, numbers of the sweeps that then judge).
 
-    Each sweep of `judged` (bool [N]) judges once, what was fitted without its group. groups: int [N], divided into `most`
-    parts at most. Raises FormatError where there is only one group.
+    Each sweep of `judged` (bool [N]) judges once, what was fitted without its group. groups: int
+    [N], divided into `most` parts at most. Raises FormatError where there is only one group.
     """
     values = np.unique(groups[judged])
     if len(np.unique(groups)) < 2:
-        raise FormatError("all sweeps are of one group; what judges must not be trained on; record a second position")
+        raise FormatError(
+            "all sweeps are of one group; what judges must not be trained on; record a second position"
+        )
     part_of = np.full(len(groups), -1)
     judging = np.isin(groups, values)
     part_of[judging] = np.searchsorted(values, groups[judging]) % min(most, len(values))
@@ -213,10 +246,14 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
         yield part_of != part, np.flatnonzero((part_of == part) & judged)
 
 
-def cross_fitted_distances(features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0) -> Array:
-    """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups (int [N]); NaN of the others.
+def cross_fitted_distances(
+    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+) -> Array:
+    """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups
+    (int [N]); NaN of the others.
 
-    Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts` and `embed`.
+    Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts`
+    and `embed`.
     """
     distances = np.full(len(labels), np.nan)
     for fit, numbers in parts(groups, judged):
@@ -227,26 +264,32 @@ def cross_fitted_distances(features: Array, labels: Array, groups: Array, judged
 
 
 def limit(novelty: Array, kept: float = KEPT) -> float:
-    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not trained on; NaN is left out.
+    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not
+    trained on; NaN is left out.
 
-    The ceil((n + 1) * kept)-th smallest, as split conformal prediction takes it, so that a new sweep is kept with at
-    least that probability (Vovk et al. 2005); the largest where n is too small for it.
-    Raises FormatError where there is none.
+    The ceil((n + 1) * kept)-th smallest, as split conformal prediction takes it, so that a new
+    sweep is kept with at least that probability (Vovk et al. 2005); the largest where n is too
+    small for it. Raises FormatError where there is none.
     """
     novelty = novelty[~np.isnan(novelty)]
     if not (n := len(novelty)):
-        raise FormatError("no known sweep is left to find the limit with; record each material in several positions")
+        raise FormatError(
+            "no known sweep is left to find the limit with; record each material in several positions"
+        )
     rank = min(int(np.ceil((n + 1) * kept)), n) - 1
     return float(max(np.sort(novelty)[rank], np.finfo(np.float32).tiny))
 
 
 def auroc(known: Array, unknown: Array) -> float:
-    """The probability that a novelty of `unknown` [m] is above one of `known` [n], ties half (Mann and Whitney).
+    """The probability that a novelty of `unknown` [m] is above one of `known` [n], ties half (Mann
+    and Whitney).
 
     Raises FormatError where there is none of either.
     """
     if not len(known) or not len(unknown):
-        raise FormatError("no AUROC without sweeps of both kinds; test on known and on unknown ones")
+        raise FormatError(
+            "no AUROC without sweeps of both kinds; test on known and on unknown ones"
+        )
     order = np.sort(known)
     below = np.searchsorted(order, unknown, "left") + np.searchsorted(order, unknown, "right")
     return float(below.mean() / (2 * len(known)))

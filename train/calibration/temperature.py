@@ -1,7 +1,8 @@
-"""Temperature scaling. In: logits of sweeps that the head did not see, their labels and groups. Out: a temperature.
+"""Temperature scaling. In: logits of sweeps that the head did not see, their labels and groups.
+Out: a temperature.
 
-The temperature is only as high as these sweeps demand: where they do not show that a head is too certain, it stays 1, so
-that scaling makes no calibrated head worse.
+The temperature is only as high as these sweeps demand: where they do not show that a head is too
+certain, it stays 1, so that scaling makes no calibrated head worse.
 """
 
 from __future__ import annotations
@@ -16,17 +17,20 @@ from train.models.linear_head import TEMPERATURES
 
 Array = NDArray[Any]
 SLACK = 0.5
-"""Standard errors by which the log loss may be above the least. With 0, four of fourteen calibrated heads were made worse by
-more than a tenth of a point (simulated, seeds 301 to 316); with 1, heads that judge four positions stay too sure."""
+"""Standard errors by which the log loss may be above the least. With 0, four of fourteen calibrated
+heads were made worse by more than a tenth of a point (simulated, seeds 301 to 316); with 1, heads
+that judge four positions stay too sure."""
 
 
 def fit_temperature(logits: Array, labels: Array, groups: Array) -> float:
-    """The least of TEMPERATURES, a divisor of `logits` [n, K], whose log loss on `labels` [n] is within SLACK standard errors
-    of the least loss (after the one-standard-error rule; Breiman et al. 1984).
+    """The least of TEMPERATURES, a divisor of `logits` [n, K], whose log loss on `labels` [n] is
+    within SLACK standard errors of the least loss (after the one-standard-error rule; Breiman et
+    al. 1984).
 
-    The error is that of a mean over groups [n], whose sweeps are right or wrong together; over sweeps where there is one.
-    Platt's correction is not made: logits of a good head are so large that its small share of wrong answers would cost
-    more than all others, and the temperature would be three times too high.
+    The error is that of a mean over groups [n], whose sweeps are right or wrong together; over
+    sweeps where there is one. Platt's correction is not made: logits of a good head are so large
+    that its small share of wrong answers would cost more than all others, and the temperature would
+    be three times too high.
     """
     if len(np.unique(groups)) < 2:
         groups = np.arange(len(labels))

@@ -45,7 +45,11 @@ def register(add: Add) -> None:
     """fit, export, pack, score, parity, references."""
     _add_fit(add)
     _add_bundles(add)
-    score = add("score", run_score, "run a set through the box's classifier with a bundle, and print what it named")
+    score = add(
+        "score",
+        run_score,
+        "run a set through the box's classifier with a bundle, and print what it named",
+    )
     score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(score)
     score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
@@ -54,7 +58,9 @@ def register(add: Add) -> None:
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
         "show what int8 changes in a model's answers, and in each tensor",
     )
-    parity.add_argument("model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form")
+    parity.add_argument(
+        "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form"
+    )
     options.add_set(parity)
     parity.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
 
@@ -69,23 +75,47 @@ def _add_fit(add: Add) -> None:
         required=True,
         help="of the training, and of simulated sets that name none",
     )
-    command.add_argument("--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)")
-    command.add_argument("--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7")
-    command.add_argument("--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set")
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
+    )
+    command.add_argument(
+        "--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7"
+    )
+    command.add_argument(
+        "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
+    )
     command.add_argument(
         "--steps",
         type=numbers.whole("--steps", 0),
         default=STEPS,
         help=f"of training of stages (default {STEPS}; 0 for none)",
     )
-    command.add_argument("--row-shift", type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"), metavar="SHARE", dest="moved",
-                     help="share of training sweeps whose skin is moved by up to a row (default 0.5)")  # fmt: skip
-    command.add_argument("--stretch", type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"), metavar="SHARE",
-                     help="change the speed of training sweeps by up to this share (default 0)")  # fmt: skip
-    command.add_argument("--mains", type=int, choices=MAINS, default=int(MAINS_HZ), metavar="HZ",
-                     help=f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum is not heard (default {MAINS_HZ:g})")  # fmt: skip
-    command.add_argument("--reattached", action="store_true",
-                     help="the skin will be taken off and put back after the recordings: all heads see copies that look so")  # fmt: skip
+    command.add_argument(
+        "--row-shift",
+        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
+        metavar="SHARE",
+        dest="moved",
+        help="share of training sweeps whose skin is moved by up to a row (default 0.5)",
+    )
+    command.add_argument(
+        "--stretch",
+        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
+        metavar="SHARE",
+        help="change the speed of training sweeps by up to this share (default 0)",
+    )
+    command.add_argument(
+        "--mains",
+        type=int,
+        choices=MAINS,
+        default=int(MAINS_HZ),
+        metavar="HZ",
+        help=f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum is not heard (default {MAINS_HZ:g})",
+    )
+    command.add_argument(
+        "--reattached",
+        action="store_true",
+        help="the skin will be taken off and put back after the recordings: all heads see copies that look so",
+    )
     command.add_argument(
         "--size",
         choices=[*ARCHITECTURES, "chosen"],
@@ -93,7 +123,9 @@ def _add_fit(add: Add) -> None:
         help="train a network of this size (default: filters, spectrum and stages as held-out groups ask for)",
     )
     command.add_argument(
-        "--keep-means", action="store_true", help="give the head each taxel's mean too, for comparison"
+        "--keep-means",
+        action="store_true",
+        help="give the head each taxel's mean too, for comparison",
     )
 
 
@@ -103,7 +135,9 @@ def _add_bundles(add: Add) -> None:
     export.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
     pack_command = add("pack", run_pack, "train any method and pack its bundle")
     options.add_set(pack_command)
-    pack_command.add_argument("--method", required=True, metavar="NAME", help="see palpate-train methods")
+    pack_command.add_argument(
+        "--method", required=True, metavar="NAME", help="see palpate-train methods"
+    )
     pack_command.add_argument(
         "--seed",
         type=numbers.whole("--seed", 0),
@@ -113,7 +147,11 @@ def _add_bundles(add: Add) -> None:
     options.add_effort(pack_command)
     for command in (export, pack_command):
         command.add_argument(
-            "--out", type=Path, required=True, metavar="DIR", help="the bundle; replaced if it is there"
+            "--out",
+            type=Path,
+            required=True,
+            metavar="DIR",
+            help="the bundle; replaced if it is there",
         )
         command.add_argument("--name", required=True)
         command.add_argument("--version", required=True)
@@ -127,7 +165,9 @@ def _add_bundles(add: Add) -> None:
             type=numbers.above_zero("--pitch-mm"),
             help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
         )
-    references = add("references", run_references, "write the models that palpate bench times beside the bundle")
+    references = add(
+        "references", run_references, "write the models that palpate bench times beside the bundle"
+    )
     references.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
@@ -152,7 +192,9 @@ def run_fit(args: argparse.Namespace) -> None:
     _print_held_out(made)
     if args.rest and rest:
         command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
-        print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}")
+        print(
+            f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}"
+        )
     print(options.report_line(args.out, str(args.rest or "")))
 
 
@@ -161,9 +203,13 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
 
     Raises FormatError where they contradict one another.
     """
-    changes = {name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None}
+    changes = {
+        name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None
+    }
     architecture = replace(ARCHITECTURES.get(args.size, recipe.FIXED), mains_hz=float(args.mains))
-    augmentation = replace(default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes)
+    augmentation = replace(
+        default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes
+    )
     unfinished = _unfinished(args, sweeps, augmentation)
     if args.size in ARCHITECTURES:
         if args.reattached:
@@ -176,14 +222,22 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
             )
         from train.models.compact import fit  # here: the default recipe needs no PyTorch
 
-        trained = fit.FitRecipe(steps=args.steps, augmentation=augmentation, keep_means=args.keep_means)
-        return fit.fit(sweeps, args.seed, trained, options.Log(), architecture, unfinished), unfinished
+        trained = fit.FitRecipe(
+            steps=args.steps, augmentation=augmentation, keep_means=args.keep_means
+        )
+        return fit.fit(
+            sweeps, args.seed, trained, options.Log(), architecture, unfinished
+        ), unfinished
     if args.keep_means:
         raise FormatError(
             f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
         )
     settings = recipe.Settings(
-        args.steps, augmentation, unfinished=unfinished, reattached=args.reattached, mains_hz=float(args.mains)
+        args.steps,
+        augmentation,
+        unfinished=unfinished,
+        reattached=args.reattached,
+        mains_hz=float(args.mains),
     )
     made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
@@ -191,9 +245,13 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
 
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:
-    """Where a training is kept until the fit is written: its name is a fingerprint of all that it depends on."""
+    """Where a training is kept until the fit is written: its name is a fingerprint of all that it
+    depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation), args.mains]
-    return CACHE / f"{fingerprint(about, 'train.models.compact.recipe', 'train.models.compact.fit')}.pt"
+    return (
+        CACHE
+        / f"{fingerprint(about, 'train.models.compact.recipe', 'train.models.compact.fit')}.pt"
+    )
 
 
 def _print_held_out(made: Fit) -> None:
@@ -211,7 +269,9 @@ def _print_held_out(made: Fit) -> None:
     try:
         _print_figures(pack.held_out_figures(calibrate(made).held, made, by))
     except FormatError as e:  # too few sweeps to judge by
-        print(f"{by}, network alone: {_text(made.about['validation'])}; nothing judges the box's answers: {e}")
+        print(
+            f"{by}, network alone: {_text(made.about['validation'])}; nothing judges the box's answers: {e}"
+        )
 
 
 def run_export(args: argparse.Namespace) -> None:
@@ -260,29 +320,42 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
 
 
 def _print(manifest: Manifest, out: Path) -> None:
-    """The figures of a bundle, and its size; why it is not in int8 or cannot tell contact, where it might."""
+    """The figures of a bundle, and its size; why it is not in int8 or cannot tell contact, where it
+    might."""
     if why := manifest.made.get("float_because"):
         print(f"in float, not int8, which takes more time: {why}")
     if why := manifest.made.get("contact_unknown_because"):
         print(f"no-contact cannot be told: {why}")
     _print_figures(manifest.figures)
-    if few := [f"{board} wires {bits}" for board, bits in _class_bits().items() if 1 << bits <= len(manifest.labels)]:
+    if few := [
+        f"{board} wires {bits}"
+        for board, bits in _class_bits().items()
+        if 1 << bits <= len(manifest.labels)
+    ]:
         needed = len(manifest.labels).bit_length()
-        print(f"answers on lines: {len(manifest.labels)} labels need {needed} of output.class_bits; {', '.join(few)}")
+        print(
+            f"answers on lines: {len(manifest.labels)} labels need {needed} of output.class_bits; {', '.join(few)}"
+        )
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def _class_bits() -> dict[str, int]:
     """How many lines each delivered board file wires for the class code."""
-    return {name: len(config.load(name, site=Path(os.devnull)).output.class_bits) for name in config.boards()}
+    return {
+        name: len(config.load(name, site=Path(os.devnull)).output.class_bits)
+        for name in config.boards()
+    }
 
 
 def _print_figures(figures: Mapping[str, dict[str, Any]]) -> None:
-    """Each accuracy on a line: as the box answers, with what it does not name, and of the network alone."""
+    """Each accuracy on a line: as the box answers, with what it does not name, and of the network
+    alone."""
     for protocol, figure in figures.items():
         if "wrong" in figure:
-            others = ", ".join(f"{figure[name]} {name}" for name in ("wrong", "unsure", "unknown", "refused"))
+            others = ", ".join(
+                f"{figure[name]} {name}" for name in ("wrong", "unsure", "unknown", "refused")
+            )
             print(f"{protocol}, as the box answers: {_text(figure)}; {others}")
         elif "accuracy" in figure:
             print(f"{protocol}: {_text(figure)}")
@@ -299,7 +372,9 @@ def _by_share(text: str) -> tuple[str, float]:
     try:
         return by, float(share)
     except ValueError:
-        raise FormatError(f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7") from None
+        raise FormatError(
+            f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7"
+        ) from None
 
 
 def _text(figure: dict[str, float]) -> str:

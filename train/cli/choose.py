@@ -29,26 +29,38 @@ Json = dict[str, Any]
 def register(add: Callable[..., argparse.ArgumentParser]) -> None:
     """The command, with its options."""
     command = add("choose", run, "pick the smallest model that a scene needs, and pack its bundle")
-    command.add_argument("--scene", type=Path, required=True, metavar="FILE", help="as docs/choose/tubes.toml")
-    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="the bundle; replaced if it is there")
     command.add_argument(
-        "--page", type=Path, metavar="DIR", help="for index.html and choice.json (DIR of --out + -why)"
+        "--scene", type=Path, required=True, metavar="FILE", help="as docs/choose/tubes.toml"
+    )
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="the bundle; replaced if it is there"
+    )
+    command.add_argument(
+        "--page",
+        type=Path,
+        metavar="DIR",
+        help="for index.html and choice.json (DIR of --out + -why)",
     )
     options.add_effort(command)
     options.add_where(command)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene, NothingFits where no model fits."""
+    """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene,
+    NothingFits where no model fits."""
     pack.check_target(args.out)
     page = args.page or args.out.with_name(f"{args.out.name}-why")
     options.writable(page / "choice.json", "--page")
     requested = scene.read(args.scene)
     sweeps = requested.sweeps()
     choice = select.choose(
-        sweeps, requested, options.effort(args), options.where(args), options.Log(),
+        sweeps,
+        requested,
+        options.effort(args),
+        options.where(args),
+        options.Log(),
         lambda trials: reduction_curves.most(trials, requested.reduce),
-    )  # fmt: skip
+    )
     curves, change, accuracy = reduction_curves.curves(choice, requested)
     result = choice.json(requested) | {"less": curves, "applied": asdict(change), "left": accuracy}
     result["bundle"] = _packed(args, requested, sweeps, result, change)
@@ -60,8 +72,11 @@ def run(args: argparse.Namespace) -> None:
     print(options.report_line(args.out))
 
 
-def _packed(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, result: Json, change: Change) -> Json:
-    """Pack the chosen method, on reduced sweeps where that passes the checks; the bundle's content and cost."""
+def _packed(
+    args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, result: Json, change: Change
+) -> Json:
+    """Pack the chosen method, on reduced sweeps where that passes the checks; the bundle's content
+    and cost."""
     (method,) = methods.find([result["chosen"]], options.effort(args))
     refused = ""
     if change != WHOLE:
@@ -73,22 +88,44 @@ def _packed(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, r
 
 
 def _pack(
-    args: argparse.Namespace, requested: scene.Scene, method: methods.Method, sweeps: Dataset, result: Json
+    args: argparse.Namespace,
+    requested: scene.Scene,
+    method: methods.Method,
+    sweeps: Dataset,
+    result: Json,
 ) -> Json:
     content = pack.trained(method, sweeps, 1)
     nested = result["honest"]
-    figure = {"accuracy": nested["mean"], "n": len(sweeps), "low": nested["low"], "high": nested["high"]}
-    content = replace(content, about=content.about | {"scene": requested.path.name},
-                      figures={"the choice, made without each part and tested on it": figure})  # fmt: skip
-    manifest = pack.pack(content, args.out, requested.name, requested.version, commit(), requested.full_scale or None)
+    figure = {
+        "accuracy": nested["mean"],
+        "n": len(sweeps),
+        "low": nested["low"],
+        "high": nested["high"],
+    }
+    content = replace(
+        content,
+        about=content.about | {"scene": requested.path.name},
+        figures={"the choice, made without each part and tested on it": figure},
+    )
+    manifest = pack.pack(
+        content, args.out, requested.name, requested.version, commit(), requested.full_scale or None
+    )
     (measurement,) = measure.measure_all([args.out], sweeps.samples)
     return _described(manifest, BundleCost.of(measurement), requested)
 
 
 def _described(manifest: Manifest, cost: BundleCost, requested: scene.Scene) -> Json:
     used = {k: round(v, 3) for k, v in cost.used(requested.budget).items()}
-    return {"name": manifest.name, "version": manifest.version, "format": manifest.format.json(), "ms": cost.ms,
-            "kb": cost.kb, "mb": cost.mb, "used": used, "figures": manifest.figures}  # fmt: skip
+    return {
+        "name": manifest.name,
+        "version": manifest.version,
+        "format": manifest.format.json(),
+        "ms": cost.ms,
+        "kb": cost.kb,
+        "mb": cost.mb,
+        "used": used,
+        "figures": manifest.figures,
+    }
 
 
 def _origin(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset) -> Json:
@@ -99,8 +136,17 @@ def _origin(args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset) -
     words += ["--effort", f"{effort.share:g}"] if effort.share != 1 else []
     budget = {k: v for k, v in vars(requested.budget).items() if v != float("inf")}
     return {
-        "scene": requested.name, "command": shlex.join(words), "set": sweeps.source, "digest": digest(sweeps), "sweeps": len(sweeps),
-        "format": sweeps.format.json(), "materials": list(sweeps.materials), "merge": dict(requested.merge),
-        "varies": list(requested.varies), "stress": dict(requested.stress), "budget": budget, "effort": effort.share,
+        "scene": requested.name,
+        "command": shlex.join(words),
+        "set": sweeps.source,
+        "digest": digest(sweeps),
+        "sweeps": len(sweeps),
+        "format": sweeps.format.json(),
+        "materials": list(sweeps.materials),
+        "merge": dict(requested.merge),
+        "varies": list(requested.varies),
+        "stress": dict(requested.stress),
+        "budget": budget,
+        "effort": effort.share,
         "seeds": list(range(1, requested.seeds + 1)),
-    } | score.provenance()  # fmt: skip
+    } | score.provenance()

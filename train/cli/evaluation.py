@@ -1,4 +1,5 @@
-"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, cnn-curve, alignment."""
+"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, cnn-curve,
+alignment."""
 
 from __future__ import annotations
 
@@ -24,7 +25,14 @@ from train.evaluation.corruptions import EvaluationSweeps
 from train.export import bundle_stress, contact_positions
 from train.metrics import score
 from train.models import methods
-from train.reports import contact_plot, contact_table, marked_text, provenance, stress_report, uncertainty_report
+from train.reports import (
+    contact_plot,
+    contact_table,
+    marked_text,
+    provenance,
+    stress_report,
+    uncertainty_report,
+)
 
 STRESSED = "sim:T-REAL:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
@@ -39,17 +47,32 @@ def register(add: Add) -> None:
     _add_stress(add)
     _add_certainty(add)
     calibrate = add(
-        "calibrate", run_calibrate, "compare the simulator with the twenty accuracies that the paper prints"
+        "calibrate",
+        run_calibrate,
+        "compare the simulator with the twenty accuracies that the paper prints",
     )
-    calibrate.add_argument("--seeds", type=numbers.span("--seeds", "201-208"), default=range(201, 209), metavar="FIRST-LAST",
-                           help="of the simulated worlds (201-208)")  # fmt: skip
-    calibrate.add_argument("--ablate", action="store_true", help="also without each of its effects in turn")
+    calibrate.add_argument(
+        "--seeds",
+        type=numbers.span("--seeds", "201-208"),
+        default=range(201, 209),
+        metavar="FIRST-LAST",
+        help="of the simulated worlds (201-208)",
+    )
+    calibrate.add_argument(
+        "--ablate", action="store_true", help="also without each of its effects in turn"
+    )
     calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     options.add_jobs(calibrate)
-    follow = add("cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin")
+    follow = add(
+        "cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin"
+    )
     follow.set_defaults(resumes=True)
-    follow.add_argument("--size", choices=("small", "whole"), default="small",
-                       help="small (a stand-in of a minute) or whole (an hour of one core)")  # fmt: skip
+    follow.add_argument(
+        "--size",
+        choices=("small", "whole"),
+        default="small",
+        help="small (a stand-in of a minute) or whole (an hour of one core)",
+    )
     follow.add_argument(
         "--seed",
         type=numbers.whole("--seed", 0),
@@ -57,10 +80,22 @@ def register(add: Add) -> None:
         metavar="N",
         help="of the simulated world and the training (1)",
     )
-    follow.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
-    follow.add_argument("--steps", type=numbers.whole("--steps", 1), metavar="N", help="iterations (those of the size)")
-    follow.add_argument("--out", type=Path, required=True, metavar="FILE",
-                       help="where the curve goes; an interrupted training goes on from there")  # fmt: skip
+    follow.add_argument(
+        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+    )
+    follow.add_argument(
+        "--steps",
+        type=numbers.whole("--steps", 1),
+        metavar="N",
+        help="iterations (those of the size)",
+    )
+    follow.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="where the curve goes; an interrupted training goes on from there",
+    )
     _add_alignment(add)
 
 
@@ -70,26 +105,58 @@ def _add_alignment(add: Add) -> None:
         run_alignment,
         "measure whether a skin that has moved is flagged before accuracy is lost (simulated)",
     )
-    alignment.add_argument("--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)")
-    alignment.add_argument("--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on")
-    alignment.add_argument("--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places")
-    alignment.add_argument("--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead")
-    alignment.add_argument("--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go")
     alignment.add_argument(
-        "--draw", action="store_true", help="measure nothing: picture and tables of place.json in --out again"
+        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
+    )
+    alignment.add_argument(
+        "--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on"
+    )
+    alignment.add_argument(
+        "--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places"
+    )
+    alignment.add_argument(
+        "--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead"
+    )
+    alignment.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go"
+    )
+    alignment.add_argument(
+        "--draw",
+        action="store_true",
+        help="measure nothing: picture and tables of place.json in --out again",
     )
 
 
 def _add_evaluate(add: Add) -> None:
     command = add("evaluate", run_evaluate, "train and test methods under a protocol")
     options.add_set(command)
-    command.add_argument("--protocol", action="append", required=True, metavar="PROTOCOL", dest="protocols",
-                     help="random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups out")  # fmt: skip
-    command.add_argument("--method", required=True, metavar="NAME[,NAME...]", help="or all; see palpate-train methods")
-    command.add_argument("--remove-means", action="store_true", help="take each window's mean away, taxel by taxel")
-    command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)")
-    command.add_argument("--each", type=int, default=0, metavar="N",
-                     help="train on N sweeps of each material, drawn by the seed: a point of a learning curve (all)")  # fmt: skip
+    command.add_argument(
+        "--protocol",
+        action="append",
+        required=True,
+        metavar="PROTOCOL",
+        dest="protocols",
+        help="random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups out",
+    )
+    command.add_argument(
+        "--method",
+        required=True,
+        metavar="NAME[,NAME...]",
+        help="or all; see palpate-train methods",
+    )
+    command.add_argument(
+        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+    )
+    command.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)"
+    )
+    command.add_argument(
+        "--each",
+        type=int,
+        default=0,
+        metavar="N",
+        help="train on N sweeps of each material, drawn by the seed: a point of a learning curve (all)",
+    )
     command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
     options.add_effort(command)
     options.add_where(command)
@@ -97,20 +164,43 @@ def _add_evaluate(add: Add) -> None:
 
 def _add_stress(add: Add) -> None:
     command = add(
-        "stress", run_stress, "test trained methods, and a bundle, on corrupted sweeps, one corruption at a time"
+        "stress",
+        run_stress,
+        "test trained methods, and a bundle, on corrupted sweeps, one corruption at a time",
     )
     options.add_set(command, "sim:T-REAL:1")
-    command.add_argument("--test", default=STRESSED, metavar="SET",
-                         help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})")  # fmt: skip
-    command.add_argument("--method", default=STRESSED_METHODS, metavar="NAME[,NAME...]",
-                         help=f"ours first; the first five are drawn; or all; see palpate-train methods ({STRESSED_METHODS})")  # fmt: skip
-    command.add_argument("--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)")
-    command.add_argument("--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)")
-    command.add_argument("--out", type=Path, default=Path("docs/stress"), metavar="DIR",
-                         help="for results.json, pictures and page (docs/stress)")  # fmt: skip
-    command.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
     command.add_argument(
-        "--draw", action="store_true", help="run nothing: draw the page of results.json in --out again"
+        "--test",
+        default=STRESSED,
+        metavar="SET",
+        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
+    )
+    command.add_argument(
+        "--method",
+        default=STRESSED_METHODS,
+        metavar="NAME[,NAME...]",
+        help=f"ours first; the first five are drawn; or all; see palpate-train methods ({STRESSED_METHODS})",
+    )
+    command.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
+    )
+    command.add_argument(
+        "--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)"
+    )
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("docs/stress"),
+        metavar="DIR",
+        help="for results.json, pictures and page (docs/stress)",
+    )
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
+    command.add_argument(
+        "--draw",
+        action="store_true",
+        help="run nothing: draw the page of results.json in --out again",
     )
     options.add_effort(command)
     options.add_where(command)
@@ -125,15 +215,29 @@ def _add_certainty(add: Add) -> None:
     options.add_set(command)
     command.add_argument("--test", metavar="SET", help="test on this set")
     command.add_argument(
-        "--protocol", default="leave:position", help="what is tested on where --test is not given (leave:position)"
+        "--protocol",
+        default="leave:position",
+        help="what is tested on where --test is not given (leave:position)",
     )
-    command.add_argument("--method", default=methods.SHIPPED, metavar="NAME",
-                         help=f"{methods.SHIPPED}, compact or one of its family ({methods.SHIPPED})")  # fmt: skip
-    command.add_argument("--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)")
     command.add_argument(
-        "--out", type=Path, default=Path("docs/certainty"), metavar="DIR", help="where it goes (docs/certainty)"
+        "--method",
+        default=methods.SHIPPED,
+        metavar="NAME",
+        help=f"{methods.SHIPPED}, compact or one of its family ({methods.SHIPPED})",
     )
-    command.add_argument("--kept", action="store_true", help="train nothing, report what an earlier run has finished")
+    command.add_argument(
+        "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
+    )
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("docs/certainty"),
+        metavar="DIR",
+        help="where it goes (docs/certainty)",
+    )
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
     options.add_effort(command)
     options.add_where(command)
 
@@ -146,14 +250,17 @@ def run_methods(args: argparse.Namespace) -> None:
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
-    """Print each result as it is finished, and write all of them; name a method that cannot be used, and go on.
+    """Print each result as it is finished, and write all of them; name a method that cannot be
+    used, and go on.
 
     Raises FormatError at the end where there was one.
     """
     sweeps = options.load(args)
     names = options.names(args)
     if args.each < 0:
-        raise FormatError(f"--each {args.each} is no number of sweeps; use 1 or more, or leave it out for all")
+        raise FormatError(
+            f"--each {args.each} is no number of sweeps; use 1 or more, or leave it out for all"
+        )
     seeds, effort = options.seeds(args), options.effort(args)
     plan = evaluate.Plan(names, tuple(args.protocols), seeds, args.remove_means, effort, args.each)
     results: list[dict[str, Any]] = []
@@ -169,19 +276,32 @@ def run_evaluate(args: argparse.Namespace) -> None:
         results.append(result.json() | {"only": args.only, "each": args.each})
         print(evaluate.line(results[-1]), flush=True)
         if args.json:
-            results.sort(key=lambda r: (args.protocols.index(r["protocol"]), names.index(r["method"]), r["seed"]))
+            results.sort(
+                key=lambda r: (
+                    args.protocols.index(r["protocol"]),
+                    names.index(r["method"]),
+                    r["seed"],
+                )
+            )
             _write(args.json, results)
     if refused:
-        raise FormatError(f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why")
+        raise FormatError(
+            f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why"
+        )
 
 
 def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
     """Write a JSON list, one line each, whole or not at all."""
-    put(path, ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode(), parents=True)
+    put(
+        path,
+        ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode(),
+        parents=True,
+    )
 
 
 def run_stress(args: argparse.Namespace) -> None:
-    """Write the figures, the pictures and the page; print the page's path. With --draw only the pictures and the page."""
+    """Write the figures, the pictures and the page; print the page's path. With --draw only the
+    pictures and the page."""
     if args.draw:
         print(stress_report.write(stress_report.read(args.out), args.out))
         return
@@ -193,20 +313,35 @@ def run_stress(args: argparse.Namespace) -> None:
     )
     box = _box_under_stress(args.bundle, test, seeds, log)
     result = robustness.run(
-        options.names(args), train, test, options.where(args), seeds=seeds, effort=options.effort(args), log=log
+        options.names(args),
+        train,
+        test,
+        options.where(args),
+        seeds=seeds,
+        effort=options.effort(args),
+        log=log,
     )
     positions = test.sweeps.groups.get("position")
-    result |= {"box": box, "train": train.source, "train_sweeps": len(train), "train_digest": sets.digest(train),
-               "test": test.sweeps.source, "test_sweeps": len(test.sweeps), "test_digest": sets.digest(test.sweeps),
-               "attachments": 0 if positions is None else len(np.unique(positions)),
-               "format": str(train.format), "seeds": list(seeds)} | score.provenance()  # fmt: skip
+    result |= {
+        "box": box,
+        "train": train.source,
+        "train_sweeps": len(train),
+        "train_digest": sets.digest(train),
+        "test": test.sweeps.source,
+        "test_sweeps": len(test.sweeps),
+        "test_digest": sets.digest(test.sweeps),
+        "attachments": 0 if positions is None else len(np.unique(positions)),
+        "format": str(train.format),
+        "seeds": list(seeds),
+    } | score.provenance()
     print(stress_report.write(result, args.out))
 
 
 def _box_under_stress(
     folder: Path | None, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None]
 ) -> dict[str, Any]:
-    """What a bundle answers. Raises FormatError where it cannot; of the packaged one (None) the curves are missing then."""
+    """What a bundle answers. Raises FormatError where it cannot; of the packaged one (None) the
+    curves are missing then."""
     box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock())
     try:
         curves = bundle_stress.under_corruptions(box, test, seeds, log)
@@ -216,24 +351,35 @@ def _box_under_stress(
         curves = {}
     manifest = box.bundle.manifest
     return {
-        "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id}, "made": dict(manifest.made),
-        "uninformative": robustness.box_answers(box.bundle), "curves": curves,
-    }  # fmt: skip
+        "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id},
+        "made": dict(manifest.made),
+        "uninformative": robustness.box_answers(box.bundle),
+        "curves": curves,
+    }
 
 
 def run_certainty(args: argparse.Namespace) -> None:
     """Write the figures and the page; print the page's path."""
     test = sets.load(args.test).select(args.only) if args.test else None
     result = uncertainty.run(
-        options.load(args), test, args.protocol, args.method, options.where(args), options.Log(), options.effort(args),
+        options.load(args),
+        test,
+        args.protocol,
+        args.method,
+        options.where(args),
+        options.Log(),
+        options.effort(args),
         args.seed,
-    )  # fmt: skip
+    )
     print(uncertainty_report.write(result, args.out))
 
 
 def run_calibrate(args: argparse.Namespace) -> None:
     """Print the table; write the figures as JSON where a file is named."""
-    result = sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs) | score.provenance()
+    result = (
+        sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs)
+        | score.provenance()
+    )
     if args.json:
         put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     print(sim_calibration.table(result))
@@ -244,13 +390,18 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
     log = options.Log()
     from train.evaluation import cnn_curve  # here: it imports PyTorch
 
-    print(cnn_curve.table(cnn_curve.follow(
-        args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
-    )))  # fmt: skip
+    print(
+        cnn_curve.table(
+            cnn_curve.follow(
+                args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
+            )
+        )
+    )
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the figures and the plot, the tables into the page where one lies there, and print a summary."""
+    """Measure, write the figures and the plot, the tables into the page where one lies there, and
+    print a summary."""
     if args.draw:
         result = options.earlier_run(
             args.out / "place.json",
@@ -265,11 +416,18 @@ def run_alignment(args: argparse.Namespace) -> None:
         result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
         put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     about = provenance.of(result)
-    put(args.out / "place.svg", (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(), parents=True)
+    put(
+        args.out / "place.svg",
+        (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(),
+        parents=True,
+    )
     page = args.out / "README.md"
     if page.exists():
         text = page.read_text(encoding="utf-8")
-        for name, content in (("in short", contact_table.headline(result)), ("alignment", contact_table.table(result))):
+        for name, content in (
+            ("in short", contact_table.headline(result)),
+            ("alignment", contact_table.table(result)),
+        ):
             text = marked_text.insert(text, name, content, str(page))
         put(page, provenance.in_markdown(text, about).encode())
     print("\n".join(contact_positions.lines(result)))

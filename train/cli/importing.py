@@ -1,4 +1,5 @@
-"""The command import. In: a folder of recordings as laboratories keep them. Out: a sweep set, and a line for each file."""
+"""The command import. In: a folder of recordings as laboratories keep them. Out: a sweep set, and a
+line for each file."""
 
 from __future__ import annotations
 
@@ -22,36 +23,82 @@ SHOWN = 5
 
 def register(add: Add) -> None:
     """import."""
-    command = add("import", run, "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/import.md)")
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="of recordings, and the folders in it")
-    command.add_argument("--pattern", required=True, metavar="PATTERN",
-                         help=f"what the names below FOLDER say: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'")  # fmt: skip
-    command.add_argument("--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)")
-    command.add_argument("--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3")
-    command.add_argument("--columns", default="", metavar="COLUMNS",
-                         help="those of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)")  # fmt: skip
-    command.add_argument(
-        "--time", default="", metavar="COLUMN:UNIT", help="of sampling times in s, ms, us or ns: t:ms, 1:s"
+    command = add(
+        "import", run, "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/import.md)"
     )
-    command.add_argument("--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second")
-    command.add_argument("--window", default="2s", metavar="LENGTH", help="of a sweep: 2s, 500ms or 1500 frames (2s)")
-    command.add_argument("--every", metavar="LENGTH",
-                         help="cut windows from the start on, one each LENGTH (the middle window alone)")  # fmt: skip
-    command.add_argument("--dtype", default="", metavar="TYPE",
-                         help=f"of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)")  # fmt: skip
-    command.add_argument("--variable", default="", metavar="NAME", help="the array to take, where a file holds several")
+    command.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="of recordings, and the folders in it"
+    )
+    command.add_argument(
+        "--pattern",
+        required=True,
+        metavar="PATTERN",
+        help=f"what the names below FOLDER say: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
+    )
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
+    )
+    command.add_argument(
+        "--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3"
+    )
+    command.add_argument(
+        "--columns",
+        default="",
+        metavar="COLUMNS",
+        help="those of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
+    )
+    command.add_argument(
+        "--time",
+        default="",
+        metavar="COLUMN:UNIT",
+        help="of sampling times in s, ms, us or ns: t:ms, 1:s",
+    )
+    command.add_argument(
+        "--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second"
+    )
+    command.add_argument(
+        "--window", default="2s", metavar="LENGTH", help="of a sweep: 2s, 500ms or 1500 frames (2s)"
+    )
+    command.add_argument(
+        "--every",
+        metavar="LENGTH",
+        help="cut windows from the start on, one each LENGTH (the middle window alone)",
+    )
+    command.add_argument(
+        "--dtype",
+        default="",
+        metavar="TYPE",
+        help=f"of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)",
+    )
+    command.add_argument(
+        "--variable",
+        default="",
+        metavar="NAME",
+        help="the array to take, where a file holds several",
+    )
     command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
-    command.add_argument("--report", type=Path, metavar="FILE", help="a line for each file, taken or not")
+    command.add_argument(
+        "--report", type=Path, metavar="FILE", help="a line for each file, taken or not"
+    )
     options.add_rename(command)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Import, print what was left out and what is in the set. Raises FormatError at the end where a file was broken."""
+    """Import, print what was left out and what is in the set. Raises FormatError at the end where a
+    file was broken."""
     plan = ImportPlan(
-        NamePattern(args.pattern), args.grid, args.columns, args.time, args.rate, Length(args.window, "--window"),
-        Length(args.every, "--every") if args.every else None, args.dtype, args.variable, args.transpose,
+        NamePattern(args.pattern),
+        args.grid,
+        args.columns,
+        args.time,
+        args.rate,
+        Length(args.window, "--window"),
+        Length(args.every, "--every") if args.every else None,
+        args.dtype,
+        args.variable,
+        args.transpose,
         labels.renames(args.rename),
-    )  # fmt: skip
+    )
     for option in ("out", "report"):
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}")
@@ -101,5 +148,7 @@ def _report(taken: Sequence[Cut], left_out: Sequence[LeftOut]) -> str:
     lines = {one.name: f"left out: {one.why}" for one in left_out}
     for cut in taken:
         notes = f"; {cut.notes}" if cut.notes else ""
-        lines[cut.recording.name] = f"taken: {len(cut.windows)} windows of {len(cut.recording.frames)} frames{notes}"
+        lines[cut.recording.name] = (
+            f"taken: {len(cut.windows)} windows of {len(cut.recording.frames)} frames{notes}"
+        )
     return "".join(f"{name}\t{line}\n" for name, line in sorted(lines.items()))

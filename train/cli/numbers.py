@@ -1,4 +1,5 @@
-"""Readers of options that are numbers. In: what a person typed. Out: the number, or a FormatError with what is allowed."""
+"""Readers of options that are numbers. In: what a person typed. Out: the number, or a FormatError
+with what is allowed."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from appliance.core.errors import FormatError
 
 
 def whole(name: str, least: int) -> Callable[[str], int]:
-    """Reads the option `name`, a whole number from `least` on; raises FormatError for anything else."""
+    """Reads the option `name`, a whole number from `least` on; raises FormatError for anything
+    else."""
 
     def read(text: str) -> int:
         try:
@@ -24,7 +26,8 @@ def whole(name: str, least: int) -> Callable[[str], int]:
 
 
 def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[str], float]:
-    """Reads the option `name`, a number that `fits`; raises FormatError for anything else, with what is `allowed`."""
+    """Reads the option `name`, a number that `fits`; raises FormatError for anything else, with
+    what is `allowed`."""
 
     def read(text: str) -> float:
         try:
@@ -44,11 +47,14 @@ def above_zero(name: str) -> Callable[[str], float]:
 
 
 def span(name: str, example: str) -> Callable[[str], range]:
-    """Reads the option `name`, a whole number or FIRST-LAST; raises FormatError for anything else, with an `example`."""
+    """Reads the option `name`, a whole number or FIRST-LAST; raises FormatError for anything else,
+    with an `example`."""
 
     def read(text: str) -> range:
         first, _, last = text.partition("-")
-        if not (first.isdecimal() and (last or first).isdecimal() and int(last or first) >= int(first)):
+        if not (
+            first.isdecimal() and (last or first).isdecimal() and int(last or first) >= int(first)
+        ):
             raise FormatError(f"{name} {text} cannot be read; write FIRST-LAST, e.g. {example}")
         return range(int(first), int(last or first) + 1)
 

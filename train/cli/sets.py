@@ -15,7 +15,9 @@ from train.reports import sweep_pages, sweep_plot
 
 def register(add: Add) -> None:
     """sets and pull."""
-    known = add("sets", run_known, "list the sweep sets that can be named, describe sets, or show one sweep")
+    known = add(
+        "sets", run_known, "list the sweep sets that can be named, describe sets, or show one sweep"
+    )
     commands = known.add_subparsers(metavar="COMMAND")
     describe = commands.add_parser(
         "describe", help="count what is in sets: materials by position and session, frames lost"
@@ -23,24 +25,47 @@ def register(add: Add) -> None:
     describe.add_argument("sets", nargs="+", metavar="SET", help=options.SET)
     describe.set_defaults(run=run_describe)
     view = commands.add_parser("view", help="draw sweeps: taxels over time, spectrum, spectrogram")
-    view.add_argument("sweep", metavar="SWEEP", help=f"an .npy that the box recorded, or a SET: {options.SET}")
-    view.add_argument("--number", type=numbers.span("--number", "0-49"), metavar="N[-LAST]",
-                      help="which sweep of the set, from 0 on; of a page the first and the last")  # fmt: skip
-    view.add_argument("--out", type=Path, required=True, metavar="FILE",
-                      help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set")  # fmt: skip
+    view.add_argument(
+        "sweep", metavar="SWEEP", help=f"an .npy that the box recorded, or a SET: {options.SET}"
+    )
+    view.add_argument(
+        "--number",
+        type=numbers.span("--number", "0-49"),
+        metavar="N[-LAST]",
+        help="which sweep of the set, from 0 on; of a page the first and the last",
+    )
+    view.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
+    )
     view.set_defaults(run=run_view)
     pull_command = add("pull", run_pull, "fetch what a box has recorded and is not here yet")
     pull_command.set_defaults(resumes=True)
     pull_command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
     pull_command.add_argument(
-        "--from", default=pull.FOLDER, metavar="DIR", dest="folder", help=f"on the box ({pull.FOLDER})"
+        "--from",
+        default=pull.FOLDER,
+        metavar="DIR",
+        dest="folder",
+        help=f"on the box ({pull.FOLDER})",
     )
     pull_command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="here; its folders are those of the box"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="here; its folders are those of the box",
     )
     pull_command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
     pull_command.add_argument(
-        "--ssh-option", action="append", default=[], metavar="OPTION", help="as for ssh -o, e.g. User=pi"
+        "--ssh-option",
+        action="append",
+        default=[],
+        metavar="OPTION",
+        help="as for ssh -o, e.g. User=pi",
     )
 
 
@@ -58,18 +83,24 @@ def run_view(args: argparse.Namespace) -> None:
     """Write the picture or the page and print its path."""
     kind, span = args.out.suffix.lower(), args.number
     if kind not in (".svg", ".html"):
-        raise FormatError(f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file that ends so")
+        raise FormatError(
+            f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file that ends so"
+        )
     options.writable_file(args.out)
     if kind == ".svg":
         if span is not None and len(span) != 1:
-            raise FormatError(f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an .html for more")
+            raise FormatError(
+                f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an .html for more"
+            )
         made = sweep_plot.draw(sweep_plot.load(args.sweep, None if span is None else span.start))
     else:
         found = sweep_plot.source(args.sweep)
         shown = sweep_pages.chosen(found, span)
         made = sweep_pages.page(found, shown, options.Log())
         if span is None and len(shown) < found.count:
-            print(f"{len(shown)} of {found.count} sweeps, from all over the set; --number FIRST-LAST shows others")
+            print(
+                f"{len(shown)} of {found.count} sweeps, from all over the set; --number FIRST-LAST shows others"
+            )
     put(args.out, made.encode(), parents=True)
     print(args.out)
 
@@ -77,7 +108,9 @@ def run_view(args: argparse.Namespace) -> None:
 def run_pull(args: argparse.Namespace) -> None:
     """Fetch, and print what was fetched and what was not."""
     ssh_options = [part for option in args.ssh_option for part in ("-o", option)]
-    box = pull.RecordingHost(args.host, args.folder, [*ssh_options, *(["-p", str(args.port)] if args.port else [])])
+    box = pull.RecordingHost(
+        args.host, args.folder, [*ssh_options, *(["-p", str(args.port)] if args.port else [])]
+    )
     report = pull.PullReport()
     try:
         pull.pull(box, args.out, report, options.Log())
@@ -88,7 +121,9 @@ def run_pull(args: argparse.Namespace) -> None:
         )
         _print(report, args.out)
     if bad := len(report.refused) + len(report.different):
-        raise FormatError(f"{bad} recordings of {args.host} were not taken; the lines above say why")
+        raise FormatError(
+            f"{bad} recordings of {args.host} were not taken; the lines above say why"
+        )
 
 
 def _print(report: pull.PullReport, out: Path) -> None:

@@ -1,4 +1,5 @@
-"""The command that signs bundles. It is apart from `bundles`, whose imports take seconds and which it does not need."""
+"""The command that signs bundles. It is apart from `bundles`, whose imports take seconds and which
+it does not need."""
 
 from __future__ import annotations
 
@@ -19,7 +20,11 @@ def register(add: Add) -> None:
     command = add("sign", run, "sign a bundle, so that boxes take it")
     command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     command.add_argument(
-        "--key", type=Path, required=True, metavar="KEY", help="your private key: ssh-keygen -t ed25519 makes one"
+        "--key",
+        type=Path,
+        required=True,
+        metavar="KEY",
+        help="your private key: ssh-keygen -t ed25519 makes one",
     )
     command.add_argument(
         "--counter",

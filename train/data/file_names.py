@@ -1,4 +1,5 @@
-"""What the names of files say. In: a pattern such as "{material}_{force:d}N_{trial}.csv", a path. Out: its fields as text."""
+"""What the names of files say. In: a pattern such as "{material}_{force:d}N_{trial}.csv", a path.
+Out: its fields as text."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 
 @dataclass(frozen=True)
 class NamePattern:
-    """A pattern over paths below a folder; `{}` is a part that says nothing. Raises FormatError where it cannot be read."""
+    """A pattern over paths below a folder; `{}` is a part that says nothing. Raises FormatError
+    where it cannot be read."""
 
     text: str
 
@@ -31,18 +33,26 @@ class NamePattern:
         names = self.names
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
-            raise FormatError(f"--pattern {self.text!r} has a brace without its other one; write e.g. {EXAMPLE}")
+            raise FormatError(
+                f"--pattern {self.text!r} has a brace without its other one; write e.g. {EXAMPLE}"
+            )
         if "material" not in names:
-            raise FormatError(f"--pattern {self.text!r} does not say where the material stands; write e.g. {EXAMPLE}")
+            raise FormatError(
+                f"--pattern {self.text!r} does not say where the material stands; write e.g. {EXAMPLE}"
+            )
         for name, kind in FIELD.findall(self.text):
             if name and (names.count(name) > 1 or not GROUP.fullmatch(name)):
-                raise FormatError(f"--pattern: {name!r} stands twice or is no name; use small letters, each name once")
+                raise FormatError(
+                    f"--pattern: {name!r} stands twice or is no name; use small letters, each name once"
+                )
             if kind not in KINDS:
                 raise FormatError(
                     f"--pattern: {kind!r} is no kind; use {{{name}}}, {{{name}:d}} (whole) or {{{name}:f}}"
                 )
         if "recording" in names:
-            raise FormatError("--pattern: each file is a recording; call {recording} something else, e.g. {trial}")
+            raise FormatError(
+                "--pattern: each file is a recording; call {recording} something else, e.g. {trial}"
+            )
 
     @property
     def names(self) -> list[str]:
@@ -50,13 +60,16 @@ class NamePattern:
         return [name for name, _ in FIELD.findall(self.text) if name]
 
     def read(self, path: str) -> dict[str, str] | None:
-        """The fields of a path; None where it does not fit. Raises FormatError where it fits in several ways."""
+        """The fields of a path; None where it does not fit. Raises FormatError where it fits in
+        several ways."""
         short, long = (re.fullmatch(self._expression(how), path) for how in ("+?", "+"))
         if not (short and long):
             return None
         if short.groups() != long.groups():
             a, b = (tuple(found.groupdict().items()) for found in (short, long))
-            name, one, other = next(((n, x, y) for (n, x), (_, y) in zip(a, b, strict=True) if x != y), ("{}", "", ""))
+            name, one, other = next(
+                ((n, x, y) for (n, x), (_, y) in zip(a, b, strict=True) if x != y), ("{}", "", "")
+            )
             raise FormatError(
                 f"its name fits the pattern in several ways ({name} {one!r} or {other!r}); "
                 "say which fields are numbers, e.g. {force:d}"
@@ -69,18 +82,23 @@ class NamePattern:
         for found in FIELD.finditer(self.text):
             name, kind = found.groups()
             fits = KINDS[kind or ""].replace("+", how, 1)
-            parts += [re.escape(self.text[end : found.start()]), f"(?P<{name}>{fits})" if name else f"({fits})"]
+            parts += [
+                re.escape(self.text[end : found.start()]),
+                f"(?P<{name}>{fits})" if name else f"({fits})",
+            ]
             end = found.end()
         return "".join([*parts, re.escape(self.text[end:])])
 
 
 def group(texts: Sequence[str]) -> tuple[NDArray[Any], str]:
-    """A number for each text [N], and what the numbers stand for, "" where they are the texts: whole numbers stay, other
-    texts are ranked, by value where all are numbers."""
+    """A number for each text [N], and what the numbers stand for, "" where they are the texts:
+    whole numbers stay, other texts are ranked, by value where all are numbers."""
     different = sorted(set(texts))
     if all(map(NUMBER.fullmatch, different)):
         return numbered(texts), ""
     with suppress(ValueError):  # some are no numbers
         different = sorted(different, key=float)
     rank = {text: i for i, text in enumerate(different)}
-    return np.array([rank[text] for text in texts]), ", ".join(f"{i} = {text}" for text, i in rank.items())
+    return np.array([rank[text] for text in texts]), ", ".join(
+        f"{i} = {text}" for text, i in rank.items()
+    )

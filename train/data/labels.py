@@ -1,4 +1,5 @@
-"""Names of materials: which the box can send, and how others are renamed. In: names. Out: the same, or one error for all."""
+"""Names of materials: which the box can send, and how others are renamed. In: names. Out: the same,
+or one error for all."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ REMEDY = "give each another name with --rename OLD=NEW"
 
 
 def unsendable(names: Iterable[str]) -> str:
-    """Which of `names` the box cannot send, all in a line with what a label may be; "" where it can send all."""
+    """Which of `names` the box cannot send, all in a line with what a label may be; "" where it can
+    send all."""
     if not (bad := [name for name in names if not LABEL.fullmatch(name)]):
         return ""
     listed = ", ".join(f"{name!r} ({len(name)} characters)" for name in bad)
@@ -32,14 +34,17 @@ def check(sweeps: Dataset) -> Dataset:
 
 
 def renames(texts: Sequence[str]) -> dict[str, str]:
-    """What --rename OLD=NEW says. Raises FormatError where one cannot be read, or one name gets two."""
+    """What --rename OLD=NEW says. Raises FormatError where one cannot be read, or one name gets
+    two."""
     pairs: dict[str, str] = {}
     for text in texts:
         old, separator, new = text.rpartition("=")
         if not (separator and old and new):
             raise FormatError(f"--rename {text!r} cannot be read; write OLD=NEW")
         if pairs.setdefault(old, new) != new:
-            raise FormatError(f"--rename gives {old!r} two names, {pairs[old]!r} and {new!r}; give it one")
+            raise FormatError(
+                f"--rename gives {old!r} two names, {pairs[old]!r} and {new!r}; give it one"
+            )
     return pairs
 
 
@@ -54,7 +59,8 @@ def check_known(pairs: Mapping[str, str], names: Iterable[str]) -> None:
 
 
 def renamed(sweeps: Dataset, pairs: Mapping[str, str]) -> Dataset:
-    """The set with other names of materials, in the same order; what gets the same name becomes one material."""
+    """The set with other names of materials, in the same order; what gets the same name becomes one
+    material."""
     if not set(pairs) & set(sweeps.materials):
         return sweeps
     names = [pairs.get(name, name) for name in sweeps.materials]

@@ -1,7 +1,8 @@
 """MAT files of versions 5 to 7. In: their bytes. Out: the numeric arrays by name.
 
-Written after MathWorks, MAT-File Format (R2023a). Readers in C trust sizes that a damaged file gives; here each is checked.
-Cells, structures, text and sparse arrays are passed over. Version 7.3 is HDF5, which raw_files.py reads.
+Written after MathWorks, MAT-File Format (R2023a). Readers in C trust sizes that a damaged file
+gives; here each is checked. Cells, structures, text and sparse arrays are passed over. Version 7.3
+is HDF5, which raw_files.py reads.
 """
 
 from __future__ import annotations
@@ -21,9 +22,31 @@ Array = NDArray[Any]
 HEADER = 128
 ENDIAN = {b"IM": "<", b"MI": ">"}
 MATRIX, COMPRESSED = 14, 15
-STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+STORED = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
 """Types of data on the disk, which may be smaller than that of the array."""
-CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+CLASSES = {
+    6: "f8",
+    7: "f4",
+    8: "i1",
+    9: "u1",
+    10: "i2",
+    11: "u2",
+    12: "i4",
+    13: "u4",
+    14: "i8",
+    15: "u8",
+}
 """Classes of numeric arrays; all others are passed over."""
 COMPLEX, LOGICAL = 0x0800, 0x0200
 MOST_BYTES = 1 << 31
@@ -31,7 +54,8 @@ MOST_BYTES = 1 << 31
 
 
 def arrays(data: bytes) -> dict[str, Array]:
-    """All numeric arrays of a file. Raises FormatError where it is damaged, or of another version."""
+    """All numeric arrays of a file. Raises FormatError where it is damaged, or of another
+    version."""
     order = ENDIAN.get(data[126:128], "")
     if not order:
         raise FormatError("is no MAT file of version 5 to 7.3; save it with -v7")
@@ -74,7 +98,8 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _matrix(data: bytes, order: str) -> tuple[str, Array] | None:
-    """Name and values of an array; None where it is not numeric. Raises FormatError where its parts contradict."""
+    """Name and values of an array; None where it is not numeric. Raises FormatError where its parts
+    contradict."""
     parts = list(_elements(data, order))
     if len(parts) < 3 or len(parts[0][1]) < 4 or len(parts[1][1]) % 4:
         raise FormatError("is damaged: an array lacks its shape or name")
@@ -88,6 +113,8 @@ def _matrix(data: bytes, order: str) -> tuple[str, Array] | None:
         raise FormatError(f"is damaged: array {name!r} has no values")
     stored = np.dtype(order + STORED[kind])
     if len(content) != math.prod(shape) * stored.itemsize:
-        raise FormatError(f"is damaged: array {name!r} {list(shape)} holds {len(content)} bytes of {stored}")
+        raise FormatError(
+            f"is damaged: array {name!r} {list(shape)} holds {len(content)} bytes of {stored}"
+        )
     kept = np.dtype("u1" if flags & LOGICAL else CLASSES[flags & 0xFF])
     return name, np.frombuffer(content, stored).reshape(shape, order="F").astype(kept)

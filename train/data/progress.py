@@ -1,4 +1,5 @@
-"""Progress of long work: how much of it is done, and how long the rest will take. In: tasks as they begin or end. Out: lines."""
+"""Progress of long work: how much of it is done, and how long the rest will take. In: tasks as they
+begin or end. Out: lines."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ Clock = Callable[[], float]
 
 
 class ProgressLine(str):
-    """A line for people that knows its numbers, for a display that draws a bar. done, total: tasks."""
+    """A line for people that knows its numbers, for a display that draws a bar. done, total:
+    tasks."""
 
     done: int
     total: int
@@ -17,18 +19,23 @@ class ProgressLine(str):
     @classmethod
     def of(cls, done: int, total: int, left_s: float | None, what: str) -> ProgressLine:
         """left_s: how long the others will take, where it is known."""
-        line = cls(f"{done}/{total} done{'' if left_s is None else f', {spoken(left_s)} left'} ({what})")
+        line = cls(
+            f"{done}/{total} done{'' if left_s is None else f', {spoken(left_s)} left'} ({what})"
+        )
         line.done, line.total = done, total
         return line
 
 
 class Progress:
-    """Logs how many tasks are done and how long the others will take, if they take as long on average. clock: in s.
+    """Logs how many tasks are done and how long the others will take, if they take as long on
+    average. clock: in s.
 
     done: tasks so far.
     """
 
-    def __init__(self, total: int, log: Callable[[str], None], clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, total: int, log: Callable[[str], None], clock: Clock = time.monotonic
+    ) -> None:
         self._total, self._log, self._clock = total, log, clock
         self._start, self.done = clock(), 0
 

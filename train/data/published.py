@@ -1,6 +1,8 @@
-"""Time series that the package aeon ships, with their published splits. In: a name. Out: samples, labels, names, groups.
+"""Time series that the package aeon ships, with their published splits. In: a name. Out: samples,
+labels, names, groups.
 
-None was recorded with a skin: they show whether a method was tuned to one kind of sensor. Nothing is ever downloaded.
+None was recorded with a skin: they show whether a method was tuned to one kind of sensor. Nothing
+is ever downloaded.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from appliance.core.sweep_set import Array
 
 PREFIX = "aeon:"
 RATE_HZ = 100.0
-"""Frames per second of all of them. The files state none; without one no feature in Hz could be computed."""
+"""Frames per second of all of them. The files state none; without one no feature in Hz could be
+computed."""
 SETS: Mapping[str, str] = MappingProxyType(
     {
         "ACSF1": "100 + 100 sweeps of 10 appliances, 1460 frames of their power",
@@ -33,17 +36,25 @@ SETS: Mapping[str, str] = MappingProxyType(
 def load(name: str) -> tuple[Array, Array, tuple[str, ...], dict[str, Array]]:
     """(samples float32 [N, T, channels, 1], labels int [N], class names, groups) of one of SETS.
 
-    Groups: `split`, 0 for the published training part and 1 for the test part; `recording`, each sweep its own number.
-    Raises FormatError for another name, and where aeon or the set in it is missing.
+    Groups: `split`, 0 for the published training part and 1 for the test part; `recording`, each
+    sweep its own number. Raises FormatError for another name, and where aeon or the set in it is
+    missing.
     """
     if name not in SETS:
-        raise FormatError(f"set {PREFIX + name!r} is unknown; use {PREFIX}NAME, NAME one of {', '.join(SETS)}")
+        raise FormatError(
+            f"set {PREFIX + name!r} is unknown; use {PREFIX}NAME, NAME one of {', '.join(SETS)}"
+        )
     parts = [_part(name, split) for split in ("train", "test")]
     series, classes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     names, labels = np.unique(classes.astype(str), return_inverse=True)
     split = np.repeat([0, 1], [len(part[1]) for part in parts])
     samples = np.ascontiguousarray(series.transpose(0, 2, 1)[..., None], np.float32)
-    return samples, labels, tuple(names.tolist()), {"split": split, "recording": np.arange(len(labels))}
+    return (
+        samples,
+        labels,
+        tuple(names.tolist()),
+        {"split": split, "recording": np.arange(len(labels))},
+    )
 
 
 def _part(name: str, split: str) -> tuple[Array, Array]:
@@ -51,9 +62,15 @@ def _part(name: str, split: str) -> tuple[Array, Array]:
     try:
         import aeon.datasets
     except ImportError as e:
-        raise FormatError(f"set {PREFIX + name!r} needs aeon ({e}); try pip install 'palpate-train[minirocket]'") from e
+        raise FormatError(
+            f"set {PREFIX + name!r} needs aeon ({e}); try pip install 'palpate-train[minirocket]'"
+        ) from e
     # load_classification would download what is not there
-    if not (Path(aeon.datasets.__file__).parent / "data" / name / f"{name}_{split.upper()}.ts").is_file():
-        raise FormatError(f"this version of aeon does not hold {name}; try pip install 'palpate-train[minirocket]'")
+    if not (
+        Path(aeon.datasets.__file__).parent / "data" / name / f"{name}_{split.upper()}.ts"
+    ).is_file():
+        raise FormatError(
+            f"this version of aeon does not hold {name}; try pip install 'palpate-train[minirocket]'"
+        )
     series, classes = aeon.datasets.load_classification(name, split=split)
     return series, classes

@@ -1,8 +1,10 @@
-"""Fetches recordings from a box over ssh. In: a host and its folder. Out: the same files here; existing ones stay.
+"""Fetches recordings from a box over ssh. In: a host and its folder. Out: the same files here;
+existing ones stay.
 
-The box needs sshd, a shell, find, sha256sum and tar, and no part of Palpate. It lists each file with its SHA-256; new
-files come in one stream, pair by pair (.npy and .json). A pair is read as a recording before it gets its file names: when
-the connection ends, no incomplete pair is left under them, and the next call continues with the rest.
+The box needs sshd, a shell, find, sha256sum and tar, and no part of Palpate. It lists each file
+with its SHA-256; new files come in one stream, pair by pair (.npy and .json). A pair is read as a
+recording before it gets its file names: when the connection ends, no incomplete pair is left under
+them, and the next call continues with the rest.
 """
 
 from __future__ import annotations
@@ -29,18 +31,22 @@ from train.data.progress import Progress
 FOLDER = f"{StoreConfig().folder}/sweeps"
 PAIR = (".json", ".npy")
 """In the order in which they are written: an .npy never lacks its sidecar."""
-SSH_OPTIONS = ("BatchMode=yes", "ConnectTimeout=10", "ServerAliveInterval=5", "ServerAliveCountMax=3")
-"""ssh asks no questions, and a box that is silent for 15 s counts as disconnected."""
-AS_READER = (
-    'if cd -- "$1" 2>/dev/null && test -r .; then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
+SSH_OPTIONS = (
+    "BatchMode=yes",
+    "ConnectTimeout=10",
+    "ServerAliveInterval=5",
+    "ServerAliveCountMax=3",
 )
+"""ssh asks no questions, and a box that is silent for 15 s counts as disconnected."""
+AS_READER = 'if cd -- "$1" 2>/dev/null && test -r .; then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
 ABSENT = 44
 """Exit code of LIST where the folder does not exist."""
 LIST = f"""test -e "$1" || exit {ABSENT}
 cd -- "$1" || exit
 find . -type f '(' -name '*.npy' -o -name '*.json' ')' -exec sha256sum -z -- {{}} +
 test $? -le 1"""
-"""find ends with 1 where a file was removed meanwhile: it reports that, and still lists the others."""
+"""find ends with 1 where a file was removed meanwhile: it reports that, and still lists the
+others."""
 SEND = 'cd -- "$1" && exec tar -c --null -T - -f -'
 LISTED = re.compile(rb"([0-9a-f]{64})  \./(.+)", re.S)
 MAX_BYTES = 1 << 30
@@ -57,7 +63,9 @@ class RecordingHost:
     folder: str = FOLDER
     options: Sequence[str] = ()
 
-    def run(self, script: str, stdin: IO[bytes] | int, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+    def run(
+        self, script: str, stdin: IO[bytes] | int, stderr: IO[bytes]
+    ) -> subprocess.Popen[bytes]:
         """Start a script in the folder, as the user or, where that may not read it, with sudo.
 
         Raises ApplianceError where ssh is not installed.
@@ -75,8 +83,11 @@ class RecordingHost:
             raise ApplianceError("ssh is not installed; apt install openssh-client") from None
 
     @contextmanager
-    def output(self, script: str, stdin: IO[bytes] | int = subprocess.DEVNULL) -> Iterator[IO[bytes]]:
-        """The output of the script, which has ended when the context ends. Its messages go to stderr.
+    def output(
+        self, script: str, stdin: IO[bytes] | int = subprocess.DEVNULL
+    ) -> Iterator[IO[bytes]]:
+        """The output of the script, which has ended when the context ends. Its messages go to
+        stderr.
 
         Raises ApplianceError where the box cannot be reached or the script failed.
         """
@@ -94,7 +105,9 @@ class RecordingHost:
         if messages:
             print(f"{self.host}: {messages}", file=sys.stderr)
         if code == 255:
-            raise ApplianceError(f"{self.host}: no connection; see that `ssh {self.host} true` works")
+            raise ApplianceError(
+                f"{self.host}: no connection; see that `ssh {self.host} true` works"
+            )
         if code == ABSENT:
             raise ApplianceError(
                 f"{self.host}: there is no {self.folder}: nothing was recorded yet, which makes it (`palpate record`); "
@@ -111,8 +124,9 @@ class RecordingHost:
 class PullReport:
     """What happened to the recordings, by their names without suffix.
 
-    present: already here, and the same. incomplete: without .npy or .json on the box. relabelled: with another .json on
-    the box. different: with another .npy on the box. refused: with the reason.
+    present: already here, and the same. incomplete: without .npy or .json on the box. relabelled:
+    with another .json on the box. different: with another .npy on the box. refused: with the
+    reason.
     """
 
     fetched: list[str] = field(default_factory=list)
@@ -124,10 +138,11 @@ class PullReport:
 
 
 def pull(box: RecordingHost, out: Path, report: PullReport, log: Callable[[str], None]) -> None:
-    """Fetch into `out` what is not there yet; what happens to each recording is added to `report` at once.
+    """Fetch into `out` what is not there yet; what happens to each recording is added to `report`
+    at once.
 
-    Raises ApplianceError where the box cannot be reached or read or the connection ends, FormatError where it sends files
-    that were not requested, OSError where `out` cannot be written.
+    Raises ApplianceError where the box cannot be reached or read or the connection ends,
+    FormatError where it sends files that were not requested, OSError where `out` cannot be written.
     """
     listed = listing(box)
     wanted = list(_new_recordings(listed, out, report))
@@ -163,7 +178,8 @@ def listing(box: RecordingHost) -> dict[str, str]:
 
 
 def _new_recordings(listed: Mapping[str, str], out: Path, report: PullReport) -> Iterator[str]:
-    """Names without suffix of the recordings that are not here; all others are added to the report."""
+    """Names without suffix of the recordings that are not here; all others are added to the
+    report."""
     for name in sorted({file.rpartition(".")[0] for file in listed}):
         if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
             report.refused.append(f"{name!r} (not a name for a file here)")
@@ -195,8 +211,9 @@ def _sha256(path: Path) -> str | None:
 def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Each recording of which both files came, in the order of `names`, which come in pairs.
 
-    Raises FormatError where the archive holds anything but plain files that were requested: a path out of the folder, a
-    link, a device or a file of more than MAX_BYTES is refused. A stream that is cut off ends the iteration.
+    Raises FormatError where the archive holds anything but plain files that were requested: a path
+    out of the folder, a link, a device or a file of more than MAX_BYTES is refused. A stream that
+    is cut off ends the iteration.
     """
     requested = set(names)
     received: dict[str, bytes] = {}
@@ -205,7 +222,9 @@ def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[
             for member in archive:
                 name = member.name
                 if not member.isreg() or name not in requested or member.size > MAX_BYTES:
-                    raise FormatError(f"the box sends {name!r}, which was not requested; check that box")
+                    raise FormatError(
+                        f"the box sends {name!r}, which was not requested; check that box"
+                    )
                 file = archive.extractfile(member)
                 assert file
                 received[name] = file.read()
@@ -216,12 +235,16 @@ def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[
         return
 
 
-def _keep(name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, report: PullReport) -> None:
+def _keep(
+    name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, report: PullReport
+) -> None:
     """Store one recording, if it is what the box listed and can be read as a recording."""
     try:
         for suffix, data in pair.items():
             if hashlib.sha256(data).hexdigest() != sha256[suffix]:
-                raise FormatError(f"{name}{suffix} changed while it was fetched; run the same command again")
+                raise FormatError(
+                    f"{name}{suffix} changed while it was fetched; run the same command again"
+                )
         with tempfile.TemporaryDirectory() as folder:
             for suffix, data in pair.items():
                 Path(folder, f"sweep{suffix}").write_bytes(data)

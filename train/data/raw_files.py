@@ -1,4 +1,5 @@
-"""Files in which laboratories keep one recording: CSV and other text, .npy, .npz, MAT, HDF5. In: a path. Out: its Table.
+"""Files in which laboratories keep one recording: CSV and other text, .npy, .npz, MAT, HDF5. In: a
+path. Out: its Table.
 
 Nothing is unpickled. What is ambiguous is refused with the option that decides.
 """
@@ -33,8 +34,8 @@ DAMAGED = (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zli
 
 @dataclass(frozen=True)
 class Table:
-    """One recording. values: [n, ...] numbers as the file has them, float64 of text. columns: their names, () for none.
-    vectors: one-dimensional arrays beside it, by name, such as times."""
+    """One recording. values: [n, ...] numbers as the file has them, float64 of text. columns: their
+    names, () for none. vectors: one-dimensional arrays beside it, by name, such as times."""
 
     values: Array
     columns: tuple[str, ...] = ()
@@ -42,8 +43,8 @@ class Table:
 
 
 def read(path: Path, variable: str = "") -> Table:
-    """The recording in a file. variable: the array to take of a file that holds several. Raises FormatError saying what is
-    wrong, without the file's name."""
+    """The recording in a file. variable: the array to take of a file that holds several. Raises
+    FormatError saying what is wrong, without the file's name."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".npy":
@@ -61,7 +62,8 @@ def read(path: Path, variable: str = "") -> Table:
 
 
 def _array(name: str, values: Array | bytes) -> Array:
-    """What numpy found under a name of an .npz: an array, or as it is what does not begin as one."""
+    """What numpy found under a name of an .npz: an array, or as it is what does not begin as
+    one."""
     if isinstance(values, bytes):
         raise ValueError(f"{name!r} is no array")
     return values
@@ -74,7 +76,8 @@ def _plain(values: Array) -> Table:
 
 
 def _mat(path: Path) -> dict[str, Array]:
-    """Arrays of a MAT file of any version; those of version 7.3 are HDF5 and have their axes the other way round."""
+    """Arrays of a MAT file of any version; those of version 7.3 are HDF5 and have their axes the
+    other way round."""
     if h5py.is_hdf5(path):
         return {name: values.T for name, values in _hdf5(path).items()}
     return mat_files.arrays(path.read_bytes())
@@ -85,7 +88,11 @@ def _hdf5(path: Path) -> dict[str, Array]:
     names: list[str] = []
 
     def keep(name: str, found: Any) -> None:
-        if isinstance(found, h5py.Dataset) and found.shape is not None and found.dtype.kind in "biuf":
+        if (
+            isinstance(found, h5py.Dataset)
+            and found.shape is not None
+            and found.dtype.kind in "biuf"
+        ):
             names.append(name)
 
     with h5py.File(path, "r") as file:
@@ -101,41 +108,67 @@ def _printable(name: str) -> str:
 def _chosen(arrays: Mapping[str, Array], variable: str) -> Table:
     """The one array of frames, or the one called `variable`, and the vectors beside it."""
     numbers = {name: values for name, values in arrays.items() if values.dtype.kind in "biuf"}
-    tables = {name: values for name, values in numbers.items() if values.ndim > 1 and min(values.shape) > 1}
-    listed = ", ".join(f"{_printable(name)} {list(values.shape)}" for name, values in numbers.items()) or "nothing"
+    tables = {
+        name: values
+        for name, values in numbers.items()
+        if values.ndim > 1 and min(values.shape) > 1
+    }
+    listed = (
+        ", ".join(f"{_printable(name)} {list(values.shape)}" for name, values in numbers.items())
+        or "nothing"
+    )
     if variable:
         if variable not in numbers:
             raise FormatError(f"has no array {variable!r}; it holds {listed}")
         tables = {variable: numbers[variable]}
     if len(tables) != 1:
-        raise FormatError(f"holds {len(tables)} arrays of frames; name one with --variable: it holds {listed}")
-    vectors = {name: values.ravel() for name, values in numbers.items() if max(values.shape, default=0) == values.size}
+        raise FormatError(
+            f"holds {len(tables)} arrays of frames; name one with --variable: it holds {listed}"
+        )
+    vectors = {
+        name: values.ravel()
+        for name, values in numbers.items()
+        if max(values.shape, default=0) == values.size
+    }
     (values,) = tables.values()
     return Table(values, vectors=vectors)
 
 
 def _text(data: bytes) -> Table:
-    """Numbers in lines, perhaps after lines of text, the first of which that has as many cells names the columns."""
+    """Numbers in lines, perhaps after lines of text, the first of which that has as many cells
+    names the columns."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise FormatError("is UTF-16; save it as UTF-8")
     lines = data.decode("utf-8-sig", errors="replace").splitlines()
-    kept = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(COMMENTS)]
+    kept = [
+        (i, line)
+        for i, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith(COMMENTS)
+    ]
     delimiter = next((d for d in DELIMITERS if kept and d in kept[-1][1]), None)
     decimal_comma = delimiter in ("\t", ";")
     rows = [(i, line.replace(",", ".") if decimal_comma else line) for i, line in kept]
-    first = next((k for k, (_, line) in enumerate(rows) if _all_numbers(cells(line, delimiter))), len(rows))
+    first = next(
+        (k for k, (_, line) in enumerate(rows) if _all_numbers(cells(line, delimiter))), len(rows)
+    )
     if first == len(rows):
         raise FormatError("holds no line of numbers")
     body = rows[first:]
-    if delimiter and all(line.rstrip().endswith(delimiter) for _, line in body):  # the last column is empty
+    if delimiter and all(
+        line.rstrip().endswith(delimiter) for _, line in body
+    ):  # the last column is empty
         body = [(i, line.rstrip()[: -len(delimiter)]) for i, line in body]
     try:
         plain = [line for _, line in body]
-        values = np.loadtxt(plain, np.float64, comments=None, delimiter=delimiter, ndmin=2, quotechar='"')
+        values = np.loadtxt(
+            plain, np.float64, comments=None, delimiter=delimiter, ndmin=2, quotechar='"'
+        )
     except ValueError as e:
         raise FormatError(_fault(body, delimiter) or str(e)) from e
     wide = values.shape[1]
-    heads = [line for _, line in kept[:first]] + [line.lstrip("#% ") for line in lines if line.startswith(COMMENTS)]
+    heads = [line for _, line in kept[:first]] + [
+        line.lstrip("#% ") for line in lines if line.startswith(COMMENTS)
+    ]
     named = ([cell.strip() for cell in cells(line, delimiter)] for line in heads)
     named = (head[:-1] if head[-1:] == [""] else head for head in named)
     return Table(values, next((tuple(head) for head in named if len(head) == wide), ()))

@@ -1,7 +1,7 @@
 """Reads sweep sets. In: an .npz, an HDF5 file, a folder of the box's recordings. Out: a SweepSet.
 
-appliance.core.sweep_set names the arrays and checks them, wherever they were read from. Nothing is unpickled, and nothing
-outside the named file or folder is read.
+appliance.core.sweep_set names the arrays and checks them, wherever they were read from. Nothing is
+unpickled, and nothing outside the named file or folder is read.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from appliance.signal.unloaded import UnloadedSkin
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
-"""Rate of the TactMat data, which neither the file nor its page states: that of the same laboratory's skin in the paper
-(sec. II.A). A `rate_hz` in the file takes precedence."""
+"""Rate of the TactMat data, which neither the file nor its page states: that of the same
+laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
 SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
 NAMED = ("position", "session")
 """What a recording may name, beside its material."""
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to a window that it does not classify."""
 FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
-"""Suffixes of files in which laboratories keep the frames of one recording; importing.py makes a set of a folder of them."""
+"""Suffixes of files in which laboratories keep the frames of one recording; importing.py makes a
+set of a folder of them."""
 IMPORT = "palpate-train import {} makes a set of such files"
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 """A name that is a whole number; 07 is not one, or it would equal 7."""
@@ -55,9 +56,11 @@ class RecordedSweep:
 
     @property
     def why_not(self) -> str:
-        """Why it is not trained on, in one word: not a whole window, or a skin that the box refused; "" where it is.
+        """Why it is not trained on, in one word: not a whole window, or a skin that the box
+        refused; "" where it is.
 
-        A material that the box did not know, or was uncertain about, is trained on: it was recorded for that.
+        A material that the box did not know, or was uncertain about, is trained on: it was recorded
+        for that.
         """
         verdict = self.about.get("verdict")
         answer = verdict.get("status") if isinstance(verdict, dict) else ""
@@ -67,8 +70,8 @@ class RecordedSweep:
 
     @property
     def unloaded(self) -> Array:
-        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN where the sidecar does not
-        know them. Raises FormatError where it has something else."""
+        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN
+        where the sidecar does not know them. Raises FormatError where it has something else."""
         found = self.about.get("unloaded")
         shape = self.format.shape
         if found is None:
@@ -86,7 +89,8 @@ class RecordedSweep:
 
 
 def read(path: Path, kind: type[Set]) -> Set:
-    """The set at `path`, in whatever format. Raises FormatError naming what is missing or of the wrong form, and where."""
+    """The set at `path`, in whatever format. Raises FormatError naming what is missing or of the
+    wrong form, and where."""
     if not path.exists():
         raise FormatError(
             f"{path.name}: not a sweep set: there is no such file; name an .npz, an HDF5 file or a folder of recordings"
@@ -96,16 +100,21 @@ def read(path: Path, kind: type[Set]) -> Set:
     try:
         path.open("rb").close()
     except OSError as e:
-        raise FormatError(f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}") from e
+        raise FormatError(
+            f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}"
+        ) from e
     if path.suffix in HDF5 or h5py.is_hdf5(path):
         return hdf5(path, kind)
     if path.suffix.lower() in FRAMES:
-        raise FormatError(f"{path.name}: not a sweep set, but a file of frames; {IMPORT.format(path.parent)}")
+        raise FormatError(
+            f"{path.name}: not a sweep set, but a file of frames; {IMPORT.format(path.parent)}"
+        )
     return load_file(path, kind)
 
 
 def hdf5(path: Path, kind: type[Set]) -> Set:
-    """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises FormatError."""
+    """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises
+    FormatError."""
     try:
         with h5py.File(path, "r") as file:
             names = [k for k in file if k in SET_ARRAYS or k.startswith("group_")]
@@ -113,7 +122,9 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
             if "rate_hz" in file.attrs:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
     except (OSError, KeyError, RuntimeError, ValueError, TypeError) as e:
-        raise FormatError(f"{path.name}: not a sweep set (HDF5 with samples, materials …) that can be read: {e}") from e
+        raise FormatError(
+            f"{path.name}: not a sweep set (HDF5 with samples, materials …) that can be read: {e}"
+        ) from e
     except FormatError as e:
         raise FormatError(f"{path.name}: {e}") from e
     source = path.name
@@ -126,24 +137,30 @@ def hdf5(path: Path, kind: type[Set]) -> Set:
 
 
 def array_in(file: h5py.File, name: str) -> Array:
-    """One array that the file itself holds: what a link or a virtual array refers to may be missing, or read as zeros."""
+    """One array that the file itself holds: what a link or a virtual array refers to may be
+    missing, or read as zeros."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
-        raise FormatError(f"{name} is a link to {getattr(link, 'path', None)!r}; put the data itself into the file")
+        raise FormatError(
+            f"{name} is a link to {getattr(link, 'path', None)!r}; put the data itself into the file"
+        )
     data = file[name]
     if not isinstance(data, h5py.Dataset) or data.shape is None:
         raise FormatError(f"{name} is no array but {data!r}; give one")
     if data.is_virtual or data.external:
         raise FormatError(f"{name} lies in other files; put the data itself into the file")
     if not _complete(data):
-        raise FormatError(f"{name} {list(data.shape)} was not written to its end; record or copy it again")
+        raise FormatError(
+            f"{name} {list(data.shape)} was not written to its end; record or copy it again"
+        )
     if h5py.check_string_dtype(data.dtype):
         return np.array(data.asstr("utf-8")[()], dtype=str)
     return np.asarray(data[()])
 
 
 def _complete(data: h5py.Dataset) -> bool:
-    """Whether all of its chunks are present: HDF5 reads zeros for missing ones, which an interrupted recording leaves."""
+    """Whether all of its chunks are present: HDF5 reads zeros for missing ones, which an
+    interrupted recording leaves."""
     if not data.chunks:
         return not data.size or bool(data.id.get_storage_size() > 0)
     chunks = math.prod(-(-n // size) for n, size in zip(data.shape, data.chunks, strict=True))
@@ -151,52 +168,72 @@ def _complete(data: h5py.Dataset) -> bool:
 
 
 def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
-    """TactMat (Tulbure and Baeuml, Humanoids 2018): samples [materials, repetitions, T, R, C], names -> a set's arrays.
+    """TactMat (Tulbure and Baeuml, Humanoids 2018): samples [materials, repetitions, T, R, C],
+    names -> a set's arrays.
 
-    Its raw counts are 0 to 255 (paper, sec. II.B) whatever type they are stored in. Raises FormatError.
+    Its raw counts are 0 to 255 (paper, sec. II.B) whatever type they are stored in. Raises
+    FormatError.
     """
     x, materials = arrays["samples"], arrays.get("materials", np.empty(0, str))
     if len(materials) != len(x):
-        raise FormatError(f"{source}: samples {list(x.shape)} are of {len(x)} materials, {len(materials)} are named")
+        raise FormatError(
+            f"{source}: samples {list(x.shape)} are of {len(x)} materials, {len(materials)} are named"
+        )
     if x.dtype.kind in "iuf":
         with np.errstate(invalid="ignore"):
             counts = x.astype(np.uint8)
         x = counts if np.array_equal(counts, x) else x
     label, repetition = np.indices(x.shape[:2]).reshape(2, -1)
-    return arrays | {"samples": x.reshape(-1, *x.shape[2:]), "labels": label, "group_repetition": repetition}
+    return arrays | {
+        "samples": x.reshape(-1, *x.shape[2:]),
+        "labels": label,
+        "group_repetition": repetition,
+    }
 
 
 def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
-    """The arrays, named as in an .npz, as an HDF5 file that `hdf5` reads; samples are compressed."""
+    """The arrays, named as in an .npz, as an HDF5 file that `hdf5` reads; samples are
+    compressed."""
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
-            file.create_dataset(name, data=values, compression="gzip" if name == "samples" else None)
+            file.create_dataset(
+                name, data=values, compression="gzip" if name == "samples" else None
+            )
 
 
 def recorded(folder: Path) -> list[RecordedSweep]:
-    """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of their names.
+    """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of
+    their names.
 
-    Raises FormatError naming the file that is broken, or the folder where it may not be read or holds no recorded sweep.
+    Raises FormatError naming the file that is broken, or the folder where it may not be read or
+    holds no recorded sweep.
     """
     check_folder(folder)
     paths = sorted(folder.rglob("*.npy"))
     if not any(path.with_suffix(".json").exists() for path in paths):
-        raise FormatError(f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_instead(folder)}")
+        raise FormatError(
+            f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_instead(folder)}"
+        )
     return [RecordedSweep.load(path) for path in paths]
 
 
 def check_folder(folder: Path) -> None:
-    """Raises FormatError where what is in the folder may not be seen: a search in it would find nothing, without a word."""
+    """Raises FormatError where what is in the folder may not be seen: a search in it would find
+    nothing, without a word."""
     try:
         next(folder.iterdir(), None)
     except OSError as e:
-        raise FormatError(f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}") from e
+        raise FormatError(
+            f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}"
+        ) from e
 
 
 def _instead(folder: Path) -> str:
     """What to do with a folder without recordings of the box."""
     others = Counter(
-        path.suffix.lower() for path in folder.rglob("*") if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
+        path.suffix.lower()
+        for path in folder.rglob("*")
+        if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
     )
     if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
         return f"{sets} .npz or HDF5 files are: name one of them, or {IMPORT.format(folder)}"
@@ -213,10 +250,10 @@ def ok(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
 def recordings(folder: Path, kind: type[Set]) -> Set:
     """The set of all sweeps that the box recorded in `folder` and below; each is a recording.
 
-    Its label is its material. Groups are position and session, with the numbers that they have as names where all have
-    one, else numbered in the order of their names; and the object where NEW OBJECT was ever signalled. Sweeps that are
-    not trained on are counted in `source`. Raises FormatError naming the file that is broken, lacks a name or is of
-    another format.
+    Its label is its material. Groups are position and session, with the numbers that they have as
+    names where all have one, else numbered in the order of their names; and the object where NEW
+    OBJECT was ever signalled. Sweeps that are not trained on are counted in `source`. Raises
+    FormatError naming the file that is broken, lacks a name or is of another format.
     """
     return joined(recorded(folder), folder, kind)
 
@@ -227,7 +264,9 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
     left = Counter(one.why_not for one in recorded if one.why_not)
     source = f"{folder} (left out: {counted(left)})" if left else str(folder)
     if not kept:
-        raise FormatError(f"{source}: not a sweep set: no recorded sweep is ok; record some with `palpate record`")
+        raise FormatError(
+            f"{source}: not a sweep set: no recorded sweep is ok; record some with `palpate record`"
+        )
     for one in kept:
         _check(one, kept[0].format)
     groups = {"group_recording": np.arange(len(kept))}
@@ -241,11 +280,15 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
             groups[f"group_{name}"] = numbered(texts)
     if any(one.sweep.object for one in kept):  # each run counts from 1 again
         groups["group_object"] = _ranks(
-            [(str(one.path.parent), str(one.about.get("run", "")), one.sweep.object) for one in kept]
+            [
+                (str(one.path.parent), str(one.about.get("run", "")), one.sweep.object)
+                for one in kept
+            ]
         )
     materials = [one.sweep.material for one in kept]
     samples, unloaded, moved = one_level(
-        np.stack([one.sweep.frames.taxels for one in kept]), np.stack([one.unloaded for one in kept])
+        np.stack([one.sweep.frames.taxels for one in kept]),
+        np.stack([one.unloaded for one in kept]),
     )
     source += moved
     rate = np.array(kept[0].format.rate_hz)
@@ -256,19 +299,23 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
 
 
 def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
-    """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if they had been tared alike:
-    those whose unloaded skin lies elsewhere than that of most, by what counts as a load, are moved by the difference.
+    """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if
+    they had been tared alike: those whose unloaded skin lies elsewhere than that of most, by what
+    counts as a load, are moved by the difference.
 
-    unloaded: as RecordedSweep.unloaded, of each [n, 2, R, C] or [n, 2, R, C, A]; a sweep of which it is not known stays as it
-    is. Smaller differences stay, too: a skin drifts like that in service. Whole counts stay whole, and in the range of their type.
-    Returns both as they are then, and words for the set's source: how many were moved, "" for none.
+    unloaded: as RecordedSweep.unloaded, of each [n, 2, R, C] or [n, 2, R, C, A]; a sweep of which
+    it is not known stays as it is. Smaller differences stay, too: a skin drifts like that in
+    service. Whole counts stay whole, and in the range of their type. Returns both as they are then,
+    and words for the set's source: how many were moved, "" for none.
     """
     known = np.isfinite(unloaded).all(axis=tuple(range(1, unloaded.ndim)))
     if not known.any():
         return samples, unloaded, ""
     levels = unloaded[known, 0]
     away = np.abs(levels - np.median(levels, axis=0)).sum(axis=tuple(range(1, levels.ndim)))
-    usual = levels[away.argmin()]  # one that was there: the median of two halves would be a skin that nobody has
+    usual = levels[
+        away.argmin()
+    ]  # one that was there: the median of two halves would be a skin that nobody has
     samples, unloaded, moved = samples.copy(), unloaded.copy(), 0
     for i in np.flatnonzero(known):
         level, noise = unloaded[i]
@@ -295,14 +342,23 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
     """Raises FormatError where its format differs from `wanted`, or no material is named."""
     path, n = one.path, len(one.sweep.frames)
     if one.format != wanted or n != wanted.window:
-        raise FormatError(f"{path}: {n} frames of {one.format}; others have {wanted}: give each its folder")
+        raise FormatError(
+            f"{path}: {n} frames of {one.format}; others have {wanted}: give each its folder"
+        )
     if not one.sweep.material:
-        raise FormatError(f'{path}: has no material; write it into {path.with_suffix(".json").name}, "material": "…"')
+        raise FormatError(
+            f'{path}: has no material; write it into {path.with_suffix(".json").name}, "material": "…"'
+        )
 
 
 def numbered(names: Sequence[str]) -> Array:
-    """A number for each name: its value, where all are whole numbers, else its rank among the different names."""
-    return np.array([int(name) for name in names]) if all(map(NUMBER.fullmatch, names)) else _ranks(names)
+    """A number for each name: its value, where all are whole numbers, else its rank among the
+    different names."""
+    return (
+        np.array([int(name) for name in names])
+        if all(map(NUMBER.fullmatch, names))
+        else _ranks(names)
+    )
 
 
 def _ranks(values: Sequence[Any]) -> Array:

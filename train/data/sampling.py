@@ -1,7 +1,9 @@
-"""When frames were taken. In: sampling times of a recording. Out: its rate, and runs of frames that are evenly apart.
+"""When frames were taken. In: sampling times of a recording. Out: its rate, and runs of frames that
+are evenly apart.
 
-Times come from clocks that round, drivers that deliver late, and programs that lose frames. What is even is kept as it
-is; what wanders is interpolated linearly onto even times; no run goes over a gap.
+Times come from clocks that round, drivers that deliver late, and programs that lose frames. What is
+even is kept as it is; what wanders is interpolated linearly onto even times; no run goes over a
+gap.
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ from appliance.core.errors import FormatError
 Array = NDArray[Any]
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 GAP_FRAMES = 3.5
-"""Longer than this many frames it is a gap: three frames or more are missing, as the box counts a gap."""
+"""Longer than this many frames it is a gap: three frames or more are missing, as the box counts a
+gap."""
 MOST_ROUNDING = 1.0
 """Range of the deviations from even times, in frames, that a clock's rounding explains."""
 SAME_RATE, NEAR_RATE = 0.01, 0.05
-"""Relative differences of rates: up to the first, frames are taken as they are; up to the second they are interpolated."""
+"""Relative differences of rates: up to the first, frames are taken as they are; up to the second
+they are interpolated."""
 FEWEST_BURSTS = 5
 """So many gaps that together are longer than all else lie between bursts."""
 REMEDY = "where frames are even and only their times are not, give --rate in place of --time"
@@ -30,8 +34,8 @@ BURSTS = f"its frames come in bursts, so their times say when a program read the
 
 @dataclass(frozen=True)
 class Runs:
-    """Frames that are evenly apart. parts: float or as recorded, [n, ...] each. gaps: how many lie between them.
-    interpolated: whether any part was."""
+    """Frames that are evenly apart. parts: float or as recorded, [n, ...] each. gaps: how many lie
+    between them. interpolated: whether any part was."""
 
     parts: tuple[Array, ...]
     gaps: int = 0
@@ -39,9 +43,12 @@ class Runs:
 
 
 def measured_hz(time_s: Array) -> float:
-    """The rate of a recording: of all its intervals that are no gaps. Raises FormatError where time does not go on."""
+    """The rate of a recording: of all its intervals that are no gaps. Raises FormatError where time
+    does not go on."""
     if not np.isfinite(time_s).all():
-        raise FormatError(f"the time of frame {int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1} is no number")
+        raise FormatError(
+            f"the time of frame {int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1} is no number"
+        )
     steps = np.diff(time_s)
     if not len(steps):
         raise FormatError("holds one frame")
@@ -67,11 +74,13 @@ def nominal_hz(rates: Array) -> float:
 
 
 def runs(frames: Array, time_s: Array, rate_hz: float) -> Runs:
-    """The runs of `frames` [n, ...], sampled at `time_s` [n], at `rate_hz`. Raises FormatError for another rate, or times
-    that stand still where frames are not even."""
+    """The runs of `frames` [n, ...], sampled at `time_s` [n], at `rate_hz`. Raises FormatError for
+    another rate, or times that stand still where frames are not even."""
     own_hz = measured_hz(time_s)
     if abs(own_hz / rate_hz - 1) > NEAR_RATE:
-        raise FormatError(f"is sampled at {own_hz:.4g} Hz, the set at {rate_hz:g} Hz; import it by itself")
+        raise FormatError(
+            f"is sampled at {own_hz:.4g} Hz, the set at {rate_hz:g} Hz; import it by itself"
+        )
     gaps = np.flatnonzero(np.diff(time_s) > GAP_FRAMES / own_hz) + 1
     parts, changed = [], False
     for part, t in zip(np.split(frames, gaps), np.split(time_s, gaps), strict=True):
@@ -95,7 +104,9 @@ def _wander(time_s: Array, rate_hz: float) -> float:
 def _interpolated(frames: Array, time_s: Array, rate_hz: float) -> Array:
     """Frames [m, ...] at even times, each linear between the two frames around it."""
     if len(still := np.flatnonzero(np.diff(time_s) <= 0)):
-        raise FormatError(f"frames {still[0] + 1} and {still[0] + 2} of a run have the same time; {REMEDY}")
+        raise FormatError(
+            f"frames {still[0] + 1} and {still[0] + 2} of a run have the same time; {REMEDY}"
+        )
     even = time_s[0] + np.arange(int((time_s[-1] - time_s[0]) * rate_hz * (1 + 1e-9)) + 1) / rate_hz
     flat = frames.reshape(len(frames), -1).astype(np.float64)
     columns = [np.interp(even, time_s, column) for column in flat.T]

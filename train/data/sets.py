@@ -1,7 +1,9 @@
-"""Sweep sets to train and test on. In: a user's file, or the name of a simulated or published set. Out: a checked Dataset.
+"""Sweep sets to train and test on. In: a user's file, or the name of a simulated or published set.
+Out: a checked Dataset.
 
-A set knows which sweeps belong together (`groups`); it can be narrowed to some of them and split so that no recording is
-on both sides. appliance.core.sweep_set says what a file must hold; readers.py reads it.
+A set knows which sweeps belong together (`groups`); it can be narrowed to some of them and split so
+that no recording is on both sides. appliance.core.sweep_set says what a file must hold; readers.py
+reads it.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import published, readers
 
-SIMULATED = re.compile(r"sim:(?P<name>[^:]+?)(?P<shear>x3)?(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?")
+SIMULATED = re.compile(
+    r"sim:(?P<name>[^:]+?)(?P<shear>x3)?(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?"
+)
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
 OWN_NUMBERS = ("recording", "position", "session", "object")
 """Groups whose numbers only mean something within their set."""
@@ -35,11 +39,14 @@ class Dataset(sweep_set.SweepSet):
     def require_materials(self) -> Dataset:
         """The set itself. Raises FormatError where all its sweeps are of one material."""
         if len(present := np.unique(self.labels)) < 2:
-            raise self._error(f"only one class, {self.materials[present[0]]!r}; a classifier needs two")
+            raise self._error(
+                f"only one class, {self.materials[present[0]]!r}; a classifier needs two"
+            )
         return self
 
     def require_pure_recordings(self) -> Dataset:
-        """The set itself. Raises FormatError where a recording is of several materials: no answer for it could be right."""
+        """The set itself. Raises FormatError where a recording is of several materials: no answer
+        for it could be right."""
         values, _, counts = self.counts_by("recording")
         if len(several := values[(counts > 0).sum(axis=1) > 1]):
             raise self._error(
@@ -49,17 +56,25 @@ class Dataset(sweep_set.SweepSet):
         return self
 
     def take(self, index: Array) -> Dataset:
-        """The sweeps `index` (mask or numbers) with all materials, so that labels keep their meaning."""
+        """The sweeps `index` (mask or numbers) with all materials, so that labels keep their
+        meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
         unloaded = None if self.unloaded is None else self.unloaded[index]
-        return replace(self, samples=self.samples[index], labels=self.labels[index], groups=groups, unloaded=unloaded)
+        return replace(
+            self,
+            samples=self.samples[index],
+            labels=self.labels[index],
+            groups=groups,
+            unloaded=unloaded,
+        )
 
     def select(self, conditions: Sequence[str]) -> Dataset:
         """The sweeps for which all conditions hold, without materials that do not occur.
 
-        A condition is a group and a limit ("force<=180") or any of several values ("force=100,150"); materials go by name
-        ("material=Canvas,Linen"). Raises FormatError where a condition cannot be read, its group or a value of it does
-        not occur, or fewer than two classes remain.
+        A condition is a group and a limit ("force<=180") or any of several values
+        ("force=100,150"); materials go by name ("material=Canvas,Linen"). Raises FormatError where
+        a condition cannot be read, its group or a value of it does not occur, or fewer than two
+        classes remain.
         """
         keep = np.ones(len(self), bool)
         for text in conditions:
@@ -73,7 +88,9 @@ class Dataset(sweep_set.SweepSet):
     def _matches(self, condition: str) -> Array:
         """bool [N], the sweeps for which one condition holds."""
         if not (found := CONDITION.fullmatch(condition)):
-            raise self._error(f"condition {condition!r} cannot be read; write a group, one of = <= >=, whole numbers")
+            raise self._error(
+                f"condition {condition!r} cannot be read; write a group, one of = <= >=, whole numbers"
+            )
         name, operator, text = found.groups()
         if name == "material":
             column, values = (
@@ -82,7 +99,10 @@ class Dataset(sweep_set.SweepSet):
             )
         else:
             try:
-                column, values = self.group(name), np.array([int(value) for value in text.split(",")])
+                column, values = (
+                    self.group(name),
+                    np.array([int(value) for value in text.split(",")]),
+                )
             except ValueError:
                 raise self._error(
                     f"condition {condition!r} cannot be read; {text.strip()!r} is no whole number"
@@ -95,30 +115,40 @@ class Dataset(sweep_set.SweepSet):
             return LIMITS[operator](column, values[0])
         for value in values:
             if not (column == value).any():
-                raise self._error(f"no sweep fulfils {name}={value}; it has {shortened(np.unique(column).tolist())}")
+                raise self._error(
+                    f"no sweep fulfils {name}={value}; it has {shortened(np.unique(column).tolist())}"
+                )
         return np.isin(column, values)
 
     def without_means(self) -> Dataset:
-        """The set with each taxel's mean over the window subtracted: samples float32, zero where a taxel is constant.
+        """The set with each taxel's mean over the window subtracted: samples float32, zero where a
+        taxel is constant.
 
-        What is left is texture: the mean alone often reveals the session in which a material was recorded.
+        What is left is texture: the mean alone often reveals the session in which a material was
+        recorded.
         """
-        means = self.samples.mean(axis=1, keepdims=True, dtype=np.float64)  # exact where a taxel is constant
-        samples = np.subtract(self.samples, means, out=np.empty(self.samples.shape, np.float32), casting="same_kind")
+        means = self.samples.mean(
+            axis=1, keepdims=True, dtype=np.float64
+        )  # exact where a taxel is constant
+        samples = np.subtract(
+            self.samples, means, out=np.empty(self.samples.shape, np.float32), casting="same_kind"
+        )
         return replace(self, samples=samples, unloaded=None)
 
     def counts_by(self, by: str) -> tuple[Array, Array, Array]:
-        """The values [V] of group `by`, the index of each sweep's value [N], and the sweeps of each material [V, K]."""
+        """The values [V] of group `by`, the index of each sweep's value [N], and the sweeps of each
+        material [V, K]."""
         values, member = np.unique(self.group(by), return_inverse=True)
         counts = np.zeros((len(values), len(self.materials)), int)
         np.add.at(counts, (member, self.labels), 1)
         return values, member, counts
 
     def split(self, by: str, share: float, seed: int) -> tuple[Dataset, Dataset]:
-        """Two parts, the first with about `share` of each material's groups `by`; no group is in both.
+        """Two parts, the first with about `share` of each material's groups `by`; no group is in
+        both.
 
-        Raises FormatError where a recording would be in both, where the groups are too few, or where the first part would
-        lack a material.
+        Raises FormatError where a recording would be in both, where the groups are too few, or
+        where the first part would lack a material.
         """
         if not 0 < share < 1:
             raise self._error(f"a share of {share} splits nothing; use more than 0 and less than 1")
@@ -134,30 +164,39 @@ class Dataset(sweep_set.SweepSet):
             raise self._error(f"groups {by!r} cut recordings in two; split by recording instead")
         if inside.all() or len(missing := np.setdiff1d(self.labels, self.labels[inside])):
             lacks = "is everything" if inside.all() else f"lacks {self.materials[missing[0]]!r}"
-            raise self._error(f"split by {by!r}: the first part {lacks}; it has {len(names)} groups, use a finer one")
+            raise self._error(
+                f"split by {by!r}: the first part {lacks}; it has {len(names)} groups, use a finer one"
+            )
         return self.take(inside), self.take(~inside)
 
     def save(self, path: Path) -> None:
-        """Write the set for `load`: as HDF5 where the name ends in .h5 or .hdf5, else as a compressed .npz."""
+        """Write the set for `load`: as HDF5 where the name ends in .h5 or .hdf5, else as a
+        compressed .npz."""
         groups = {f"group_{k}": v for k, v in self.groups.items()}
         rate = np.array(self.rate_hz)
-        arrays: dict[str, Array] = {"samples": self.samples, "labels": self.labels, "rate_hz": rate} | groups
+        arrays: dict[str, Array] = {
+            "samples": self.samples,
+            "labels": self.labels,
+            "rate_hz": rate,
+        } | groups
         if self.unloaded is not None:
             arrays["unloaded"] = self.unloaded
         if path.suffix in readers.HDF5:
             readers.write_hdf5(path, arrays | {"materials": list(self.materials)})
         else:
             with path.open("wb") as f:
-                np.savez_compressed(f, allow_pickle=False, materials=np.array(self.materials), **arrays)
+                np.savez_compressed(
+                    f, allow_pickle=False, materials=np.array(self.materials), **arrays
+                )
 
 
 def load(spec: str, seed: int = 0) -> Dataset:
-    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or
-    aeon:NAME.
+    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings,
+    sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME.
 
-    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several simulated scenes, each
-    with positions of its own.
-    seed: for a simulated set that names none. Raises FormatError where the set is missing, broken or unknown.
+    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several
+    simulated scenes, each with positions of its own. seed: for a simulated set that names none.
+    Raises FormatError where the set is missing, broken or unknown.
     """
     if spec.startswith("sim:"):
         return _simulated(spec, seed)
@@ -168,15 +207,19 @@ def load(spec: str, seed: int = 0) -> Dataset:
 
 
 def join(sets: Sequence[Dataset]) -> Dataset:
-    """One set of several with the same format and materials, the groups that all have, and the group `set`, its index.
+    """One set of several with the same format and materials, the groups that all have, and the
+    group `set`, its index.
 
-    Recordings, positions, sessions and objects are renumbered, since number 0 of two sets is not the same one; a force or
-    a speed is. Where the skin was tared between, all are brought to one level, as in a folder. A single set is not changed.
-    Raises FormatError where the sets differ in format or materials.
+    Recordings, positions, sessions and objects are renumbered, since number 0 of two sets is not
+    the same one; a force or a speed is. Where the skin was tared between, all are brought to one
+    level, as in a folder. A single set is not changed. Raises FormatError where the sets differ in
+    format or materials.
     """
     if len(sets) == 1:
         return sets[0]
-    return _joined([replace(s, groups=s.groups | {"set": np.full(len(s), i)}) for i, s in enumerate(sets)])
+    return _joined(
+        [replace(s, groups=s.groups | {"set": np.full(len(s), i)}) for i, s in enumerate(sets)]
+    )
 
 
 def _joined(sets: Sequence[Dataset]) -> Dataset:
@@ -196,7 +239,9 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
             starts = np.cumsum([0] + [int(np.ptp(part)) + 1 for part in parts])
             parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
         groups[name] = np.concatenate(parts)
-    samples, labels = (np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels"))
+    samples, labels = (
+        np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels")
+    )
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
     if unloaded is not None:  # each set is at a level by itself; that of the other may be another
         samples, unloaded, moved = readers.one_level(samples, unloaded)
@@ -209,7 +254,10 @@ def _unloaded(sets: Sequence[Dataset]) -> Array | None:
     if all(s.unloaded is None for s in sets):
         return None
     known: Array = np.concatenate(
-        [np.full((len(s), 2, *s.format.shape), np.nan) if s.unloaded is None else s.unloaded for s in sets]
+        [
+            np.full((len(s), 2, *s.format.shape), np.nan) if s.unloaded is None else s.unloaded
+            for s in sets
+        ]
     )
     return known
 
@@ -234,9 +282,12 @@ def _simulated(spec: str, seed: int) -> Dataset:
 
 
 def digest(sweeps: Dataset) -> str:
-    """16 hex digits (SHA-256) of everything but the source: the same for the same data, whatever file it came from."""
+    """16 hex digits (SHA-256) of everything but the source: the same for the same data, whatever
+    file it came from."""
     x, names = sweeps.samples, sorted(sweeps.groups)
-    total = hashlib.sha256(repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode())
+    total = hashlib.sha256(
+        repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode()
+    )
     for numbers in (sweeps.labels, *(sweeps.groups[name] for name in names)):
         total.update(numbers.astype("<i8").tobytes())
     if sweeps.unloaded is not None:

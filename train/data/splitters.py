@@ -1,7 +1,8 @@
-"""Evaluation protocols: which sweeps train and which test. In: a text such as "leave:position". Out: a splitter.
+"""Evaluation protocols: which sweeps train and which test. In: a text such as "leave:position".
+Out: a splitter.
 
-Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training, test), with recordings
-as `groups`. No splitter ever has parts of one recording on both sides.
+Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training,
+test), with recordings as `groups`. No splitter ever has parts of one recording on both sides.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
 
 
 class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
-    """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's overestimate."""
+    """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's
+    overestimate."""
 
     def __init__(self, folds: int, seed: int, materials: Sequence[str]) -> None:
         self.folds, self.seed, self.materials = folds, seed, materials
@@ -52,11 +54,14 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
                     f"random:{self.folds} needs {self.folds} recordings of each material; {self.materials[label]!r} has {n}: "
                     f"use random:{n} or less"
                 )
-        yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(y, y, groups)
+        yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(
+            y, y, groups
+        )
 
 
 class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
-    """Tested on one value of the group `name` at a time, trained on all others, as in leave-one-position-out."""
+    """Tested on one value of the group `name` at a time, trained on all others, as in
+    leave-one-position-out."""
 
     def __init__(self, name: str, group: Array) -> None:
         self.name, self.group = name, group
@@ -66,7 +71,8 @@ class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
         return len(np.unique(self.group))
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """Pairs (training, test) of sweep numbers. Raises FormatError where the group cannot be left out."""
+        """Pairs (training, test) of sweep numbers. Raises FormatError where the group cannot be
+        left out."""
         if (n := self.get_n_splits()) < 2:
             raise FormatError(
                 f"leave:{self.name} needs two values of the group {self.name!r}; all sweeps have {self.group[0]} "
@@ -78,7 +84,8 @@ class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
 
 
 class TrainTest(BaseCrossValidator):  # type: ignore[misc]
-    """Trained on some values of the group `name`, tested on others: T-REAL against T-HARD, first block against last."""
+    """Trained on some values of the group `name`, tested on others: T-REAL against T-HARD, first
+    block against last."""
 
     def __init__(self, name: str, group: Array, train: Sequence[int], test: Sequence[int]) -> None:
         self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
@@ -88,14 +95,25 @@ class TrainTest(BaseCrossValidator):  # type: ignore[misc]
         return 1
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """The pair (training, test) of sweep numbers. Raises FormatError where a value is on both sides or unknown."""
+        """The pair (training, test) of sweep numbers. Raises FormatError where a value is on both
+        sides or unknown."""
         present = np.unique(self.group)
         for value in (*self.train, *self.test):
             if value not in present:
-                raise FormatError(f"group {self.name!r} has no {value}; it has {', '.join(map(str, present[:20]))}")
+                raise FormatError(
+                    f"group {self.name!r} has no {value}; it has {', '.join(map(str, present[:20]))}"
+                )
         if both := set(self.train) & set(self.test):
-            raise FormatError(f"{self.name}={min(both)} is on both sides of the split; name it once")
-        yield _checked(f"split:{self.name}", np.isin(self.group, self.train), np.isin(self.group, self.test), y, groups)
+            raise FormatError(
+                f"{self.name}={min(both)} is on both sides of the split; name it once"
+            )
+        yield _checked(
+            f"split:{self.name}",
+            np.isin(self.group, self.train),
+            np.isin(self.group, self.test),
+            y,
+            groups,
+        )
 
 
 @dataclass(frozen=True)
@@ -111,7 +129,8 @@ class Protocol:
             raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
 
     def splitter(self, sweeps: Dataset, seed: int) -> BaseCrossValidator:
-        """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an unknown group."""
+        """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an
+        unknown group."""
         if found := RANDOM.fullmatch(self.text):
             return RandomFolds(int(found[1]), seed, sweeps.materials)
         if found := LEAVE.fullmatch(self.text):
@@ -119,16 +138,23 @@ class Protocol:
         found = SPLIT.fullmatch(self.text)
         assert found
         name, train, test = found.groups()
-        return TrainTest(name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test)))
+        return TrainTest(
+            name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test))
+        )
 
     def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
-        """All pairs (training, test) of sweep numbers. Raises FormatError where `sweeps` cannot be split so."""
+        """All pairs (training, test) of sweep numbers. Raises FormatError where `sweeps` cannot be
+        split so."""
         sweeps.require_materials().require_pure_recordings()
-        return list(self.splitter(sweeps, seed).split(sweeps.samples, sweeps.labels, sweeps.group("recording")))
+        return list(
+            self.splitter(sweeps, seed).split(
+                sweeps.samples, sweeps.labels, sweeps.group("recording")
+            )
+        )
 
     def clusters(self, sweeps: Dataset) -> Array | None:
-        """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else recordings of several
-        windows; None where sweeps are independent."""
+        """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else
+        recordings of several windows; None where sweeps are independent."""
         if found := LEAVE.fullmatch(self.text):
             return sweeps.group(found[1])
         recording = sweeps.group("recording")
@@ -136,24 +162,31 @@ class Protocol:
 
 
 def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
-    """At most `each` of the sweeps `train` of every material, their numbers in order. labels: int [N], of all sweeps.
+    """At most `each` of the sweeps `train` of every material, their numbers in order. labels: int
+    [N], of all sweeps.
 
-    The same seed draws more of the same sweeps for a larger `each`, so that a learning curve adds to what was there.
+    The same seed draws more of the same sweeps for a larger `each`, so that a learning curve adds
+    to what was there.
     """
     rng = np.random.default_rng(seed)
     mine = labels[train]
-    return np.sort(np.concatenate([rng.permutation(train[mine == label])[:each] for label in np.unique(mine)]))
+    return np.sort(
+        np.concatenate([rng.permutation(train[mine == label])[:each] for label in np.unique(mine)])
+    )
 
 
 def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
-    """The masks as numbers. Raises FormatError where the sides share a recording or there is too little to train on."""
+    """The masks as numbers. Raises FormatError where the sides share a recording or there is too
+    little to train on."""
     if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
         raise FormatError(
             f"{what}: {len(shared)} recordings, {min(shared)} among them, would be trained on and tested on; "
             "choose a group that does not cut recordings"
         )
     if len(np.unique(labels[train])) < 2:
-        raise FormatError(f"{what}: {train.sum()} sweeps of less than two materials are left to train on")
+        raise FormatError(
+            f"{what}: {train.sum()} sweeps of less than two materials are left to train on"
+        )
     return np.flatnonzero(train), np.flatnonzero(test)
 
 
@@ -164,26 +197,35 @@ RANDOM_PARTS = 5
 
 @dataclass(frozen=True)
 class InnerPart:
-    """Sweeps of a training set that judge what was fitted to the others. group: what their values belong to. out: [N]."""
+    """Sweeps of a training set that judge what was fitted to the others. group: what their values
+    belong to. out: [N]."""
 
     group: str
     out: Array
 
 
 def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
-    """Each group that can be left out, in `most` parts at most; recordings, materials spread evenly, where there is none.
+    """Each group that can be left out, in `most` parts at most; recordings, materials spread
+    evenly, where there is none.
 
     The first part of every group comes first, then the second ones.
 
-    A group can be left out where it does not cut recordings in two, and where every material that is tested remains.
-    Raises FormatError where nothing can be left out.
+    A group can be left out where it does not cut recordings in two, and where every material that
+    is tested remains. Raises FormatError where nothing can be left out.
     """
-    of_all = [_parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET]
+    of_all = [
+        _parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET
+    ]
     if any(of_all):
         return [part for turn in zip_longest(*of_all) for part in turn if part]
-    fewest = min(len(np.unique(sweeps.group("recording")[sweeps.labels == k])) for k in np.unique(sweeps.labels))
+    fewest = min(
+        len(np.unique(sweeps.group("recording")[sweeps.labels == k]))
+        for k in np.unique(sweeps.labels)
+    )
     if fewest < 2:
-        raise FormatError(f"{sweeps.source}: a material has one recording; two of each are needed to choose a model by")
+        raise FormatError(
+            f"{sweeps.source}: a material has one recording; two of each are needed to choose a model by"
+        )
     drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
     return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
 
@@ -191,7 +233,9 @@ def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
 def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
     values, recording = sweeps.group(name), sweeps.group("recording")
     shuffled = np.random.default_rng(0).permutation(np.unique(values))
-    if len(shuffled) < 2 or len(np.unique(np.stack([recording, values]), axis=1).T) > len(np.unique(recording)):
+    if len(shuffled) < 2 or len(np.unique(np.stack([recording, values]), axis=1).T) > len(
+        np.unique(recording)
+    ):
         return []
     parts = [np.isin(values, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
     labels = sweeps.labels

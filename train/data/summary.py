@@ -1,7 +1,7 @@
 """Describes sweep sets. In: the name of a set. Out: its counts, gaps and faults as lines of text.
 
-An incomplete folder of recordings is described too: recordings without a name are counted, and the reason why the folder
-cannot be trained on yet is given.
+An incomplete folder of recordings is described too: recordings without a name are counted, and the
+reason why the folder cannot be trained on yet is given.
 """
 
 from __future__ import annotations
@@ -28,12 +28,17 @@ UNNAMED = "(none)"
 
 
 def describe(spec: str) -> str:
-    """The contents of the set that `spec` names, as lines. Raises FormatError where it is missing, broken or unknown."""
+    """The contents of the set that `spec` names, as lines. Raises FormatError where it is missing,
+    broken or unknown."""
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
         return "\n".join(
-            [*description(whole, {}), *(f"  {line}" for line in warnings_of(whole)), *_unsendable(whole.materials)]
+            [
+                *description(whole, {}),
+                *(f"  {line}" for line in warnings_of(whole)),
+                *_unsendable(whole.materials),
+            ]
         )
     recorded = readers.recorded(folder)
     named, names = _named(recorded)
@@ -42,18 +47,24 @@ def describe(spec: str) -> str:
     kept = [one.sweep for one in readers.ok(recorded)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
-        lines.append(f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours")
+        lines.append(
+            f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours"
+        )
     try:
         readers.joined(recorded, folder, Dataset).require_materials()
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
-    return "\n".join([*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))])
+    return "\n".join(
+        [*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))]
+    )
 
 
 def warnings_of(sweeps: Dataset) -> list[str]:
     """What a model can be trained on, but should not be without a look: one line each."""
     lines = []
-    if still := np.argwhere(sweeps.samples.min(axis=(0, 1)) == sweeps.samples.max(axis=(0, 1))).tolist():
+    if still := np.argwhere(
+        sweeps.samples.min(axis=(0, 1)) == sweeps.samples.max(axis=(0, 1))
+    ).tolist():
         listed = shortened([".".join(str(i + 1) for i in place) for place in still])
         lines.append(
             f"warning: taxels that never change in any sweep: {listed}; check the skin with `palpate skin show`"
@@ -67,7 +78,8 @@ def warnings_of(sweeps: Dataset) -> list[str]:
 
 
 def half_known(sweeps: Dataset) -> list[str]:
-    """A line where some sweeps know the unloaded skin and others do not: whether these compare cannot be told."""
+    """A line where some sweeps know the unloaded skin and others do not: whether these compare
+    cannot be told."""
     if sweeps.unloaded is None:
         return []
     known = int(np.isfinite(sweeps.unloaded).all(axis=tuple(range(1, sweeps.unloaded.ndim))).sum())
@@ -81,16 +93,23 @@ def half_known(sweeps: Dataset) -> list[str]:
 
 def _unsendable(materials: Iterable[str]) -> list[str]:
     """A line where `fit` refuses names of materials."""
-    return [f"  cannot be trained on yet: {why}; {labels.REMEDY}"] if (why := labels.unsendable(materials)) else []
+    return (
+        [f"  cannot be trained on yet: {why}; {labels.REMEDY}"]
+        if (why := labels.unsendable(materials))
+        else []
+    )
 
 
 def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
-    """The recordings, UNNAMED where some have a name and others none, and the names of the groups' numbers."""
+    """The recordings, UNNAMED where some have a name and others none, and the names of the groups'
+    numbers."""
     kept, names = [one.sweep for one in readers.ok(recorded)], {}
     groups = [by for by in readers.NAMED if any(getattr(sweep, by) for sweep in kept)]
 
     def name(one: RecordedSweep) -> RecordedSweep:
-        missing: dict[str, Any] = {by: UNNAMED for by in ("material", *groups) if not getattr(one.sweep, by)}
+        missing: dict[str, Any] = {
+            by: UNNAMED for by in ("material", *groups) if not getattr(one.sweep, by)
+        }
         return replace(one, sweep=replace(one.sweep, **missing))
 
     named = [name(one) for one in recorded]
@@ -101,7 +120,8 @@ def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Name
 
 
 def description(sweeps: Dataset, names: Names) -> list[str]:
-    """The contents of a set: sweeps and their form, materials, recordings, groups and what is confounded."""
+    """The contents of a set: sweeps and their form, materials, recordings, groups and what is
+    confounded."""
     fmt = sweeps.format
     _, _, per_recording = sweeps.counts_by("recording")
     least, most = (windows := per_recording.sum(axis=1)).min(), windows.max()
@@ -110,33 +130,46 @@ def description(sweeps: Dataset, names: Names) -> list[str]:
         f"  recordings: {len(windows)}, of {least if least == most else f'{least} to {most}'} each",
     ]
     if several := np.count_nonzero((per_recording > 0).sum(axis=1) > 1):
-        lines.append(f"    {several} of them hold sweeps of several materials: number recordings within one material")
+        lines.append(
+            f"    {several} of them hold sweeps of several materials: number recordings within one material"
+        )
     each = zip(sweeps.materials, per_recording.sum(axis=0), strict=True)
-    lines.append(f"  materials: {len(sweeps.materials)}: {', '.join(f'{name} {n}' for name, n in each)}")
+    lines.append(
+        f"  materials: {len(sweeps.materials)}: {', '.join(f'{name} {n}' for name, n in each)}"
+    )
     for by in sorted(set(sweeps.groups) - {"recording"}):
         values, _, counts = sweeps.counts_by(by)
         name_of = names.get(by, {})
         shown = [name_of.get(value, str(value)) for value in values.tolist()]
-        both = [f"{v} {text}" if text != str(v) else text for v, text in zip(values, shown, strict=True)]
+        both = [
+            f"{v} {text}" if text != str(v) else text for v, text in zip(values, shown, strict=True)
+        ]
         lines.append(f"  {by}: {len(values)}: {shortened(both)}")
-        lines += [f"    confounded: {why}" for why in _confounded(shown, counts > 0, sweeps.materials)]
+        lines += [
+            f"    confounded: {why}" for why in _confounded(shown, counts > 0, sweeps.materials)
+        ]
         if by in readers.NAMED and len(values) <= MAX_COLUMNS:
             lines += [f"    {line}" for line in table(sweeps.materials, shown, counts)]
     return lines
 
 
 def table(materials: Sequence[str], columns: Sequence[str], counts: Array) -> list[str]:
-    """Lines: sweeps of each material in each column, with totals; a dot where there is none. counts: [columns, K]."""
+    """Lines: sweeps of each material in each column, with totals; a dot where there is none.
+    counts: [columns, K]."""
     totals = np.vstack([counts, counts.sum(axis=0)]).T
     totals = np.vstack([totals, totals.sum(axis=0)])
     rows = [["", *columns, "all"]]
-    rows += [[name, *(str(n or "·") for n in row)] for name, row in zip([*materials, "all"], totals, strict=True)]
+    rows += [
+        [name, *(str(n or "·") for n in row)]
+        for name, row in zip([*materials, "all"], totals, strict=True)
+    ]
     first, *wide = (max(map(len, column)) for column in zip(*rows, strict=True))
     return ["  ".join([row[0].ljust(first), *map(str.rjust, row[1:], wide)]) for row in rows]
 
 
 def _confounded(values: Sequence[str], holds: Array, materials: Sequence[str]) -> Iterator[str]:
-    """How a group of several values reveals the material, or removes one when left out. holds: bool [V, K]."""
+    """How a group of several values reveals the material, or removes one when left out. holds: bool
+    [V, K]."""
     if len(values) < 2:
         return
     if len(single := np.flatnonzero(holds.sum(axis=1) == 1)):
@@ -157,7 +190,9 @@ def known() -> str:
     ]
     for name, (positions, each) in skin.SETS.items():
         total = positions * each * tubes
-        lines.append(f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes at {positions} position(s)")
+        lines.append(
+            f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes at {positions} position(s)"
+        )
     lines.append(
         f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty simulated scenes joined, for narrow intervals"
     )

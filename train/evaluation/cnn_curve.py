@@ -1,8 +1,11 @@
-"""The paper's CNN followed while it learns: accuracy over iterations at new positions and a row off. In: a size, a seed.
+"""The paper's CNN followed while it learns: accuracy over iterations at new positions and a row
+off. In: a size, a seed.
 
-Out: a curve in a file, beside the two accuracies that the paper prints, with the newest answers, which the paper's page shows.
-Trained whole it takes an hour of one core, so there is a small one to compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
-iterations at ten times the rate. An interrupted training goes on from the file and a checkpoint beside it.
+Out: a curve in a file, beside the two accuracies that the paper prints, with the newest answers,
+which the paper's page shows. Trained whole it takes an hour of one core, so there is a small one to
+compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
+iterations at ten times the rate. An interrupted training goes on from the file and a checkpoint
+beside it.
 """
 
 from __future__ import annotations
@@ -27,13 +30,20 @@ from train.metrics import score
 from train.models import paper_cnn
 from train.models.networks import Network
 from train.models.paper_cnn import PAPER_RECIPE, ImageLayers
-from train.models.training import TrainingRecipe, batches, deterministic_device, float_batches, learn
+from train.models.training import (
+    TrainingRecipe,
+    batches,
+    deterministic_device,
+    float_batches,
+    learn,
+)
 
 Array = NDArray[Any]
 PRINTED = {"new": 0.923, "hard": 0.917}
 """Figs. 5, 7 and 10: leave one position out, and T-HARD."""
 APART = 1000
-"""T-REAL of the seed + APART stands for positions that were left out: as the ninth, but more of them."""
+"""T-REAL of the seed + APART stands for positions that were left out: as the ninth, but more of
+them."""
 ATTACHMENTS = 20
 FIRST_MARK = 25
 EACH = {"train": 10, "new": 3, "hard": 3}
@@ -51,14 +61,17 @@ class Size:
 
 SIZES = {
     "small": Size(
-        replace(paper_cnn.PAPER, channels=(8, 16), dense=256), 750, replace(PAPER_RECIPE, steps=600, peak_rate=1e-3)
+        replace(paper_cnn.PAPER, channels=(8, 16), dense=256),
+        750,
+        replace(PAPER_RECIPE, steps=600, peak_rate=1e-3),
     ),
     "whole": Size(paper_cnn.PAPER, 1500, replace(PAPER_RECIPE, steps=paper_cnn.PAPER_STEPS)),
 }
 
 
 def draw(seed: int, world: skin.World, window: int, each: dict[str, int]) -> dict[str, Dataset]:
-    """The sets "train", "new" and "hard" of a simulated world, the first `window` frames of each sweep."""
+    """The sets "train", "new" and "hard" of a simulated world, the first `window` frames of each
+    sweep."""
     hard = range(ATTACHMENTS * (seed - 1) + 1, ATTACHMENTS * seed + 1)
     named: dict[str, list[tuple[skin.SetName, int]]] = {
         "train": [("T-REAL", seed)],
@@ -71,7 +84,11 @@ def draw(seed: int, world: skin.World, window: int, each: dict[str, int]) -> dic
         for name, number in those:
             samples, labels, position = skin.sweep_set(name, number, each[key], world)
             groups = {"position": position}
-            parts.append(Dataset(samples[:, :window], labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, name))
+            parts.append(
+                Dataset(
+                    samples[:, :window], labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, name
+                )
+            )
         drawn[key] = sets.join(parts)
     return drawn
 
@@ -86,10 +103,11 @@ def follow(
     log: Callable[[str], None] = lambda line: None,
     each: dict[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Train, and write a point of the curve into `out` at each of `marks`; what the file then holds.
+    """Train, and write a point of the curve into `out` at each of `marks`; what the file then
+    holds.
 
-    centred: behind a layer that subtracts each taxel's mean. steps: None for those of the size. Computed in bfloat16 where
-    the processor can. Raises OSError where `out` cannot be written.
+    centred: behind a layer that subtracts each taxel's mean. steps: None for those of the size.
+    Computed in bfloat16 where the processor can. Raises OSError where `out` cannot be written.
     """
     form, each = SIZES[size], each or EACH
     about = [size, seed, centred, repr(world), steps, each]
@@ -97,7 +115,12 @@ def follow(
     unfinished, result = out.with_suffix(".pt"), _kept(out, about)
     if result is None:
         unfinished.unlink(missing_ok=True)  # of another training
-        start: dict[str, Any] = {"about": about, "printed": PRINTED, "steps": recipe.steps, "points": []}
+        start: dict[str, Any] = {
+            "about": about,
+            "printed": PRINTED,
+            "steps": recipe.steps,
+            "points": [],
+        }
         result = start | score.provenance()
         _write(out, result)
     if any(point["step"] == recipe.steps for point in result["points"]):
@@ -114,7 +137,10 @@ def follow(
 
     with deterministic_device(seed) as device:
         half = device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16"))
-        build, train = paper_cnn.build_centred if centred else paper_cnn.build_paper_cnn, given["train"]
+        build, train = (
+            paper_cnn.build_centred if centred else paper_cnn.build_paper_cnn,
+            given["train"],
+        )
         network = build(train.format, len(train.materials), train.samples, form.layers)
         learn(network, train, recipe, seed, log, device, half, unfinished=unfinished, watch=watch)
     unfinished.unlink(missing_ok=True)
@@ -122,13 +148,15 @@ def follow(
 
 
 def marks(steps: int) -> list[int]:
-    """Iterations at which the accuracy is measured: FIRST_MARK, twice, four times as many and so on, and the last."""
+    """Iterations at which the accuracy is measured: FIRST_MARK, twice, four times as many and so
+    on, and the last."""
     doubled = [FIRST_MARK * 2**i for i in range(20)]
     return [*(mark for mark in doubled if mark < steps), steps]
 
 
 def _kept(out: Path, about: Sequence[Any]) -> dict[str, Any] | None:
-    """What an earlier run of the same training wrote; None where there is nothing, or of another one."""
+    """What an earlier run of the same training wrote; None where there is nothing, or of another
+    one."""
     try:
         kept: dict[str, Any] = json.loads(out.read_text())
     except (OSError, ValueError):
@@ -153,14 +181,19 @@ def _logits(network: Network, samples: Array) -> Array:
 
 def _given(logits: Array, sweeps: Dataset) -> dict[str, Any]:
     """What the network answers to each sweep, as JSON."""
-    return {"labels": sweeps.labels.tolist(), "position": sweeps.group("position").tolist(),
-            "logits": logits.astype(float).round(4).tolist()}  # fmt: skip
+    return {
+        "labels": sweeps.labels.tolist(),
+        "position": sweeps.group("position").tolist(),
+        "logits": logits.astype(float).round(4).tolist(),
+    }
 
 
 def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any]:
-    """Of each set the share of right answers and its 95 % interval over positions; the confusion of all but training, of
-    which there is the cross entropy."""
-    point: dict[str, Any] = {"cost": round(float(log_loss(given["train"].labels, softmax(logits["train"]))), 6)}
+    """Of each set the share of right answers and its 95 % interval over positions; the confusion of
+    all but training, of which there is the cross entropy."""
+    point: dict[str, Any] = {
+        "cost": round(float(log_loss(given["train"].labels, softmax(logits["train"]))), 6)
+    }
     for name, sweeps in given.items():
         named = logits[name].argmax(1)
         right = named == sweeps.labels
@@ -176,8 +209,10 @@ def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any
 def table(result: dict[str, Any]) -> str:
     """A line for each point, for a person."""
     size, seed, centred = result["about"][:3]
-    lines = [f"{size}{', means removed' * centred}, seed {seed}; printed {PRINTED['new']} and {PRINTED['hard']}",
-             f"{'iteration':>9}  {'training':<9} {'new positions':<24} T-HARD"]  # fmt: skip
+    lines = [
+        f"{size}{', means removed' * centred}, seed {seed}; printed {PRINTED['new']} and {PRINTED['hard']}",
+        f"{'iteration':>9}  {'training':<9} {'new positions':<24} T-HARD",
+    ]
     for point in result["points"]:
         new, hard = ("{:.3f} [{:.3f}, {:.3f}]".format(*point[name]) for name in ("new", "hard"))
         lines.append(f"{point['step']:>9}  {point['train'][0]:<9.3f} {new:<24} {hard}")

@@ -1,8 +1,10 @@
-"""Corruptions: the ways in which a sweep goes wrong. In: test sweeps. Out: the same sweeps with one thing wrong.
+"""Corruptions: the ways in which a sweep goes wrong. In: test sweeps. Out: the same sweeps with one
+thing wrong.
 
-Each corruption is one entry of CORRUPTIONS, in steps from none to severe. What can be physical is: simulated sweeps are
-drawn anew with the skin, the force or the window elsewhere, each from its own random stream. The rest is done to the raw
-counts, which are digitized again. What is drawn does not depend on the severity: a corruption only grows with it.
+Each corruption is one entry of CORRUPTIONS, in steps from none to severe. What can be physical is:
+simulated sweeps are drawn anew with the skin, the force or the window elsewhere, each from its own
+random stream. The rest is done to the raw counts, which are digitized again. What is drawn does not
+depend on the severity: a corruption only grows with it.
 """
 
 from __future__ import annotations
@@ -29,19 +31,21 @@ HUM_HZ = 50.0
 NOISY = 4.0
 """Noise of a noisy taxel, in deviations of the set."""
 GAIN_LAW = 0.25
-"""Of the shifted grid: gains are drawn evenly within this range each way, on a logarithmic scale, at the severest shift."""
+"""Of the shifted grid: gains are drawn evenly within this range each way, on a logarithmic scale,
+at the severest shift."""
 USUAL_SWEEPS = 120
 """Test sweeps of a file that are corrupted; more narrow the intervals and slow everything down."""
 REST_S = 0.1
-"""How long the simulated finger rests before and after the slide, which is as long as the window."""
+"""How long the simulated finger rests before and after the slide, which is as long as the
+window."""
 
 
 @dataclass(frozen=True)
 class SimulatedScene:
     """Simulated sweeps that can be drawn anew, each from the random stream that it had.
 
-    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each sweep is of. physics: as
-    they were drawn.
+    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each
+    sweep is of. physics: as they were drawn.
     """
 
     materials: tuple[str, ...]
@@ -55,15 +59,19 @@ class SimulatedScene:
         world: skin.World | None = None,
         late_ms: Array | float = 0.0,
     ) -> Array:
-        """Raw counts [N, 1500, 4, 4] or [N, 1500, 4, 4, 3] of the sweeps with changed placements or in a changed world.
+        """Raw counts [N, 1500, 4, 4] or [N, 1500, 4, 4, 3] of the sweeps with changed placements or
+        in a changed world.
 
-        late_ms: a number or [N], at most 100 either way: start of the window minus start of the slide.
+        late_ms: a number or [N], at most 100 either way: start of the window minus start of the
+        slide.
         """
         world = world or self.physics
         form, rest = world.format, round(REST_S * world.format.rate_hz)
         late = np.rint(np.broadcast_to(late_ms, len(self.places)) * form.rate_hz / 1000).astype(int)
         drawn = np.empty((len(self.places), form.window, *form.shape), form.numpy_type)
-        for i, (material, at, seed) in enumerate(zip(self.materials, self.places, self.worlds, strict=True)):
+        for i, (material, at, seed) in enumerate(
+            zip(self.materials, self.places, self.worlds, strict=True)
+        ):
             rng = np.random.default_rng([seed, i, *b"stress"])
             length_s = {"rest_s": REST_S, "slide_s": form.window / form.rate_hz, "after_s": REST_S}
             whole = skin.sweep(material, place(at), rng, world, **length_s)
@@ -73,7 +81,8 @@ class SimulatedScene:
 
 @dataclass(frozen=True)
 class EvaluationSweeps:
-    """Test sweeps that can be corrupted and, where they are simulated, the scene that draws them anew."""
+    """Test sweeps that can be corrupted and, where they are simulated, the scene that draws them
+    anew."""
 
     sweeps: Dataset
     scene: SimulatedScene | None = None
@@ -90,14 +99,18 @@ class EvaluationSweeps:
 
     @classmethod
     def simulated(cls, spec: str, seed: int = 0) -> EvaluationSweeps:
-        """Sweeps as in the set "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest before and after each.
+        """Sweeps as in the set "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest
+        before and after each.
 
-        They are drawn at the same places as those of that set, with other noise. Raises FormatError as `sets.load` does.
+        They are drawn at the same places as those of that set, with other noise. Raises FormatError
+        as `sets.load` does.
         """
         base = sets.load(spec, seed)
         found = sets.SIMULATED.fullmatch(spec)
         if not found:
-            raise FormatError(f"set {spec!r} is not a simulated one; use sim:NAME, or EvaluationSweeps.of for a file")
+            raise FormatError(
+                f"set {spec!r} is not a simulated one; use sim:NAME, or EvaluationSweeps.of for a file"
+            )
         first = int(found["seed"] or seed)
         name = cast("skin.SetName", found["name"])
         worlds = range(first, int(found["last"] or first) + 1)
@@ -109,7 +122,8 @@ class EvaluationSweeps:
 
     @cached_property
     def deviation(self) -> Array:
-        """Standard deviation in raw counts [R, C] or [R, C, A] within a sweep, root mean square over sweeps."""
+        """Standard deviation in raw counts [R, C] or [R, C, A] within a sweep, root mean square
+        over sweeps."""
         deviation: Array = np.sqrt(self.sweeps.samples.var(axis=1, dtype=np.float64).mean(axis=0))
         return deviation
 
@@ -120,7 +134,8 @@ class EvaluationSweeps:
 
     @cached_property
     def load(self) -> float:
-        """Full load in raw counts: the 99.9th percentile of their magnitude. The very largest may be an accident."""
+        """Full load in raw counts: the 99.9th percentile of their magnitude. The very largest may
+        be an accident."""
         return float(np.percentile(np.abs(self.sweeps.samples.astype(np.float32)), 99.9))
 
 
@@ -146,8 +161,8 @@ class Corruption:
     def apply(self, test: EvaluationSweeps, severity: float, seed: int) -> Array:
         """The raw counts of `test`, corrupted, of the same type; unchanged at severity 0.
 
-        The same seed draws the same taxels, signs and noise for every severity.
-        Raises FormatError for a severity out of range, and where the corruption needs a scene and `test` has none.
+        The same seed draws the same taxels, signs and noise for every severity. Raises FormatError
+        for a severity out of range, and where the corruption needs a scene and `test` has none.
         """
         samples = test.sweeps.samples
         if not 0 <= severity <= self.severities[-1]:
@@ -155,15 +170,20 @@ class Corruption:
                 f"severity {severity:g} of stress {self.name!r} is out of range; use 0 to {self.severities[-1]:g}"
             )
         if self.only == "simulated" and test.scene is None:
-            raise FormatError(f"stress {self.name!r} draws sweeps anew and {test.sweeps.source} cannot; use sim:NAME")
+            raise FormatError(
+                f"stress {self.name!r} draws sweeps anew and {test.sweeps.source} cannot; use sim:NAME"
+            )
         if severity == 0:
             return samples
         rng = np.random.default_rng([seed, *self.name.encode()])
-        return _digitized(self.change(samples.astype(np.float32), severity, rng, test), samples.dtype)
+        return _digitized(
+            self.change(samples.astype(np.float32), severity, rng, test), samples.dtype
+        )
 
 
 def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
-    """As the converter digitizes: whole counts within the range of their type; float32 stays as it is."""
+    """As the converter digitizes: whole counts within the range of their type; float32 stays as it
+    is."""
     if kind.kind == "f":
         return x.astype(kind)
     limits = np.iinfo(kind)
@@ -186,7 +206,9 @@ def _turn(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> A
 
 def _force(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     scene = _scene(test)
-    return scene.draw(world=replace(scene.physics, force_n=scene.physics.force_n * (1 + sign * share)))
+    return scene.draw(
+        world=replace(scene.physics, force_n=scene.physics.force_n * (1 + sign * share))
+    )
 
 
 def _error_ms(x: Array, ms: float, rng: Generator) -> Array:
@@ -206,13 +228,14 @@ def _window_held(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) ->
 
 
 def _over(times: Array, x: Array) -> Array:
-    """`times` [..., T] as it is broadcast over the taxels and axes of `x` [N, T, R, C] or [N, T, R, C, A]."""
+    """`times` [..., T] as it is broadcast over the taxels and axes of `x` [N, T, R, C] or [N, T, R,
+    C, A]."""
     return times.reshape(*times.shape, *(1,) * (x.ndim - 2))
 
 
 def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator) -> Array:
-    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid is mirrored. Of three
-    axes the first two, shear along rows and columns, turn with the skin.
+    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid
+    is mirrored. Of three axes the first two, shear along rows and columns, turn with the skin.
 
     share: of GAIN_LAW, by which their gains spread.
     """
@@ -221,13 +244,19 @@ def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator)
     place = rows + (i + 1j * j) * np.exp(1j * np.deg2rad(degrees))
     at = np.stack([place.real + (r - 1) / 2, place.imag + (c - 1) / 2])
     taxels = np.eye(r * c).reshape(-1, r, c)
-    weights = np.stack([map_coordinates(taxel, at, order=1, mode="mirror").ravel() for taxel in taxels])
+    weights = np.stack(
+        [map_coordinates(taxel, at, order=1, mode="mirror").ravel() for taxel in taxels]
+    )
     gain = np.exp(GAIN_LAW * share * rng.uniform(-1, 1, (len(x), 1, r, c)))
-    axes = np.moveaxis(x.reshape(*x.shape[:2], r * c, -1), 3, 0) @ weights.astype(np.float32)  # [A, N, T, R * C]
+    axes = np.moveaxis(x.reshape(*x.shape[:2], r * c, -1), 3, 0) @ weights.astype(
+        np.float32
+    )  # [A, N, T, R * C]
     if len(axes) == 3:
         turned = (axes[0] + 1j * axes[1]) * np.exp(-1j * np.deg2rad(degrees))
         axes[0], axes[1] = turned.real, turned.imag
-    read: Array = np.moveaxis(axes, 0, 3).reshape(x.shape) * gain.reshape(*gain.shape, *(1,) * (x.ndim - 4))
+    read: Array = np.moveaxis(axes, 0, 3).reshape(x.shape) * gain.reshape(
+        *gain.shape, *(1,) * (x.ndim - 4)
+    )
     return read
 
 
@@ -240,7 +269,8 @@ def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps)
 
 
 def _some(x: Array, n: float, rng: Generator) -> Array:
-    """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C] or [N, 1, R, C, 1]."""
+    """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C] or [N, 1, R, C,
+    1]."""
     r, c, *axes = x.shape[2:]
     order = rng.permuted(np.tile(np.arange(r * c), (len(x), 1)), axis=1)
     chosen: Array = (order < n).reshape(len(x), 1, r, c, *(1,) * len(axes))
@@ -256,7 +286,9 @@ def _stuck(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
 
 
 def _noisy(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    noisy: Array = x + _some(x, n, rng) * np.float32(NOISY * test.rms) * rng.standard_normal(x.shape, np.float32)
+    noisy: Array = x + _some(x, n, rng) * np.float32(NOISY * test.rms) * rng.standard_normal(
+        x.shape, np.float32
+    )
     return noisy
 
 
@@ -299,7 +331,9 @@ def _bits(x: Array, fewer: float, rng: Generator, test: EvaluationSweeps) -> Arr
 def _lost(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     lost = rng.random(x.shape[:2]) < share
     lost[:, [0, -1]] = False  # on the box the frames around the window are there too
-    for t in range(sweep_window.MAX_GAP, x.shape[1]):  # the box refuses a sweep that lacks more in a row
+    for t in range(
+        sweep_window.MAX_GAP, x.shape[1]
+    ):  # the box refuses a sweep that lacks more in a row
         lost[:, t] &= ~lost[:, t - sweep_window.MAX_GAP : t].all(axis=1)
     number = np.arange(x.shape[1])
     for taxels, missing in zip(x, lost, strict=True):
@@ -319,42 +353,194 @@ def _hum(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Arra
 
 
 def _noise(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    noisy: Array = x + (ratio * test.deviation).astype(np.float32) * rng.standard_normal(x.shape, np.float32)
+    noisy: Array = x + (ratio * test.deviation).astype(np.float32) * rng.standard_normal(
+        x.shape, np.float32
+    )
     return noisy
 
 
 SHIFTS, TURNS, ERRORS_MS = (0, 0.25, 0.5, 1, 1.5), (0, 5, 10, 20, 30), (0, 10, 25, 50, 100)
 HALVES, TAXELS = (0, 0.1, 0.2, 0.35, 0.5), (0, 1, 2, 3, 4)
 CORRUPTIONS = (
-    Corruption("shift-rows", "skin further along", "rows", SHIFTS, "skin further along the sliding, drawn anew", _shift, "simulated"),
-    Corruption("turn", "skin turned", "degrees", TURNS, "skin turned on the finger, drawn anew", _turn, "simulated"),
-    Corruption("force-down", "less force", "share", HALVES, "pressed less, drawn anew", partial(_force, -1), "simulated"),
-    Corruption("force-up", "more force", "share", HALVES, "pressed more, drawn anew", partial(_force, 1), "simulated"),
-    Corruption("speed-down", "slower", "share", HALVES, "slid slower, drawn anew", partial(_speed, -1), "simulated"),
-    Corruption("speed-up", "faster", "share", HALVES, "slid faster, drawn anew", partial(_speed, 1), "simulated"),
-    Corruption("window", "window off", "ms", ERRORS_MS, "window too early or late, into the rest, drawn anew", _window, "simulated"),
-    Corruption("shift-grid", "skin further along", "rows", SHIFTS, "taxels read further on, edge mirrored, new gains", _shift_grid, "files"),
-    Corruption("turn-grid", "skin turned", "degrees", TURNS, "taxels read on a turned grid, edge mirrored, new gains", _turn_grid, "files"),
-    Corruption("window-held", "window off", "ms", ERRORS_MS, "window too early or late, first or last frame held", _window_held, "files"),
+    Corruption(
+        "shift-rows",
+        "skin further along",
+        "rows",
+        SHIFTS,
+        "skin further along the sliding, drawn anew",
+        _shift,
+        "simulated",
+    ),
+    Corruption(
+        "turn",
+        "skin turned",
+        "degrees",
+        TURNS,
+        "skin turned on the finger, drawn anew",
+        _turn,
+        "simulated",
+    ),
+    Corruption(
+        "force-down",
+        "less force",
+        "share",
+        HALVES,
+        "pressed less, drawn anew",
+        partial(_force, -1),
+        "simulated",
+    ),
+    Corruption(
+        "force-up",
+        "more force",
+        "share",
+        HALVES,
+        "pressed more, drawn anew",
+        partial(_force, 1),
+        "simulated",
+    ),
+    Corruption(
+        "speed-down",
+        "slower",
+        "share",
+        HALVES,
+        "slid slower, drawn anew",
+        partial(_speed, -1),
+        "simulated",
+    ),
+    Corruption(
+        "speed-up",
+        "faster",
+        "share",
+        HALVES,
+        "slid faster, drawn anew",
+        partial(_speed, 1),
+        "simulated",
+    ),
+    Corruption(
+        "window",
+        "window off",
+        "ms",
+        ERRORS_MS,
+        "window too early or late, into the rest, drawn anew",
+        _window,
+        "simulated",
+    ),
+    Corruption(
+        "shift-grid",
+        "skin further along",
+        "rows",
+        SHIFTS,
+        "taxels read further on, edge mirrored, new gains",
+        _shift_grid,
+        "files",
+    ),
+    Corruption(
+        "turn-grid",
+        "skin turned",
+        "degrees",
+        TURNS,
+        "taxels read on a turned grid, edge mirrored, new gains",
+        _turn_grid,
+        "files",
+    ),
+    Corruption(
+        "window-held",
+        "window off",
+        "ms",
+        ERRORS_MS,
+        "window too early or late, first or last frame held",
+        _window_held,
+        "files",
+    ),
     Corruption("dead", "dead taxels", "taxels", TAXELS, "read 0", _dead),
-    Corruption("stuck", "stuck taxels", "taxels", TAXELS, "each at some count of the set's range", _stuck),
-    Corruption("noisy", "noisy taxels", "taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations", _noisy),
-    Corruption("gain-spread", "uneven gains", "share", HALVES, "each taxel's gain off by up to this share", _gain_spread),
+    Corruption(
+        "stuck", "stuck taxels", "taxels", TAXELS, "each at some count of the set's range", _stuck
+    ),
+    Corruption(
+        "noisy",
+        "noisy taxels",
+        "taxels",
+        TAXELS,
+        f"white noise of {NOISY:g} of the set's deviations",
+        _noisy,
+    ),
+    Corruption(
+        "gain-spread",
+        "uneven gains",
+        "share",
+        HALVES,
+        "each taxel's gain off by up to this share",
+        _gain_spread,
+    ),
     Corruption("gain-down", "lower gain", "share", HALVES, "all gains lower", partial(_gain, -1)),
     Corruption("gain-up", "higher gain", "share", HALVES, "all gains higher", partial(_gain, 1)),
-    Corruption("stretch", "slower", "share", HALVES, "slower: all is stretched in time", partial(_stretch, -1), "files"),
-    Corruption("shorten", "faster", "share", HALVES, "faster: all is shortened in time", partial(_stretch, 1), "files"),
-    Corruption("drift", "drift", "of full load", (0, 0.02, 0.05, 0.1, 0.2), "offset of each taxel, from one to another", _drift),
-    Corruption("bits", "fewer bits", "fewer than 8", (0, 1, 2, 3, 4), "steps of the set's range: 7, 6, 5, 4 bits", _bits),
-    Corruption("lost", "lost frames", "share", (0, 0.02, 0.05, 0.1, 0.2), "frames lost, at most two in a row, filled as the box does", _lost),
-    Corruption("saturation", "saturation", "share", HALVES, "clipped so far below full load", _saturation),
-    Corruption("hum", "50 Hz hum", "deviations", (0, 0.25, 0.5, 1, 2), "50 Hz on all taxels, amplitude", _hum),
-    Corruption("noise", "white noise", "deviations", (0, 0.1, 0.2, 0.3, 0.5), "white, of each taxel's deviation", _noise),
-)  # fmt: skip
+    Corruption(
+        "stretch",
+        "slower",
+        "share",
+        HALVES,
+        "slower: all is stretched in time",
+        partial(_stretch, -1),
+        "files",
+    ),
+    Corruption(
+        "shorten",
+        "faster",
+        "share",
+        HALVES,
+        "faster: all is shortened in time",
+        partial(_stretch, 1),
+        "files",
+    ),
+    Corruption(
+        "drift",
+        "drift",
+        "of full load",
+        (0, 0.02, 0.05, 0.1, 0.2),
+        "offset of each taxel, from one to another",
+        _drift,
+    ),
+    Corruption(
+        "bits",
+        "fewer bits",
+        "fewer than 8",
+        (0, 1, 2, 3, 4),
+        "steps of the set's range: 7, 6, 5, 4 bits",
+        _bits,
+    ),
+    Corruption(
+        "lost",
+        "lost frames",
+        "share",
+        (0, 0.02, 0.05, 0.1, 0.2),
+        "frames lost, at most two in a row, filled as the box does",
+        _lost,
+    ),
+    Corruption(
+        "saturation", "saturation", "share", HALVES, "clipped so far below full load", _saturation
+    ),
+    Corruption(
+        "hum",
+        "50 Hz hum",
+        "deviations",
+        (0, 0.25, 0.5, 1, 2),
+        "50 Hz on all taxels, amplitude",
+        _hum,
+    ),
+    Corruption(
+        "noise",
+        "white noise",
+        "deviations",
+        (0, 0.1, 0.2, 0.3, 0.5),
+        "white, of each taxel's deviation",
+        _noise,
+    ),
+)
 
 
 def applicable(test: EvaluationSweeps) -> tuple[Corruption, ...]:
-    """All corruptions that apply to `test`: drawn anew where it has a scene, done to the raw counts where it has none."""
+    """All corruptions that apply to `test`: drawn anew where it has a scene, done to the raw counts
+    where it has none."""
     other = "files" if test.scene else "simulated"
     return tuple(corruption for corruption in CORRUPTIONS if corruption.only != other)
 

@@ -1,6 +1,8 @@
-"""Evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result each.
+"""Evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result
+each.
 
-Every fold is one task, run by parallel.py and kept in a cache: an interrupted run continues where it was.
+Every fold is one task, run by parallel.py and kept in a cache: an interrupted run continues where
+it was.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palp
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a method under a protocol with one seed. folds: in the order of the splitter. origin: the set's digest
-    and score.provenance."""
+    """The result of a method under a protocol with one seed. folds: in the order of the splitter.
+    origin: the set's digest and score.provenance."""
 
     method: str
     protocol: str
@@ -62,18 +64,32 @@ class Result:
         confusion = np.zeros((len(sweeps.materials),) * 2, int)
         np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
         result: dict[str, Any] = {
-            "method": self.method, "protocol": self.protocol, "means_removed": self.means_removed, "seed": self.seed,
-        } | self._counts(logits)  # fmt: skip
+            "method": self.method,
+            "protocol": self.protocol,
+            "means_removed": self.means_removed,
+            "seed": self.seed,
+        } | self._counts(logits)
         if forms := self.folds[0].forms:
             result["forms"] = {name: self._form(name) for name in forms}
-        times = {"fit_s": round(float(np.median([f.fit_s for f in self.folds])), 3),
-                 "ms_p50": round(float(np.median([f.ms for f in self.folds])), 4)}  # fmt: skip
+        times = {
+            "fit_s": round(float(np.median([f.fit_s for f in self.folds])), 3),
+            "ms_p50": round(float(np.median([f.ms for f in self.folds])), 4),
+        }
         ran = sorted({f.ran for f in self.folds} - {""})
-        return result | times | {
-            "folds": len(self.folds), "agreement": min(f.agreement for f in self.folds), "ran": ", ".join(ran),
-            "materials": list(sweeps.materials), "confusion": confusion.tolist(), "set": sweeps.source,
-            "format": sweeps.format.json(),
-        } | self.origin  # fmt: skip
+        return (
+            result
+            | times
+            | {
+                "folds": len(self.folds),
+                "agreement": min(f.agreement for f in self.folds),
+                "ran": ", ".join(ran),
+                "materials": list(sweeps.materials),
+                "confusion": confusion.tolist(),
+                "set": sweeps.source,
+                "format": sweeps.format.json(),
+            }
+            | self.origin
+        )
 
     def _counts(self, logits: Array) -> dict[str, Any]:
         """Right answers by window, and by recording where the set has recordings."""
@@ -81,22 +97,33 @@ class Result:
         clusters = Protocol(self.protocol).clusters(self.sweeps)
         clusters = None if clusters is None else clusters[self.test]
         right = logits.argmax(1) == labels
-        counts: dict[str, Any] = {"window": Score.of(right).json(), "interval": interval(right, clusters)}
+        counts: dict[str, Any] = {
+            "window": Score.of(right).json(),
+            "interval": interval(right, clusters),
+        }
         if "recording" in self.sweeps.groups:
             whole, first = fuse(logits, recording)
             right = whole.argmax(1) == labels[first]
             counts["recording"] = Score.of(right).json()
-            counts["recording_interval"] = interval(right, None if clusters is None else clusters[first])
+            counts["recording_interval"] = interval(
+                right, None if clusters is None else clusters[first]
+            )
         return counts
 
     def _form(self, name: str) -> dict[str, Any]:
-        """The same models in another precision: counts, how far the answers are apart (parity.AnswerDifference), and the accuracy that
-        int8 loses against float, whichever of the two this form is (parity.AccuracyLoss)."""
+        """The same models in another precision: counts, how far the answers are apart
+        (parity.AnswerDifference), and the accuracy that int8 loses against float, whichever of the
+        two this form is (parity.AccuracyLoss)."""
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
-        labels, clusters = self.sweeps.labels[self.test], Protocol(self.protocol).clusters(self.sweeps)
+        labels, clusters = (
+            self.sweeps.labels[self.test],
+            Protocol(self.protocol).clusters(self.sweeps),
+        )
         lost = parity.loss(
-            precise.argmax(1) == labels, int8.argmax(1) == labels, None if clusters is None else clusters[self.test]
+            precise.argmax(1) == labels,
+            int8.argmax(1) == labels,
+            None if clusters is None else clusters[self.test],
         )
         figures = asdict(parity.compare(precise, int8)) | asdict(lost)
         return self._counts(logits) | {key: round(value, 4) for key, value in figures.items()}
@@ -109,7 +136,9 @@ def line(result: dict[str, Any]) -> str:
     """What Result.json() returned, as a line under HEADER."""
     means = "out" if result["means_removed"] else "in"
     counts = [_count(result["window"], result["interval"])]
-    counts.append(_count(result["recording"], result["recording_interval"]) if "recording" in result else "")
+    counts.append(
+        _count(result["recording"], result["recording_interval"]) if "recording" in result else ""
+    )
     times = f"{result['fit_s']:>7.2f} {result['ms_p50']:>7.3f}"
     return f"{result['method']:<20} {result['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
 
@@ -133,7 +162,8 @@ class Plan:
     each: int = 0
 
     def folds(self, sweeps: Dataset, protocol: str, seed: int) -> list[tuple[Array, Array]]:
-        """Pairs (training, test) of sweep numbers. Raises FormatError where the protocol does not fit the set."""
+        """Pairs (training, test) of sweep numbers. Raises FormatError where the protocol does not
+        fit the set."""
         pairs = Protocol(protocol).folds(sweeps, seed)
         if not self.each:
             return pairs
@@ -142,7 +172,8 @@ class Plan:
 
 @dataclass(frozen=True)
 class Where:
-    """Where folds run and are kept: see parallel.results. cache None: nowhere. kept: run none, use only kept ones."""
+    """Where folds run and are kept: see parallel.results. cache None: nowhere. kept: run none, use
+    only kept ones."""
 
     jobs: int = -1
     scheduler: str = ""
@@ -153,7 +184,8 @@ class Where:
 def evaluate(
     sweeps: Dataset, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
-    """Results as they are complete; of a method that is refused one for each protocol and seed, at once.
+    """Results as they are complete; of a method that is refused one for each protocol and seed, at
+    once.
 
     Raises FormatError where a method or protocol is unknown, or a protocol does not fit the set.
     """
@@ -166,8 +198,10 @@ def evaluate(
         same = [method.name for method in known if method.input == kind]
         tasks = {
             (name, *split, i): FoldTask(name, plan.effort, split[1], *fold)
-            for name in same for split, parts in splits.items() for i, fold in enumerate(parts)
-        }  # fmt: skip
+            for name in same
+            for split, parts in splits.items()
+            for i, fold in enumerate(parts)
+        }
         done: dict[Any, Fold] = {}
         for (name, protocol, seed, i), fold in folds(tasks, sweeps, origin["digest"], kind, where):
             parts = [(name, protocol, seed, k) for k in range(len(splits[protocol, seed]))]
@@ -184,10 +218,13 @@ def folds(
 ) -> Iterator[tuple[Any, Fold]]:
     """Every task's Fold: those in the cache first, then the others as they finish.
 
-    On this machine an interrupted training of the paper's CNN goes on from a file beside the folds. data: digest of
-    `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all are refused.
+    On this machine an interrupted training of the paper's CNN goes on from a file beside the folds.
+    data: digest of `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all
+    are refused.
     """
-    paths = {name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache}
+    paths = {
+        name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache
+    }
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = {name: task for name, task in tasks.items() if name not in kept and not where.kept}
@@ -204,7 +241,8 @@ def folds(
 def _trained(
     tasks: Sequence[tuple[Any, FoldTask]], sweeps: Dataset, kind: str, where: Where
 ) -> Iterator[tuple[Any, Fold]]:
-    """The Fold of each named task as it finishes; all refused where the input `kind` cannot be computed."""
+    """The Fold of each named task as it finishes; all refused where the input `kind` cannot be
+    computed."""
     try:
         shared = (sweeps, known_methods.model_inputs(kind, sweeps)) if tasks else ()
     except FormatError as e:

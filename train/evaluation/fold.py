@@ -1,6 +1,8 @@
-"""One fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and times.
+"""One fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and
+times.
 
-A fold is kept under a fingerprint of all that it depends on: the data, the code and the versions of libraries too.
+A fold is kept under a fingerprint of all that it depends on: the data, the code and the versions of
+libraries too.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ Array = NDArray[Any]
 Answer = Callable[[Array], Array]
 """Raw counts [T, R, C] -> logits [K]."""
 TIMED_SWEEPS = 24
-"""How many test sweeps go one by one through an inference session of the box (of a method without a graph, through its
-library), for their time and to compare their labels."""
+"""How many test sweeps go one by one through an inference session of the box (of a method without a
+graph, through its library), for their time and to compare their labels."""
 NOT_COUNTED = (
     "train.data.readers",
     "train.data.sets",
@@ -43,10 +45,11 @@ NOT_COUNTED = (
     "train.metrics.score",
     "train.models.methods",
 )
-"""Modules that methods use and that do not change the result of a fold: it stays valid when their code changes. Of the
-sets the data themselves count."""
+"""Modules that methods use and that do not change the result of a fold: it stays valid when their
+code changes. Of the sets the data themselves count."""
 COUNTED = ("train", "appliance.signal")
-"""Packages whose code may change the result of a fold. `agreement` compares the box's other code with the desktop's."""
+"""Packages whose code may change the result of a fold. `agreement` compares the box's other code
+with the desktop's."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +69,13 @@ class FoldTask:
 
 @dataclass(frozen=True)
 class Fold:
-    """The result of one fold. logits: float32 [n, K] of its test sweeps; ms: median time of one sweep, features and graph.
+    """The result of one fold. logits: float32 [n, K] of its test sweeps; ms: median time of one
+    sweep, features and graph.
 
-    agreement: share of the timed sweeps to which the exported graph, or its library where it has none, gives the same
-    label when it answers them one by one. ran: what was trained, where
-    the method's name does not say it. cost: the training's cross entropy, [iterations, 2], where it has one.
-    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
+    agreement: share of the timed sweeps to which the exported graph, or its library where it has
+    none, gives the same label when it answers them one by one. ran: what was trained, where the
+    method's name does not say it. cost: the training's cross entropy, [iterations, 2], where it has
+    one. forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
     refused: why the method cannot work with this set; all else is empty then.
     """
 
@@ -132,15 +136,23 @@ def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: 
     model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
     fit_s = time.perf_counter() - start
     models = {"": model} | dict(getattr(model, "forms", {}))
-    answers = {name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()}
+    answers = {
+        name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()
+    }
     if not all(np.isfinite(logits).all() for logits in answers.values()):
-        raise FormatError(f"{task.method} gave a logit that is not finite; please report it with the set")
+        raise FormatError(
+            f"{task.method} gave a logit that is not finite; please report it with the set"
+        )
     logits = answers.pop("")
-    some = task.test[np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)]
+    some = task.test[
+        np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)
+    ]
     ms, labels = _timed_labels(_alone(method, model, sweeps.rate_hz), sweeps.samples[some])
     agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
     cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
-    return Fold(task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers)
+    return Fold(
+        task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers
+    )
 
 
 def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
@@ -154,12 +166,17 @@ def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
 
 
 def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answer:
-    """What answers one sweep: features and the graph in the box's kind of session, or the library that has no graph."""
+    """What answers one sweep: features and the graph in the box's kind of session, or the library
+    that has no graph."""
     if method.library:
-        return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[0]
+        return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[
+            0
+        ]
     graph = session(model.graph().SerializeToString())
     name = graph.get_inputs()[0].name
-    return lambda counts: graph.run(None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]})[0][0]
+    return lambda counts: graph.run(
+        None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]}
+    )[0][0]
 
 
 def key(task: FoldTask, data: str) -> str:
@@ -170,8 +187,13 @@ def key(task: FoldTask, data: str) -> str:
 
 
 def fingerprint(about: Any, *modules: str) -> str:
-    """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import here, and the libraries."""
-    versions = [version("numpy"), version("scikit-learn"), *([version("torch")] if find_spec("torch") else [])]
+    """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import
+    here, and the libraries."""
+    versions = [
+        version("numpy"),
+        version("scikit-learn"),
+        *([version("torch")] if find_spec("torch") else []),
+    ]
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
 
 
@@ -185,7 +207,8 @@ def _code(modules: tuple[str, ...]) -> bytes:
 
 
 def reached(modules: Sequence[str]) -> set[str]:
-    """`modules` and all that these import of the packages COUNTED, directly or not, but for NOT_COUNTED."""
+    """`modules` and all that these import of the packages COUNTED, directly or not, but for
+    NOT_COUNTED."""
     found, left = set(NOT_COUNTED), list(modules)
     while left:
         if (module := left.pop()) not in found:
@@ -205,8 +228,16 @@ def _imported(module: str) -> list[str]:
     """The modules of COUNTED that `module` imports."""
     tree = ast.parse(_file(module).read_bytes())
     froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    names = [name for node in froms for name in (node.module or "", *(f"{node.module}.{a.name}" for a in node.names))]
-    return [name for name in names if name.startswith(tuple(f"{p}." for p in COUNTED)) and _is_module(name)]
+    names = [
+        name
+        for node in froms
+        for name in (node.module or "", *(f"{node.module}.{a.name}" for a in node.names))
+    ]
+    return [
+        name
+        for name in names
+        if name.startswith(tuple(f"{p}." for p in COUNTED)) and _is_module(name)
+    ]
 
 
 def _is_module(name: str) -> bool:

@@ -1,7 +1,9 @@
-"""Many tasks at once. In: a function and its tasks. Out: the result of each, in the order of finishing.
+"""Many tasks at once. In: a function and its tasks. Out: the result of each, in the order of
+finishing.
 
-joblib runs them on this machine; with the address of a Dask scheduler its workers do. There the data is copied to every
-worker first, so that one that dies loses only the task it was computing, which is computed again elsewhere.
+joblib runs them on this machine; with the address of a Dask scheduler its workers do. There the
+data is copied to every worker first, so that one that dies loses only the task it was computing,
+which is computed again elsewhere.
 """
 
 from __future__ import annotations
@@ -24,19 +26,26 @@ CONNECT_S = 10
 
 
 def results(
-    call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], jobs: int = -1, scheduler: str = ""
+    call: Callable[..., Result],
+    tasks: Sequence[Task],
+    shared: Sequence[Any],
+    jobs: int = -1,
+    scheduler: str = "",
 ) -> Iterator[tuple[Task, Result]]:
     """call(task, *shared) of every task, as they finish; each has one thread.
 
-    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler, whose workers then run
-    all tasks. What a task raises is raised here. Raises FormatError where no scheduler or no worker answers, where
-    workers died so often that a task is given up, and where they lack this project.
+    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler,
+    whose workers then run all tasks. What a task raises is raised here. Raises FormatError where no
+    scheduler or no worker answers, where workers died so often that a task is given up, and where
+    they lack this project.
     """
     if scheduler and tasks:
         yield from _on_cluster(call, tasks, shared, scheduler)
     elif tasks:
         # joblib replaces a process whose memory has grown and warns; no task is lost by that
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+        warnings.filterwarnings(
+            "ignore", "A worker stopped while some jobs were given", UserWarning
+        )
         yield from Parallel(jobs, return_as="generator_unordered", batch_size=1)(
             delayed(_run)(task, call, *shared) for task in tasks
         )
@@ -54,18 +63,24 @@ def _on_cluster(
         # asked directly: joblib's Dask backend waits for ever when a task cannot be run any more
         from distributed import Client, KilledWorker, wait
     except ImportError as e:
-        raise FormatError("--scheduler needs dask; install it with pip install 'palpate-train[dask]'") from e
+        raise FormatError(
+            "--scheduler needs dask; install it with pip install 'palpate-train[dask]'"
+        ) from e
     try:
         client: Any = Client(scheduler, timeout=CONNECT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as e:
-        raise FormatError(f"no scheduler answers at {scheduler!r} ({e}); start one with: dask scheduler") from e
+        raise FormatError(
+            f"no scheduler answers at {scheduler!r} ({e}); start one with: dask scheduler"
+        ) from e
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
             everywhere = client.scatter(list(shared), broadcast=True) if shared else ()
             left = {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks}
             while left:
-                with suppress(TimeoutError):  # from time to time, to see below whether a worker is alive
+                with suppress(
+                    TimeoutError
+                ):  # from time to time, to see below whether a worker is alive
                     done = wait(left, timeout=CONNECT_S, return_when="FIRST_COMPLETED").done  # type: ignore[no-untyped-call]
                     yield from (future.result() for future in done)
                     left -= done
@@ -73,7 +88,9 @@ def _on_cluster(
                     raise TimeoutError
         except TimeoutError as e:
             start = f"dask worker {scheduler}"
-            raise FormatError(f"the scheduler at {scheduler!r} has no worker; start some with: {start}") from e
+            raise FormatError(
+                f"the scheduler at {scheduler!r} has no worker; start some with: {start}"
+            ) from e
         except RuntimeError as e:
             if "deserialization" not in str(e):
                 raise
@@ -81,4 +98,6 @@ def _on_cluster(
                 f"the cluster at {scheduler!r} lacks this version of palpate-train; install it there"
             ) from e
         except KilledWorker as e:
-            raise FormatError(f"the workers at {scheduler!r} died too often ({e}); see their logs and memory") from e
+            raise FormatError(
+                f"the workers at {scheduler!r} died too often ({e}); see their logs and memory"
+            ) from e

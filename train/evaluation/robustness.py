@@ -1,7 +1,9 @@
-"""Robustness: under which corruptions each method fails. In: methods, a training set, EvaluationSweeps. Out: curves.
+"""Robustness: under which corruptions each method fails. In: methods, a training set,
+EvaluationSweeps. Out: curves.
 
-One task is one method and one seed: `evaluate_method` trains it and tests it under every corruption, `merge` makes a result
-of many tasks, wherever they ran. What a task returns, and the result, are plain numbers and text that JSON can hold.
+One task is one method and one seed: `evaluate_method` trains it and tests it under every
+corruption, `merge` makes a result of many tasks, wherever they ran. What a task returns, and the
+result, are plain numbers and text that JSON can hold.
 """
 
 from __future__ import annotations
@@ -50,17 +52,24 @@ POINTS = 0.05
 
 
 def evaluate_method(
-    method: Method, train: Dataset, test: EvaluationSweeps, corruptions: Sequence[Corruption] | None, seed: int
+    method: Method,
+    train: Dataset,
+    test: EvaluationSweeps,
+    corruptions: Sequence[Corruption] | None,
+    seed: int,
 ) -> Json:
-    """A task: train `method` and test it under `corruptions`; None stands for all that apply to the test sweeps.
+    """A task: train `method` and test it under `corruptions`; None stands for all that apply to the
+    test sweeps.
 
-    Where the method cannot work with this set, the reason is in `refused`. Raises FormatError where train and test
-    differ in format or materials: that is the caller's mistake.
+    Where the method cannot work with this set, the reason is in `refused`. Raises FormatError where
+    train and test differ in format or materials: that is the caller's mistake.
     """
     if (train.format, train.materials) != (test.sweeps.format, test.sweeps.materials):
-        raise FormatError(f"{test.sweeps.source} ({test.sweeps.format}, {len(test.sweeps.materials)} materials) is "
-                          f"not of the kind of {train.source} ({train.format}, {len(train.materials)} materials); "
-                          "test on what the methods are trained for")  # fmt: skip
+        raise FormatError(
+            f"{test.sweeps.source} ({test.sweeps.format}, {len(test.sweeps.materials)} materials) is "
+            f"not of the kind of {train.source} ({train.format}, {len(train.materials)} materials); "
+            "test on what the methods are trained for"
+        )
     try:
         model = method.train(train, model_inputs(method.input, train), seed)
     except FormatError as e:
@@ -69,40 +78,69 @@ def evaluate_method(
 
 
 def evaluate_model(
-    method: Method, model: Model, test: EvaluationSweeps, corruptions: Sequence[Corruption] | None, seed: int
+    method: Method,
+    model: Model,
+    test: EvaluationSweeps,
+    corruptions: Sequence[Corruption] | None,
+    seed: int,
 ) -> Json:
-    """What `evaluate_method` returns, of a trained model. The sweeps depend on test, corruption, severity and seed alone."""
+    """What `evaluate_method` returns, of a trained model. The sweeps depend on test, corruption,
+    severity and seed alone."""
     trials = CorruptionCounts(test)
     clean = _right(method, model, test.sweeps, test.sweeps.samples)
     for corruption in applicable(test) if corruptions is None else corruptions:
-        trials.add(corruption, [clean, *(_right(method, model, test.sweeps, corruption.apply(test, severity, seed))
-                                         for severity in corruption.severities[1:])])  # fmt: skip
+        trials.add(
+            corruption,
+            [
+                clean,
+                *(
+                    _right(method, model, test.sweeps, corruption.apply(test, severity, seed))
+                    for severity in corruption.severities[1:]
+                ),
+            ],
+        )
     return trials.task(method.name, seed) | {
-        "ran": getattr(model, "ran", ""), "trouble": uninformative_answers(method, model, test)
-    }  # fmt: skip
+        "ran": getattr(model, "ran", ""),
+        "trouble": uninformative_answers(method, model, test),
+    }
 
 
 class CorruptionCounts:
-    """Counts right answers to `test` under one corruption after another, for a task that `merge` takes."""
+    """Counts right answers to `test` under one corruption after another, for a task that `merge`
+    takes."""
 
     def __init__(self, test: EvaluationSweeps) -> None:
         self.test, self.curves = test, dict[str, Json]()
 
     def add(self, corruption: Corruption, answers: Sequence[tuple[Array, int]]) -> None:
-        """answers: at each severity, bool [N], which sweeps were named rightly, and how many answers were not finite."""
+        """answers: at each severity, bool [N], which sweeps were named rightly, and how many
+        answers were not finite."""
         position = self.test.sweeps.groups.get("position")
         low, high = zip(*(interval(right, position) for right, _ in answers), strict=True)
         self.curves[corruption.name] = {
-            "title": corruption.title, "unit": corruption.unit, "about": corruption.about,
-            "severities": [float(s) for s in corruption.severities], "right": [int(right.sum()) for right, _ in answers],
-            "low": list(low), "high": list(high), "broken": [broken for _, broken in answers],
-        }  # fmt: skip
+            "title": corruption.title,
+            "unit": corruption.unit,
+            "about": corruption.about,
+            "severities": [float(s) for s in corruption.severities],
+            "right": [int(right.sum()) for right, _ in answers],
+            "low": list(low),
+            "high": list(high),
+            "broken": [broken for _, broken in answers],
+        }
 
     def task(self, name: str, seed: int) -> Json:
         """All of it; `name` answered."""
         sweeps = self.test.sweeps
-        return {"method": name, "seed": seed, "set": sweeps.source, "refused": "", "total": len(sweeps), "ran": "",
-                "curves": self.curves, "trouble": {}}  # fmt: skip
+        return {
+            "method": name,
+            "seed": seed,
+            "set": sweeps.source,
+            "refused": "",
+            "total": len(sweeps),
+            "ran": "",
+            "curves": self.curves,
+            "trouble": {},
+        }
 
 
 def run(
@@ -115,29 +153,43 @@ def run(
     effort: Effort = FULL_EFFORT,
     log: Callable[[str], None] = lambda line: None,
 ) -> Json:
-    """All methods and seeds under all corruptions that apply, merged; tasks whose results are kept are not done again.
+    """All methods and seeds under all corruptions that apply, merged; tasks whose results are kept
+    are not done again.
 
-    Every method gets its first seed before any gets its second, so that an interrupted run compares alike.
-    Raises FormatError as `evaluate_method` does, and for an unknown method.
+    Every method gets its first seed before any gets its second, so that an interrupted run compares
+    alike. Raises FormatError as `evaluate_method` does, and for an unknown method.
     """
     about = [digest(train), digest(test.sweeps), test.scene is not None]
-    tasks = {(method.name, seed): fingerprint([*about, method.name, method.effort, seed], methods.module_of(method.name), "train.evaluation.robustness")
-             for seed in seeds for method in methods.find(names, effort)}  # fmt: skip
+    tasks = {
+        (method.name, seed): fingerprint(
+            [*about, method.name, method.effort, seed],
+            methods.module_of(method.name),
+            "train.evaluation.robustness",
+        )
+        for seed in seeds
+        for method in methods.find(names, effort)
+    }
     paths = {task: where.cache / f"{key}.json" for task, key in tasks.items() if where.cache}
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
     left = [task for task in tasks if task not in done and not where.kept]
     progress = parallel.Progress(len(left), log)
-    for task, result in parallel.results(_run_task, left, (train, test, effort), where.jobs, where.scheduler):
+    for task, result in parallel.results(
+        _run_task, left, (train, test, effort), where.jobs, where.scheduler
+    ):
         done[task] = result
         if where.cache:
             put(paths[task], json.dumps(result).encode(), parents=True)
         progress(f"{task[0]} under corruptions, seed {task[1]}")
     result = merge(done.values())
-    result["methods"] = {name: result["methods"][name] for name in names if name in result["methods"]}
+    result["methods"] = {
+        name: result["methods"][name] for name in names if name in result["methods"]
+    }
     return result
 
 
-def _run_task(task: tuple[str, int], train: Dataset, test: EvaluationSweeps, effort: Effort) -> Json:
+def _run_task(
+    task: tuple[str, int], train: Dataset, test: EvaluationSweeps, effort: Effort
+) -> Json:
     (method,) = methods.find([task[0]], effort)
     return evaluate_method(method, train, test, None, task[1])
 
@@ -145,10 +197,11 @@ def _run_task(task: tuple[str, int], train: Dataset, test: EvaluationSweeps, eff
 def merge(tasks: Iterable[Json]) -> Json:
     """The result of tasks, whatever their order: {"sets": [...], "methods": {name: entry}}.
 
-    An entry holds seeds, refused ("" or why), ran, clean (accuracy), curves and trouble. A curve holds title, unit,
-    about, severities, right and total (sums), accuracy, low and high, broken (answers that were not finite; they count
-    as wrong), falls and lost. low to high is the mean of the tasks' 95 % intervals, extended to the spread of the tasks:
-    seeds see the same sweeps, and the interval of their sum would be too narrow.
+    An entry holds seeds, refused ("" or why), ran, clean (accuracy), curves and trouble. A curve
+    holds title, unit, about, severities, right and total (sums), accuracy, low and high, broken
+    (answers that were not finite; they count as wrong), falls and lost. low to high is the mean of
+    the tasks' 95 % intervals, extended to the spread of the tasks: seeds see the same sweeps, and
+    the interval of their sum would be too narrow.
     """
     tasks = sorted(tasks, key=lambda t: (t["set"], t["seed"]))
     names = sorted({t["method"] for t in tasks})
@@ -157,7 +210,8 @@ def merge(tasks: Iterable[Json]) -> Json:
 
 
 def falls(curve: Json, points: float = POINTS) -> float | None:
-    """The severity at which accuracy is `points` below that of clean sweeps, on the line between two severities.
+    """The severity at which accuracy is `points` below that of clean sweeps, on the line between
+    two severities.
 
     None where it never is.
     """
@@ -172,7 +226,8 @@ def falls(curve: Json, points: float = POINTS) -> float | None:
 
 
 def at_targets(curves: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
-    """Accuracy, lower and upper end of its interval at each of TARGETS that `curves` has, between two severities on a line."""
+    """Accuracy, lower and upper end of its interval at each of TARGETS that `curves` has, between
+    two severities on a line."""
     found = {}
     for key, those in TARGETS.items():
         there = [_at(curves[name], severity) for name, severity in those if name in curves]
@@ -182,26 +237,36 @@ def at_targets(curves: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
 
 
 def _at(curve: Mapping[str, Any], severity: float) -> tuple[float, ...]:
-    return tuple(float(np.interp(severity, curve["severities"], curve[k])) for k in ("accuracy", "low", "high"))
+    return tuple(
+        float(np.interp(severity, curve["severities"], curve[k]))
+        for k in ("accuracy", "low", "high")
+    )
 
 
 def breaks_first(curves: Mapping[str, Any]) -> list[str]:
-    """The corruptions that cost five points, those first that do so in the smallest share of the range tried."""
+    """The corruptions that cost five points, those first that do so in the smallest share of the
+    range tried."""
     reach = {
-        name: curve["falls"] / curve["severities"][-1] for name, curve in curves.items() if curve["falls"] is not None
+        name: curve["falls"] / curve["severities"][-1]
+        for name, curve in curves.items()
+        if curve["falls"] is not None
     }
     return sorted(reach, key=lambda name: (reach[name], -curves[name]["lost"], name))
 
 
 def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) -> dict[str, str]:
-    """What becomes of uninformative sweeps on the desktop: "finite", "refused: why", "not finite" or "crashed: why".
+    """What becomes of uninformative sweeps on the desktop: "finite", "refused: why", "not finite"
+    or "crashed: why".
 
-    They take the way of all sweeps: into a checked set, then to the method's input, then to the model.
+    They take the way of all sweeps: into a checked set, then to the method's input, then to the
+    model.
     """
     found = {}
     for name, taxels in _uninformative(test.sweeps.format, test.load).items():
         try:
-            sweep = Dataset(taxels[None], np.zeros(1, int), test.sweeps.materials, test.sweeps.rate_hz, {}, name)
+            sweep = Dataset(
+                taxels[None], np.zeros(1, int), test.sweeps.materials, test.sweeps.rate_hz, {}, name
+            )
             if sweep.format != test.sweeps.format:
                 raise FormatError(f"{sweep.format} instead of {test.sweeps.format}")
             logits = model.logits(model_inputs(method.input, sweep))
@@ -214,7 +279,8 @@ def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) 
 
 
 def box_answers(bundle: Bundle) -> dict[str, str]:
-    """The same on the box: the status of each verdict, with "not finite" where one of its numbers is not."""
+    """The same on the box: the status of each verdict, with "not finite" where one of its numbers
+    is not."""
     limits = bundle.manifest.thresholds
     found = {}
     for name, taxels in _uninformative(bundle.format, limits.full_scale).items():
@@ -225,7 +291,8 @@ def box_answers(bundle: Bundle) -> dict[str, str]:
 
 
 def answer(bundle: Bundle, taxels: Array) -> Verdict:
-    """The box's verdict on frames [n, R, C] that arrive from the START to the STOP edge of one sweep."""
+    """The box's verdict on frames [n, R, C] that arrive from the START to the STOP edge of one
+    sweep."""
     form, n, clock = bundle.format, np.arange(len(taxels)), VirtualClock()
     first_ns = clock.now_ns()
     cutter = SweepCutter(form, SweepConfig())
@@ -239,7 +306,8 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
 
 
 def _right(method: Method, model: Model, sweeps: Dataset, samples: Array) -> tuple[Array, int]:
-    """Which of `samples` are named rightly, bool [N], and how many answers are not finite (those are wrong)."""
+    """Which of `samples` are named rightly, bool [N], and how many answers are not finite (those
+    are wrong)."""
     logits = np.asarray(model.logits(model_inputs(method.input, replace(sweeps, samples=samples))))
     finite = np.isfinite(logits).all(axis=1)
     return finite & (logits.argmax(axis=1) == sweeps.labels), int(np.sum(~finite))
@@ -249,10 +317,18 @@ def _entry(tasks: list[Json]) -> Json:
     """One method of the result, from all its tasks."""
     done = [t for t in tasks if not t["refused"]]
     refused = next((t["refused"] for t in tasks if t["refused"]), "")
-    entry: Json = {"seeds": sorted({t["seed"] for t in done}), "refused": refused, "clean": None, "curves": {},
-                   "ran": next((t["ran"] for t in done), ""), "trouble": {}}  # fmt: skip
+    entry: Json = {
+        "seeds": sorted({t["seed"] for t in done}),
+        "refused": refused,
+        "clean": None,
+        "curves": {},
+        "ran": next((t["ran"] for t in done), ""),
+        "trouble": {},
+    }
     for name in done[0]["curves"] if done else ():
-        entry["curves"][name] = _curve([t["curves"][name] for t in done], np.array([t["total"] for t in done]))
+        entry["curves"][name] = _curve(
+            [t["curves"][name] for t in done], np.array([t["total"] for t in done])
+        )
         entry["clean"] = entry["curves"][name]["accuracy"][0]
     for t in done:  # of several answers the worst one counts
         for name, status in t["trouble"].items():
@@ -272,20 +348,28 @@ def _curve(parts: list[Json], totals: Array) -> Json:
     low = np.minimum(np.mean([part["low"] for part in parts], axis=0), shares.min(axis=0))
     high = np.maximum(np.mean([part["high"] for part in parts], axis=0), shares.max(axis=0))
     curve = {k: parts[0][k] for k in ("title", "unit", "about", "severities")} | {
-        "right": right.sum(axis=0).tolist(), "total": int(totals.sum()), "accuracy": accuracy.round(6).tolist(),
-        "low": low.round(4).tolist(), "high": high.round(4).tolist(),
+        "right": right.sum(axis=0).tolist(),
+        "total": int(totals.sum()),
+        "accuracy": accuracy.round(6).tolist(),
+        "low": low.round(4).tolist(),
+        "high": high.round(4).tolist(),
         "broken": np.sum([part["broken"] for part in parts], axis=0).tolist(),
         "lost": round(float(np.mean(accuracy[0] - accuracy[1:])), 4),
-    }  # fmt: skip
+    }
     return curve | {"falls": falls(curve)}
 
 
 def _uninformative(form: SweepFormat, top: float) -> dict[str, Array]:
-    """Windows [T, R, C] or [T, R, C, A] without information, one of a single frame. top: the highest count where their type sets none."""
+    """Windows [T, R, C] or [T, R, C, A] without information, one of a single frame. top: the
+    highest count where their type sets none."""
     level = np.full((form.window, *form.shape), top / 2).astype(form.numpy_type)
     whole = form.numpy_type.kind != "f"
-    found = {"silent": 0 * level, "constant": level, "one-frame": level[:1],
-             "saturated": np.full_like(level, np.iinfo(form.numpy_type).max if whole else top)}  # fmt: skip
+    found = {
+        "silent": 0 * level,
+        "constant": level,
+        "one-frame": level[:1],
+        "saturated": np.full_like(level, np.iinfo(form.numpy_type).max if whole else top),
+    }
     for name, value in () if whole else (("nan", np.nan), ("inf", np.inf)):
         found[name] = level.copy()
         found[name][::2] *= 1.125  # not constant

@@ -1,7 +1,9 @@
-"""Calibration of the simulator: the paper's baselines on simulated sweeps beside its printed accuracies.
+"""Calibration of the simulator: the paper's baselines on simulated sweeps beside its printed
+accuracies.
 
-In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they are from the printed ones, and
-what they are without each of the simulator's effects. No network is used: what the CNNs reach is a result.
+In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they are from the
+printed ones, and what they are without each of the simulator's effects. No network is used: what
+the CNNs reach is a result.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from train.models import baselines, methods
 Array = NDArray[Any]
 METHODS = tuple(baselines.ESTIMATORS)
 ATTACHMENTS = 5
-"""T-HARD is one attachment in the paper. A single one varies much: a seed's accuracy is the mean over so many."""
+"""T-HARD is one attachment in the paper. A single one varies much: a seed's accuracy is the mean
+over so many."""
 LAB, REAL, HARD = 0, 1, tuple(range(2, 2 + ATTACHMENTS))
 """The sets that `draw` joins, by their number in the group "set"."""
 
@@ -41,7 +44,9 @@ class Figure:
 ROW_OFF = f"split:set={REAL}->{','.join(map(str, HARD))}"
 FIGURES = (
     Figure(4, "T-LAB, random 10-fold", (LAB,), "random:10", (0.85, 0.82, 0.85, 0.90, 0.96)),
-    Figure(5, "T-REAL, leave position out", (REAL,), "leave:position", (0.78, 0.77, 0.79, 0.75, 0.86)),
+    Figure(
+        5, "T-REAL, leave position out", (REAL,), "leave:position", (0.78, 0.77, 0.79, 0.75, 0.86)
+    ),
     Figure(6, "T-REAL, random 9-fold", (REAL,), "random:9", (0.80, 0.80, 0.83, 0.85, 0.93)),
     Figure(7, "from T-REAL to T-HARD", (REAL, *HARD), ROW_OFF, (0.57, 0.58, 0.55, 0.50, 0.70)),
 )
@@ -49,24 +54,33 @@ PRINTED = np.array([figure.printed for figure in FIGURES])
 """[figures, methods]"""
 
 
-def draw(seed: int, world: skin.World = skin.WORLD, per_material: int | None = None) -> sets.Dataset:
+def draw(
+    seed: int, world: skin.World = skin.WORLD, per_material: int | None = None
+) -> sets.Dataset:
     """T-LAB, T-REAL and ATTACHMENTS times T-HARD of one seed, joined in this order.
 
-    Equal seeds draw the same places, attachments and noise in every world, so that worlds can be compared.
-    per_material: sweeps of each tube at each position; None stands for the paper's count.
+    Equal seeds draw the same places, attachments and noise in every world, so that worlds can be
+    compared. per_material: sweeps of each tube at each position; None stands for the paper's count.
     """
     parts = []
-    hard: list[tuple[skin.SetName, int]] = [("T-HARD", ATTACHMENTS * seed + i) for i in range(ATTACHMENTS)]
+    hard: list[tuple[skin.SetName, int]] = [
+        ("T-HARD", ATTACHMENTS * seed + i) for i in range(ATTACHMENTS)
+    ]
     named: list[tuple[skin.SetName, int]] = [("T-LAB", seed), ("T-REAL", seed), *hard]
     for name, its_seed in named:
         samples, labels, position = skin.sweep_set(name, its_seed, per_material, world)
         groups = {"position": position}
-        parts.append(sets.Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"))
+        parts.append(
+            sets.Dataset(
+                samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, f"{name}:{its_seed}"
+            )
+        )
     return sets.join(parts)
 
 
 def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
-    """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the random folds."""
+    """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the
+    random folds."""
     inputs = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
@@ -80,12 +94,20 @@ def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
 
 
 def _right(
-    make: Callable[[], baselines.Estimator], features: Array, labels: Array, folds: Sequence[tuple[Array, Array]]
+    make: Callable[[], baselines.Estimator],
+    features: Array,
+    labels: Array,
+    folds: Sequence[tuple[Array, Array]],
 ) -> int:
-    """How many answers of all folds are right, by the estimator itself: labels need no temperature and no graph."""
+    """How many answers of all folds are right, by the estimator itself: labels need no temperature
+    and no graph."""
     features = features.astype(np.float64)
     return sum(
-        int((make().fit(features[train], labels[train]).predict(features[test]) == labels[test]).sum())
+        int(
+            (
+                make().fit(features[train], labels[train]).predict(features[test]) == labels[test]
+            ).sum()
+        )
         for train, test in folds
     )
 
@@ -98,11 +120,14 @@ def measure(
     jobs: int = -1,
     per_material: int | None = None,
 ) -> dict[str, Any]:
-    """The twenty accuracies, means over `seeds`, ready for JSON; with `ablate` also those without each effect.
+    """The twenty accuracies, means over `seeds`, ready for JSON; with `ablate` also those without
+    each effect.
 
     jobs: processes, -1 one for each core; results do not depend on it.
     """
-    worlds = {"": world} | {e: replace(world, off=world.off | {e}) for e in (skin.EFFECTS if ablate else ())}
+    worlds = {"": world} | {
+        e: replace(world, off=world.off | {e}) for e in (skin.EFFECTS if ablate else ())
+    }
     tasks = [(without, seed) for without in worlds for seed in seeds]
     progress = parallel.Progress(len(tasks), log)
     done: dict[tuple[str, int], Array] = {}
@@ -112,42 +137,61 @@ def measure(
     by_seed = {without: np.array([done[without, seed] for seed in seeds]) for without in worlds}
     ours = by_seed[""].mean(axis=0)
     return {
-        "seeds": list(seeds), "attachments": ATTACHMENTS, "methods": list(METHODS),
-        "figures": [figure.name for figure in FIGURES], "printed": PRINTED.tolist(), "ours": ours.tolist(),
-        "spread": by_seed[""].std(axis=0).tolist(), **_match(ours),
+        "seeds": list(seeds),
+        "attachments": ATTACHMENTS,
+        "methods": list(METHODS),
+        "figures": [figure.name for figure in FIGURES],
+        "printed": PRINTED.tolist(),
+        "ours": ours.tolist(),
+        "spread": by_seed[""].std(axis=0).tolist(),
+        **_match(ours),
         "without": {
-            effect: {"ours": without.mean(axis=0).tolist(), **_match(without.mean(axis=0)),
-                     "change": (without.mean(axis=0) - ours).tolist(),
-                     "error": _standard_error(without - by_seed[""]).tolist()}
-            for effect, without in by_seed.items() if effect
+            effect: {
+                "ours": without.mean(axis=0).tolist(),
+                **_match(without.mean(axis=0)),
+                "change": (without.mean(axis=0) - ours).tolist(),
+                "error": _standard_error(without - by_seed[""]).tolist(),
+            }
+            for effect, without in by_seed.items()
+            if effect
         },
-    }  # fmt: skip
+    }
 
 
-def _accuracies(task: tuple[str, int], worlds: dict[str, skin.World], per_material: int | None) -> Array:
+def _accuracies(
+    task: tuple[str, int], worlds: dict[str, skin.World], per_material: int | None
+) -> Array:
     without, seed = task
     return accuracies(draw(seed, worlds[without], per_material), seed)
 
 
 def _match(ours: Array) -> dict[str, Any]:
     away = ours - PRINTED
-    return {"difference": away.tolist(), "largest": float(abs(away).max()), "mean": float(abs(away).mean())}
+    return {
+        "difference": away.tolist(),
+        "largest": float(abs(away).max()),
+        "mean": float(abs(away).mean()),
+    }
 
 
 def _standard_error(values: Array) -> Array:
-    """Of the mean over the first axis; 0 where there is one value only, of which nothing is known."""
+    """Of the mean over the first axis; 0 where there is one value only, of which nothing is
+    known."""
     error: Array = values.std(axis=0) / np.sqrt(max(len(values) - 1, 1))
     return error
 
 
 def table(result: dict[str, Any]) -> str:
-    """What `measure` returned, for a person: each accuracy as printed, ours with its spread over seeds, and the difference.
+    """What `measure` returned, for a person: each accuracy as printed, ours with its spread over
+    seeds, and the difference.
 
     Below, where effects were switched off: by how much each accuracy changed, in hundredths.
     """
     names = [name.ljust(20) for name in result["methods"]]
     text = [(" " * 32 + "".join(names)).rstrip()]
-    for name, *rows in zip(*(result[k] for k in ("figures", "printed", "ours", "spread", "difference")), strict=True):
+    for name, *rows in zip(
+        *(result[k] for k in ("figures", "printed", "ours", "spread", "difference")), strict=True
+    ):
         cells = [
             f"{_short(p, '.2f')} {_short(o, '.3f')}±{_short(s, '.3f')} {_short(d, '+.2f')}"
             for p, o, s, d in zip(*rows, strict=True)
@@ -157,9 +201,14 @@ def table(result: dict[str, Any]) -> str:
         f"{_difference(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each"
     )
     if result["without"]:
-        text += ["", ("without".ljust(12) + "".join(name.ljust(28) for name in result["figures"])).rstrip()]
+        text += [
+            "",
+            ("without".ljust(12) + "".join(name.ljust(28) for name in result["figures"])).rstrip(),
+        ]
     for effect, entry in result["without"].items():
-        changes = "".join("".join(f"{100 * v:+4.0f}" for v in row).ljust(28) for row in entry["change"])
+        changes = "".join(
+            "".join(f"{100 * v:+4.0f}" for v in row).ljust(28) for row in entry["change"]
+        )
         text.append(f"{effect:<12}{changes}{_difference(entry)}")
     return "\n".join(text)
 
@@ -169,4 +218,6 @@ def _short(value: float, form: str) -> str:
 
 
 def _difference(match: dict[str, Any]) -> str:
-    return f"largest difference {_short(match['largest'], '.3f')}, mean {_short(match['mean'], '.3f')}"
+    return (
+        f"largest difference {_short(match['largest'], '.3f')}, mean {_short(match['mean'], '.3f')}"
+    )

@@ -1,7 +1,9 @@
-"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as results.json holds them.
+"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as results.json holds
+them.
 
-Calibration, the sequential test, unknown materials, enrolment and early decisions, each on test sweeps that nothing was
-fitted on. Intervals are 95 %, bootstrapped over the places where the skin sat, whose sweeps fail together.
+Calibration, the sequential test, unknown materials, enrolment and early decisions, each on test
+sweeps that nothing was fitted on. Intervals are 95 %, bootstrapped over the places where the skin
+sat, whose sweeps fail together.
 """
 
 from __future__ import annotations
@@ -48,10 +50,17 @@ Trained = tuple[Case, Posthoc]
 
 
 def run(
-    sweeps: Dataset, test: Dataset | None, protocol: str, method: str, where: Where, log: Log,
-    effort: Effort = methods.FULL_EFFORT, seed: int = 1,
-) -> dict[str, Any]:  # fmt: skip
-    """All figures, as results.json holds them. test: the set that is tested on; without it `protocol` says what is left out.
+    sweeps: Dataset,
+    test: Dataset | None,
+    protocol: str,
+    method: str,
+    where: Where,
+    log: Log,
+    effort: Effort = methods.FULL_EFFORT,
+    seed: int = 1,
+) -> dict[str, Any]:
+    """All figures, as results.json holds them. test: the set that is tested on; without it
+    `protocol` says what is left out.
 
     Raises FormatError where the sets do not fit, or the method cannot do it.
     """
@@ -66,12 +75,21 @@ def run(
     log("figures")
     result = figures(trained, whole_set.materials, seed)
     about = {
-        "set": sweeps.source, "test": test.source if test else "", "protocol": "train and test" if test else protocol,
-        "method": method, "effort": effort.share, "seed": seed, "folds": len(folds), "trainings": len(trained),
-        "sweeps": len(whole_set), "tested": int(sum(len(test) for _, test in folds)), "digest": digest(whole_set),
-        "materials": list(whole_set.materials), "format": str(whole_set.format),
+        "set": sweeps.source,
+        "test": test.source if test else "",
+        "protocol": "train and test" if test else protocol,
+        "method": method,
+        "effort": effort.share,
+        "seed": seed,
+        "folds": len(folds),
+        "trainings": len(trained),
+        "sweeps": len(whole_set),
+        "tested": int(sum(len(test) for _, test in folds)),
+        "digest": digest(whole_set),
+        "materials": list(whole_set.materials),
+        "format": str(whole_set.format),
         "took_s": round(time.monotonic() - start, 1),
-    }  # fmt: skip
+    }
     return about | provenance() | result
 
 
@@ -79,7 +97,11 @@ def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Jso
     """All figures; those that need a material left out are missing where there are only two."""
     fitted = [(case, case.posthoc()) for case in trained]
     full = [one for one in fitted if one[0].left_out < 0]
-    result = {"calibration": calibration(full), "sequence": sequence(full, seed), "early": early(full)}
+    result = {
+        "calibration": calibration(full),
+        "sequence": sequence(full, seed),
+        "early": early(full),
+    }
     without = [one for one in fitted if one[0].left_out >= 0]
     if without:
         result["unknown"] = unknown(without, materials)
@@ -88,26 +110,40 @@ def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Jso
 
 
 def calibration(full: Sequence[Trained]) -> Json:
-    """Expected calibration error and reliability before (LDA's own posteriors) and after the temperature."""
+    """Expected calibration error and reliability before (LDA's own posteriors) and after the
+    temperature."""
     labels, places = _joined(full, "labels"), _places(full)
-    result: Json = {"n": len(labels), "temperature": [round(done.temperature, 2) for _, done in full]}
+    result: Json = {
+        "n": len(labels),
+        "temperature": [round(done.temperature, 2) for _, done in full],
+    }
     for name, undo in (("before", True), ("after", False)):
         logits = np.concatenate(
-            [done.logits(case.new[:, -1]) * (done.temperature if undo else 1) for case, done in full]
+            [
+                done.logits(case.new[:, -1]) * (done.temperature if undo else 1)
+                for case, done in full
+            ]
         )
         p = softmax(logits)
         confidence, right = p.max(1), p.argmax(1) == labels
         low, high = _bootstrap(partial(_error_of, confidence, right), places)
-        result[name] = {"error": round(error(confidence, right), 4), "low": low, "high": high,
-                        "bins": reliability(confidence, right)}  # fmt: skip
+        result[name] = {
+            "error": round(error(confidence, right), 4),
+            "low": low,
+            "high": high,
+            "bins": reliability(confidence, right),
+        }
     result["accuracy"] = _accuracy(right, places)
     return result
 
 
 def error(confidence: Array, right: Array) -> float:
-    """Expected calibration error (Naeini et al. 2015): mean over sweeps of |accuracy - probability| of their bin."""
+    """Expected calibration error (Naeini et al. 2015): mean over sweeps of |accuracy - probability|
+    of their bin."""
     bins = reliability(confidence, right)
-    return float(sum(b["n"] * abs(b["right"] - b["said"]) for b in bins) / max(sum(b["n"] for b in bins), 1))
+    return float(
+        sum(b["n"] * abs(b["right"] - b["said"]) for b in bins) / max(sum(b["n"] for b in bins), 1)
+    )
 
 
 def _error_of(confidence: Array, right: Array, some: Array) -> float:
@@ -115,112 +151,190 @@ def _error_of(confidence: Array, right: Array, some: Array) -> float:
 
 
 def reliability(confidence: Array, right: Array) -> list[Json]:
-    """Of each bin of the highest probability [n] that is not empty: its mean (`said`), the share right, the number."""
+    """Of each bin of the highest probability [n] that is not empty: its mean (`said`), the share
+    right, the number."""
     which = np.minimum((confidence * BINS).astype(int), BINS - 1)
     some = [(which == b) for b in range(BINS) if (which == b).any()]
-    return [{"said": round(float(confidence[i].mean()), 4), "right": round(float(right[i].mean()), 4), "n": int(i.sum())}
-            for i in some]  # fmt: skip
+    return [
+        {
+            "said": round(float(confidence[i].mean()), 4),
+            "right": round(float(right[i].mean()), 4),
+            "n": int(i.sum()),
+        }
+        for i in some
+    ]
 
 
 def sequence(full: Sequence[Trained], seed: int) -> Json:
-    """Mean number of sweeps against accuracy for WANTED probabilities: sweeps of one object are fused until the probability
-    is reached, or up to MOST_SWEEPS.
+    """Mean number of sweeps against accuracy for WANTED probabilities: sweeps of one object are
+    fused until the probability is reached, or up to MOST_SWEEPS.
 
-    "same place": all sweeps of one attachment, whose errors are correlated; "several places": from anywhere in the test.
+    "same place": all sweeps of one attachment, whose errors are correlated; "several places": from
+    anywhere in the test.
     """
-    log_p = np.log(np.maximum(softmax(np.concatenate([d.logits(c.new[:, -1]) for c, d in full])), LEAST_PROBABILITY))
+    log_p = np.log(
+        np.maximum(
+            softmax(np.concatenate([d.logits(c.new[:, -1]) for c, d in full])), LEAST_PROBABILITY
+        )
+    )
     labels, places = _joined(full, "labels"), _places(full)
     rng, result = np.random.default_rng(seed), {}
-    for name, objects in (("same place", labels + places * (labels.max() + 1)), ("several places", labels)):
+    for name, objects in (
+        ("same place", labels + places * (labels.max() + 1)),
+        ("several places", labels),
+    ):
         members = [np.flatnonzero(objects == o) for o in np.unique(objects)]
         repeat = max(ORDERS, 400 // len(members))
-        picks = [rng.permutation(m)[:MOST_SWEEPS] for m in members for _ in range(repeat) if len(m) >= MOST_SWEEPS]
+        picks = [
+            rng.permutation(m)[:MOST_SWEEPS]
+            for m in members
+            for _ in range(repeat)
+            if len(m) >= MOST_SWEEPS
+        ]
         if not picks:
             continue
         order = np.array(picks)
         fused = softmax(log_p[order].cumsum(axis=1))  # [objects, MOST_SWEEPS, K]
         truth = labels[order[:, 0]]
         clusters = places[order[:, 0]] if name == "same place" else truth
-        result[name] = {"objects": len(order), "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *WANTED)]}
+        result[name] = {
+            "objects": len(order),
+            "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *WANTED)],
+        }
     return result
 
 
 def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json:
-    """The sequential test's result where it stops at the probability `wanted`, or after the last sweep."""
+    """The sequential test's result where it stops at the probability `wanted`, or after the last
+    sweep."""
     enough = fused.max(2) >= wanted
     decided = enough.any(axis=1)
     enough[:, -1] = True
     stop = enough.argmax(axis=1)
     named = fused[np.arange(len(fused)), stop].argmax(1)
     right = named == truth
-    return {"wanted": wanted, "sweeps": round(float(stop.mean() + 1), 3), "decided": round(float(decided.mean()), 4),
-            "right_of_decided": round(float(right[decided].mean()), 4) if decided.any() else None,
-            **_accuracy(right, clusters)}  # fmt: skip
+    return {
+        "wanted": wanted,
+        "sweeps": round(float(stop.mean() + 1), 3),
+        "decided": round(float(decided.mean()), 4),
+        "right_of_decided": round(float(right[decided].mean()), 4) if decided.any() else None,
+        **_accuracy(right, clusters),
+    }
 
 
 def early(full: Sequence[Trained]) -> Json:
-    """Accuracy against the mean share of the sweep: by the rules as found in training, by others, always at a tenth."""
+    """Accuracy against the mean share of the sweep: by the rules as found in training, by others,
+    always at a tenth."""
     labels, places = _joined(full, "labels"), _places(full)
     p = np.concatenate([done.probabilities(case.new) for case, done in full])
     whole = p[:, -1].argmax(1) == labels
     steps = p.shape[1]
-    by_rule = [decide(p_, done.rule.early) if done.rule.early else (p_[:, -1].argmax(1), np.ones(len(p_)))
-               for (_, done), p_ in zip(full, _parted(p, full), strict=True)]  # fmt: skip
+    by_rule = [
+        decide(p_, done.rule.early) if done.rule.early else (p_[:, -1].argmax(1), np.ones(len(p_)))
+        for (_, done), p_ in zip(full, _parted(p, full), strict=True)
+    ]
     named, share = (np.concatenate(part) for part in zip(*by_rule, strict=True))
     lost = whole.astype(float) - (named == labels)
     low, high = _bootstrap(partial(_mean_of, lost), places)
-    rules = [{"least": r.early.least[0] if r.early else None, "agree": r.early.agree if r.early else None, "why": r.why,
-              "n": r.n} for r in (done.rule for _, done in full)]  # fmt: skip
+    rules = [
+        {
+            "least": r.early.least[0] if r.early else None,
+            "agree": r.early.agree if r.early else None,
+            "why": r.why,
+            "n": r.n,
+        }
+        for r in (done.rule for _, done in full)
+    ]
     curves = {}
     for agree in (1, 2, 3):
         met = [decide(p, _same(level, agree, steps)) for level in LEVELS]
-        curves[str(agree)] = [{"least": level, "share": round(float(s.mean()), 4),
-                               "accuracy": round(float(np.mean(k == labels)), 4)}
-                              for level, (k, s) in zip(LEVELS, met, strict=True)]  # fmt: skip
+        curves[str(agree)] = [
+            {
+                "least": level,
+                "share": round(float(s.mean()), 4),
+                "accuracy": round(float(np.mean(k == labels)), 4),
+            }
+            for level, (k, s) in zip(LEVELS, met, strict=True)
+        ]
     return {
-        "n": len(labels), "share": round(float(share.mean()), 4), "lost": round(float(lost.mean()), 4), "lost_low": low,
-        "lost_high": high, "rule": _accuracy(named == labels, places), "whole": _accuracy(whole, places), "rules": rules,
-        "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)], "curves": curves,
-    }  # fmt: skip
+        "n": len(labels),
+        "share": round(float(share.mean()), 4),
+        "lost": round(float(lost.mean()), 4),
+        "lost_low": low,
+        "lost_high": high,
+        "rule": _accuracy(named == labels, places),
+        "whole": _accuracy(whole, places),
+        "rules": rules,
+        "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)],
+        "curves": curves,
+    }
 
 
 def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
-    """Leave one material out: AUROC of known test sweeps against those of the material, by several scores; the share of
-    known sweeps that the limit found in training keeps, and of unknown ones that it lets through as known; the same at
-    multiples of the limit, and where a second sweep at the same place must pass too."""
+    """Leave one material out: AUROC of known test sweeps against those of the material, by several
+    scores; the share of known sweeps that the limit found in training keeps, and of unknown ones
+    that it lets through as known; the same at multiples of the limit, and where a second sweep at
+    the same place must pass too."""
     materials_of: dict[str, Json] = {}
     every: dict[str, list[float]] = {}
     passed: list[Array] = []
     for k in sorted({case.left_out for case, _ in without}):
         held = [one for one in without if one[0].left_out == k]
         known, places = np.concatenate([case.known() for case, _ in held]), _places(held)
-        scores = {name: np.concatenate([score(case, done) for case, done in held]) for name, score in SCORES.items()}
+        scores = {
+            name: np.concatenate([score(case, done) for case, done in held])
+            for name, score in SCORES.items()
+        }
         ours = scores["distance"]
         low, high = _bootstrap(partial(_auroc_of, ours, known), places)
         at = np.quantile(ours[known], 0.95)
         materials_of[materials[k]] = {
-            "auroc": round(auroc(ours[known], ours[~known]), 4), "low": low, "high": high,
-            "kept": round(float(np.mean(ours[known] <= 1)), 4), "false_known": round(float(np.mean(ours[~known] <= 1)), 4),
+            "auroc": round(auroc(ours[known], ours[~known]), 4),
+            "low": low,
+            "high": high,
+            "kept": round(float(np.mean(ours[known] <= 1)), 4),
+            "false_known": round(float(np.mean(ours[~known] <= 1)), 4),
             "false_known_at_95": round(float(np.mean(ours[~known] <= at)), 4),
-            "known": int(known.sum()), "unknown": int((~known).sum()),
-        }  # fmt: skip
+            "known": int(known.sum()),
+            "unknown": int((~known).sum()),
+        }
         labels = _joined(held, "labels")
         passed.append(
-            np.array([[_passed(ours, known, places, labels, factor, n) for n in (1, 2)] for factor in LIMITS])
+            np.array(
+                [
+                    [_passed(ours, known, places, labels, factor, n) for n in (1, 2)]
+                    for factor in LIMITS
+                ]
+            )
         )
         for name, row in scores.items():
             every.setdefault(name, []).append(auroc(row[known], row[~known]))
-    mean = {name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
-            for name in ("auroc", "kept", "false_known", "false_known_at_95")}  # fmt: skip
+    mean = {
+        name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
+        for name in ("auroc", "kept", "false_known", "false_known_at_95")
+    }
     means = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
-    limits = [{"factor": factor, "kept": one[0], "false_known": one[1], "kept_twice": two[0], "false_known_twice": two[1]}
-              for factor, (one, two) in zip(LIMITS, np.mean(passed, axis=0).round(4).tolist(), strict=True)]  # fmt: skip
+    limits = [
+        {
+            "factor": factor,
+            "kept": one[0],
+            "false_known": one[1],
+            "kept_twice": two[0],
+            "false_known_twice": two[1],
+        }
+        for factor, (one, two) in zip(
+            LIMITS, np.mean(passed, axis=0).round(4).tolist(), strict=True
+        )
+    ]
     return {"materials": materials_of, "mean": mean, "scores": means, "limits": limits}
 
 
-def _passed(scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int) -> tuple[float, float]:
-    """Shares of known and of unknown sweeps that pass `factor` times the limit, each together with the n - 1 sweeps of its
-    material that follow at its place; the last sweeps of a place have too few and are left out."""
+def _passed(
+    scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int
+) -> tuple[float, float]:
+    """Shares of known and of unknown sweeps that pass `factor` times the limit, each together with
+    the n - 1 sweeps of its material that follow at its place; the last sweeps of a place have too
+    few and are left out."""
     order = np.lexsort((labels, places))
     here, fits = np.stack([places, labels])[:, order], (scores <= factor)[order]
     size = len(order) - n + 1
@@ -239,7 +353,8 @@ def _mean_of(values: Array, some: Array) -> float:
 
 
 def _of_trunk(case: Case, done: Posthoc) -> Array:
-    """Squared distance in the trained features alone; the same for all sweeps where there are none."""
+    """Squared distance in the trained features alone; the same for all sweeps where there are
+    none."""
     if not (size := case.seen.shape[2] - case.fixed):
         return np.zeros(len(case.new))
     return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
@@ -249,16 +364,20 @@ SCORES: dict[str, Callable[[Case, Posthoc], Array]] = {
     "distance": lambda case, done: done.embedding.novelty(case.new[:, -1]) / done.limit,
     "distance, trained features only": _of_trunk,
     "distance, where trained materials differ": lambda case, done: embed(
-        case.seen[:, -1], case.seen_labels).novelty(case.new[:, -1]),
+        case.seen[:, -1], case.seen_labels
+    ).novelty(case.new[:, -1]),
     "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
-}  # fmt: skip
-"""Each is larger for a sweep that is less like the training sweeps. Limits of several folds differ: the first score is in
-units of the limit."""
+}
+"""Each is larger for a sweep that is less like the training sweeps. Limits of several folds differ:
+the first score is in units of the limit."""
 
 
-def enrolment(full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int) -> Json:
-    """Leave a material out and enrol it from some sweeps of one place: balanced accuracy of all classes there and
-    elsewhere, as a share of that of the model trained on all; and the accuracy that the old classes lose."""
+def enrolment(
+    full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int
+) -> Json:
+    """Leave a material out and enrol it from some sweeps of one place: balanced accuracy of all
+    classes there and elsewhere, as a share of that of the model trained on all; and the accuracy
+    that the old classes lose."""
     whole = {case.fold: (case, done) for case, done in full}
     rows: dict[tuple[str, int], list[tuple[float, ...]]] = {}
     for case, done in without:
@@ -270,23 +389,37 @@ def enrolment(full: Sequence[Trained], without: Sequence[Trained], materials: Se
         values = np.array(row_list)
         share, by_material = values[:, 1] / values[:, 2], values[:, 0].astype(int)
         low, high = _bootstrap(partial(_mean_of, share), by_material)
-        points.append({
-            "where": where, "sweeps": n, "share": round(float(share.mean()), 4), "low": low, "high": high,
-            "accuracy": round(float(values[:, 1].mean()), 4), "trained": round(float(values[:, 2].mean()), 4),
-            "new": round(float(values[:, 3].mean()), 4), "old_lost": round(float(values[:, 4].mean()), 4),
-            "draws": len(values),
-            "by_material": {materials[k]: round(float(share[by_material == k].mean()), 4) for k in np.unique(by_material)},
-        })  # fmt: skip
+        points.append(
+            {
+                "where": where,
+                "sweeps": n,
+                "share": round(float(share.mean()), 4),
+                "low": low,
+                "high": high,
+                "accuracy": round(float(values[:, 1].mean()), 4),
+                "trained": round(float(values[:, 2].mean()), 4),
+                "new": round(float(values[:, 3].mean()), 4),
+                "old_lost": round(float(values[:, 4].mean()), 4),
+                "draws": len(values),
+                "by_material": {
+                    materials[k]: round(float(share[by_material == k].mean()), 4)
+                    for k in np.unique(by_material)
+                },
+            }
+        )
     return {"points": points}
 
 
 def _enrolled(
     case: Case, done: Posthoc, whole: Case, trained: Posthoc, rng: np.random.Generator
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
-    """Of random draws: (sweeps, where, (accuracy, that of the whole model, recall of the new one, loss of the old))."""
+    """Of random draws: (sweeps, where, (accuracy, that of the whole model, recall of the new one,
+    loss of the old))."""
     z, k = done.embedding(case.new[:, -1]), case.left_out
     as_trained = trained.logits(whole.new[:, -1]).argmax(1)
-    names = np.append(np.delete(np.arange(case.labels.max() + 1), k), k)  # the box puts the new label last
+    names = np.append(
+        np.delete(np.arange(case.labels.max() + 1), k), k
+    )  # the box puts the new label last
     before = names[done.logits(case.new[:, -1]).argmax(1)]
     mine, places = np.flatnonzero(case.labels == k), np.unique(case.places)
     for n in ENROLLED:
@@ -297,20 +430,31 @@ def _enrolled(
                     continue
                 drawn = rng.permutation(there)[:n]
                 named = names[enrolled_logits(done.embedding, z, z[drawn]).argmax(1)]
-                for where, chosen in (("same place", case.places == place), ("other places", case.places != place)):
+                for where, chosen in (
+                    ("same place", case.places == place),
+                    ("other places", case.places != place),
+                ):
                     test = np.setdiff1d(np.flatnonzero(chosen), drawn)
                     if (case.labels[test] == k).any() and (case.labels[test] != k).any():
                         label, old = case.labels[test], test[case.labels[test] != k]
-                        yield n, where, (
-                            _balanced(named[test], label), _balanced(as_trained[test], label),
-                            float(np.mean(named[test][label == k] == k)),
-                            float(np.mean(before[old] == case.labels[old]) - np.mean(named[old] == case.labels[old])),
-                        )  # fmt: skip
+                        yield (
+                            n,
+                            where,
+                            (
+                                _balanced(named[test], label),
+                                _balanced(as_trained[test], label),
+                                float(np.mean(named[test][label == k] == k)),
+                                float(
+                                    np.mean(before[old] == case.labels[old])
+                                    - np.mean(named[old] == case.labels[old])
+                                ),
+                            ),
+                        )
 
 
 def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
-    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r] with one label more, enrolled from `sweeps`
-    [m, r] as the box enrols it."""
+    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r] with one label more,
+    enrolled from `sweeps` [m, r] as the box enrols it."""
     enrolled = extended(embedding.classes(), sweeps)
     logits: Array = z @ enrolled.means.T + enrolled.bias
     return logits
@@ -350,6 +494,12 @@ def _bootstrap(figure: Callable[[Array], float], clusters: Array) -> tuple[float
     rng, drawn = np.random.default_rng(0), []
     for _ in range(DRAWS):
         with suppress(FormatError):  # a draw without a sweep of one kind has no figure
-            drawn.append(figure(np.concatenate([members[c] for c in rng.integers(len(members), size=len(members))])))
+            drawn.append(
+                figure(
+                    np.concatenate(
+                        [members[c] for c in rng.integers(len(members), size=len(members))]
+                    )
+                )
+            )
     low, high = np.quantile(drawn, (0.025, 0.975)) if drawn else (0.0, 1.0)
     return round(float(low), 4), round(float(high), 4)

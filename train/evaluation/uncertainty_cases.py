@@ -1,7 +1,9 @@
-"""Trainings for the study of uncertainty. In: a sweep set, its folds, a method. Out: Cases, kept in a cache.
+"""Trainings for the study of uncertainty. In: a sweep set, its folds, a method. Out: Cases, kept in
+a cache.
 
-A Case is one training, on all materials or all but one, with the features of every sweep. All figures are computed from
-Cases without training again. Sweeps that a rule, a limit or a temperature is fitted on are never tested on.
+A Case is one training, on all materials or all but one, with the features of every sweep. All
+figures are computed from Cases without training again. Sweeps that a rule, a limit or a temperature
+is fitted on are never tested on.
 """
 
 from __future__ import annotations
@@ -52,15 +54,15 @@ class CaseTask:
 
 @dataclass(frozen=True)
 class Case:
-    """The result of one training. left_out: the material it did not see. fixed: number of features that were not trained;
-    they are the last ones.
+    """The result of one training. left_out: the material it did not see. fixed: number of features
+    that were not trained; they are the last ones.
 
-    seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered `seen_labels` [N] from
-    0 on without the one left out; seen_groups [N]: positions or recordings; judged: bool [N], those that the trunk did
-    not see, which may judge. copied: features [M, F] of augmented copies, of copied_labels, copied_groups and
-    copied_held [M]; see AugmentedCopies.
-    disturbed: bool [N] of the seen sweeps; see posthoc.fit_posthoc.
-    new, labels, places: features of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
+    seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered
+    `seen_labels` [N] from 0 on without the one left out; seen_groups [N]: positions or recordings;
+    judged: bool [N], those that the trunk did not see, which may judge. copied: features [M, F] of
+    augmented copies, of copied_labels, copied_groups and copied_held [M]; see AugmentedCopies.
+    disturbed: bool [N] of the seen sweeps; see posthoc.fit_posthoc. new, labels, places: features
+    of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
     """
 
     left_out: int
@@ -87,15 +89,25 @@ class Case:
 
     def posthoc(self) -> Posthoc:
         """What is fitted on the trunk of this training."""
-        copies = AugmentedCopies(self.copied, self.copied_labels, self.copied_groups, self.copied_held)
+        copies = AugmentedCopies(
+            self.copied, self.copied_labels, self.copied_groups, self.copied_held
+        )
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
         given = PosthocInputs(
-            self.seen, self.seen_labels, self.seen_groups, self.judged, self.fixed, copies, self.disturbed, plan
+            self.seen,
+            self.seen_labels,
+            self.seen_groups,
+            self.judged,
+            self.fixed,
+            copies,
+            self.disturbed,
+            plan,
         )
         return fit_posthoc(given)
 
     def numbered(self) -> Array:
-        """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out mean nothing."""
+        """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out
+        mean nothing."""
         if self.left_out == NONE_LEFT_OUT:
             return self.labels
         return self.labels - (self.labels > self.left_out)
@@ -121,10 +133,23 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     copies = given.copied
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
-        task.left_out, task.fold, given.fixed, given.tenths, given.labels, given.groups, given.judged, copies.features, copies.labels,
-        copies.groups, copies.held, run_graph(made.trunk(tenths=True), sweeps.samples[task.test]), sweeps.labels[task.test],
-        places[task.test], given.disturbed, json.dumps(given.plan.json()) if given.plan else "",
-    )  # fmt: skip
+        task.left_out,
+        task.fold,
+        given.fixed,
+        given.tenths,
+        given.labels,
+        given.groups,
+        given.judged,
+        copies.features,
+        copies.labels,
+        copies.groups,
+        copies.held,
+        run_graph(made.trunk(tenths=True), sweeps.samples[task.test]),
+        sweeps.labels[task.test],
+        places[task.test],
+        given.disturbed,
+        json.dumps(given.plan.json()) if given.plan else "",
+    )
 
 
 def tasks(
@@ -132,26 +157,41 @@ def tasks(
 ) -> list[CaseTask]:
     """Every fold with all materials, and without each of them in turn where at least two remain."""
     out = [NONE_LEFT_OUT, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
-    return [CaseTask(method, effort, seed, i, *fold, left) for left in out for i, fold in enumerate(folds)]
+    return [
+        CaseTask(method, effort, seed, i, *fold, left)
+        for left in out
+        for i, fold in enumerate(folds)
+    ]
 
 
 def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:
-    """The Case of each task in their order: kept ones from the cache, the others trained. log: receives the progress."""
+    """The Case of each task in their order: kept ones from the cache, the others trained. log:
+    receives the progress."""
     data, done = digest(sweeps), {}
-    keys = [fingerprint([data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
-                        methods.module_of(t.method), "train.calibration.posthoc") for t in wanted]  # fmt: skip
+    keys = [
+        fingerprint(
+            [data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
+            methods.module_of(t.method),
+            "train.calibration.posthoc",
+        )
+        for t in wanted
+    ]
     for i, key in enumerate(keys):
         if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
             done[i] = replace(case, fold=wanted[i].fold)
     left = [(i, task) for i, task in enumerate(wanted) if i not in done]
     if left and where.kept:
-        raise FormatError(f"{len(left)} of {len(wanted)} trainings are not kept; run without --kept first")
+        raise FormatError(
+            f"{len(left)} of {len(wanted)} trainings are not kept; run without --kept first"
+        )
     progress = parallel.Progress(len(left), log)
     for (i, task), case in parallel.results(_learn, left, (sweeps,), where.jobs, where.scheduler):
         done[i] = case
         if where.cache:
             _save(case, where.cache / f"{keys[i]}.case.npz")
-        out = "" if task.left_out == NONE_LEFT_OUT else f" without {sweeps.materials[task.left_out]}"
+        out = (
+            "" if task.left_out == NONE_LEFT_OUT else f" without {sweeps.materials[task.left_out]}"
+        )
         progress(f"{task.method}, fold {task.fold + 1}{out}")
     return [done[i] for i in range(len(wanted))]
 

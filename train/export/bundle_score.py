@@ -1,4 +1,5 @@
-"""What a bundle answers to a sweep set, through the classifier of the box. In: a classifier, a Dataset. Out: a BundleScore.
+"""What a bundle answers to a sweep set, through the classifier of the box. In: a classifier, a
+Dataset. Out: a BundleScore.
 
 A sweep counts as named rightly where the box names its material and is sure of it (status ok).
 """
@@ -21,12 +22,15 @@ from train.metrics.score import Score, interval, provenance
 
 Array = NDArray[Any]
 CLUSTERS = ("position", "session", "object")
-"""Groups whose sweeps succeed or fail together; the first that has several values is resampled for the interval."""
+"""Groups whose sweeps succeed or fail together; the first that has several values is resampled for
+the interval."""
 
 
-def answers(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> Iterator[tuple[int, Verdict]]:
-    """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of a recording count as
-    sweeps of one object."""
+def answers(
+    classifier: Classifier, sweeps: Dataset, *, fused: bool = False
+) -> Iterator[tuple[int, Verdict]]:
+    """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of
+    a recording count as sweeps of one object."""
     form = sweeps.format
     t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
@@ -34,7 +38,9 @@ def answers(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> 
         frames = Frames(t_ns, seq, sweeps.samples[i])
         yield (
             i,
-            classifier(Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1))),
+            classifier(
+                Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1))
+            ),
         )
 
 
@@ -42,12 +48,13 @@ def answers(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> 
 class BundleScore:
     """What a bundle answered to the sweeps of a set.
 
-    about: name, version and id of the bundle. right: bool [n], of the sweeps whose material it has. clusters, by: the
-    groups [n] that the interval resamples, and their name; None, "" where sweeps are independent. answered: of each
-    material the answers and their counts: a label, or a status in parentheses. statuses: counts.
-    unsure_right: answers that were unsure but named the material. recordings: right ones of those with several sweeps,
-    fused; None where there are none. foreign: as `answered`, of materials that the bundle does not have. moved: what the
-    box says of the sweeps whose contact lies outside the trained positions, each with its count.
+    about: name, version and id of the bundle. right: bool [n], of the sweeps whose material it has.
+    clusters, by: the groups [n] that the interval resamples, and their name; None, "" where sweeps
+    are independent. answered: of each material the answers and their counts: a label, or a status
+    in parentheses. statuses: counts. unsure_right: answers that were unsure but named the material.
+    recordings: right ones of those with several sweeps, fused; None where there are none. foreign:
+    as `answered`, of materials that the bundle does not have. moved: what the box says of the
+    sweeps whose contact lies outside the trained positions, each with its count.
     """
 
     about: dict[str, str]
@@ -65,14 +72,23 @@ class BundleScore:
     def json(self) -> dict[str, Any]:
         """The figures for scripts, with where they come from."""
         result: dict[str, Any] = {
-            "bundle": self.about, "set": self.sweeps.source, "digest": digest(self.sweeps), "sweeps": len(self.sweeps),
-            "named_rightly": Score.of(self.right).json() | {"interval": interval(self.right, self.clusters)},
-            "interval_by": self.by, "statuses": self.statuses, "unsure_right": self.unsure_right,
-            "answers": self.answered, "not_in_the_bundle": self.foreign,
+            "bundle": self.about,
+            "set": self.sweeps.source,
+            "digest": digest(self.sweeps),
+            "sweeps": len(self.sweeps),
+            "named_rightly": Score.of(self.right).json()
+            | {"interval": interval(self.right, self.clusters)},
+            "interval_by": self.by,
+            "statuses": self.statuses,
+            "unsure_right": self.unsure_right,
+            "answers": self.answered,
+            "not_in_the_bundle": self.foreign,
             "moved": self.moved.total(),
-        }  # fmt: skip
+        }
         if self.recordings is not None:
-            result["recordings"] = Score.of(self.recordings).json() | {"interval": interval(self.recordings)}
+            result["recordings"] = Score.of(self.recordings).json() | {
+                "interval": interval(self.recordings)
+            }
         return result | provenance()
 
     def text(self) -> str:
@@ -85,8 +101,15 @@ class BundleScore:
         ]
         if self.recordings is not None:
             lines.append(f"recordings, their sweeps fused: {_share(self.recordings)}")
-        sure = f" ({self.unsure_right} of them with the right label)" if self.statuses[Status.UNSURE] else ""
-        counts = [f"{status} {n}{sure * (status == Status.UNSURE)}" for status, n in self.statuses.most_common()]
+        sure = (
+            f" ({self.unsure_right} of them with the right label)"
+            if self.statuses[Status.UNSURE]
+            else ""
+        )
+        counts = [
+            f"{status} {n}{sure * (status == Status.UNSURE)}"
+            for status, n in self.statuses.most_common()
+        ]
         lines.append(f"answers: {', '.join(counts)}")
         if self.moved:
             most = self.moved.most_common(1)[0][0]
@@ -96,8 +119,12 @@ class BundleScore:
             )
         wide = max(map(len, (*self.answered, *self.foreign)))
         for material, given in self.answered.items():
-            others = ", ".join(f"{answer} {n}" for answer, n in given.most_common() if answer != material)
-            lines.append(f"  {material:<{wide}}  {given[material]:>4} of {given.total():<4}  {others}".rstrip())
+            others = ", ".join(
+                f"{answer} {n}" for answer, n in given.most_common() if answer != material
+            )
+            lines.append(
+                f"  {material:<{wide}}  {given[material]:>4} of {given.total():<4}  {others}".rstrip()
+            )
         for material, given in self.foreign.items():
             named = ", ".join(f"{answer} {n}" for answer, n in given.most_common())
             lines.append(f"  {material:<{wide}}  not in the bundle, not counted: {named}")
@@ -105,8 +132,8 @@ class BundleScore:
 
 
 def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
-    """Run `sweeps` through the box's classifier. Raises FormatError where their format is not the bundle's, or it has none
-    of their materials."""
+    """Run `sweeps` through the box's classifier. Raises FormatError where their format is not the
+    bundle's, or it has none of their materials."""
     manifest = classifier.bundle.manifest
     present = [sweeps.materials[k] for k in np.unique(sweeps.labels)]
     if sweeps.format != manifest.format:
@@ -130,13 +157,26 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
         moved.update([verdict.moved] if verdict.moved else [])
     clusters, by = _clusters(sweeps)
     return BundleScore(
-        {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id}, sweeps,
-        (given == material)[known], None if clusters is None else clusters[known], by,
-        {name: Counter(given[material == name].tolist()) for name in present if name in manifest.labels},
-        statuses, hinted, _recordings(classifier, sweeps.take(known)),
-        {name: Counter(given[material == name].tolist()) for name in present if name not in manifest.labels},
+        {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id},
+        sweeps,
+        (given == material)[known],
+        None if clusters is None else clusters[known],
+        by,
+        {
+            name: Counter(given[material == name].tolist())
+            for name in present
+            if name in manifest.labels
+        },
+        statuses,
+        hinted,
+        _recordings(classifier, sweeps.take(known)),
+        {
+            name: Counter(given[material == name].tolist())
+            for name in present
+            if name not in manifest.labels
+        },
         moved,
-    )  # fmt: skip
+    )
 
 
 def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
@@ -149,14 +189,17 @@ def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
 
 
 def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
-    """Whether the last fused answer to each recording is right, bool [G]; None where each holds one sweep."""
+    """Whether the last fused answer to each recording is right, bool [G]; None where each holds one
+    sweep."""
     values, member = np.unique(sweeps.group("recording"), return_inverse=True)
     if len(values) == len(sweeps):
         return None
     right = np.zeros(len(values), bool)
     for i, verdict in answers(classifier, sweeps, fused=True):
         if verdict.label:  # what is unknown is not fused, and leaves the answer so far
-            right[member[i]] = verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]
+            right[member[i]] = (
+                verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]
+            )
     return right
 
 

@@ -1,5 +1,5 @@
-"""What a bundle answers to corrupted sweeps, through the classifier of the box. In: a classifier, EvaluationSweeps. Out:
-curves, as robustness has them of methods."""
+"""What a bundle answers to corrupted sweeps, through the classifier of the box. In: a classifier,
+EvaluationSweeps. Out: curves, as robustness has them of methods."""
 
 from __future__ import annotations
 
@@ -22,23 +22,29 @@ from train.export import bundle_score
 Array = NDArray[Any]
 Json = dict[str, Any]
 ANSWERS = ("rightly", "wrongly", "unsure", "unknown", "refused", "network")
-"""What becomes of a sweep: named with status ok, or one of three ways not to name it; and whether the network alone, whose
-most probable label counts whatever the box makes of it, is right."""
+"""What becomes of a sweep: named with status ok, or one of three ways not to name it; and whether
+the network alone, whose most probable label counts whatever the box makes of it, is right."""
 
 
 def under_corruptions(
-    box: Classifier, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None] = lambda line: None
+    box: Classifier,
+    test: EvaluationSweeps,
+    seeds: Sequence[int],
+    log: Callable[[str], None] = lambda line: None,
 ) -> Json:
-    """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the sweeps named rightly.
+    """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the
+    sweeps named rightly.
 
-    seeds: of the corruptions. Raises FormatError where the sweeps are not of the bundle's format, or of materials that it
-    does not have.
+    seeds: of the corruptions. Raises FormatError where the sweeps are not of the bundle's format,
+    or of materials that it does not have.
     """
     manifest, sweeps = box.bundle.manifest, test.sweeps
     lacking = sorted({sweeps.materials[k] for k in np.unique(sweeps.labels)} - set(manifest.labels))
     if sweeps.format != manifest.format or lacking:
-        raise FormatError(f"bundle {box.bundle.id} ({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
-                          f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle")  # fmt: skip
+        raise FormatError(
+            f"bundle {box.bundle.id} ({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
+            f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
+        )
     clean, tasks = _answers(box, sweeps), []
     progress = Progress(len(seeds) * len(applicable(test)), log)
     for seed in seeds:
@@ -47,7 +53,9 @@ def under_corruptions(
             progress.begin(f"{corruption.name} as the box answers, seed {seed}")
             found = [clean]
             for severity in corruption.severities[1:]:
-                found.append(_answers(box, replace(sweeps, samples=corruption.apply(test, severity, seed))))
+                found.append(
+                    _answers(box, replace(sweeps, samples=corruption.apply(test, severity, seed)))
+                )
             for answer, counted in trials.items():
                 counted.add(corruption, [(given[answer], 0) for given in found])
         tasks += [counted.task(answer, seed) for answer, counted in trials.items()]
@@ -63,7 +71,11 @@ def _answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
         if verdict.status is Status.OK:
             answer = "rightly" if verdict.label == truth else "wrongly"
         else:
-            answer = str(verdict.status) if verdict.status in (Status.UNSURE, Status.UNKNOWN) else "refused"
+            answer = (
+                str(verdict.status)
+                if verdict.status in (Status.UNSURE, Status.UNKNOWN)
+                else "refused"
+            )
         given[answer][i] = True
         given["network"][i] = labels[int(box.logits(sweeps.samples[i]).argmax())] == truth
     return given

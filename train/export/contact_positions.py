@@ -1,7 +1,9 @@
-"""Where the skin sat. In: a training set; a bundle and simulated sweeps. Out: ContactPositions; accuracy of a moved skin.
+"""Where the skin sat. In: a training set; a bundle and simulated sweeps. Out: ContactPositions;
+accuracy of a moved skin.
 
-The ContactPositions go into the bundle, so that the box can say how far a contact is from those of training. How well
-that predicts accuracy is measured by `palpate-train alignment`: the same sweeps, with the skin moved further and further.
+The ContactPositions go into the bundle, so that the box can say how far a contact is from those of
+training. How well that predicts accuracy is measured by `palpate-train alignment`: the same sweeps,
+with the skin moved further and further.
 """
 
 from __future__ import annotations
@@ -29,8 +31,9 @@ from train.metrics.score import interval, provenance
 Array = NDArray[Any]
 Json = dict[str, Any]
 MIN_LIMIT = 1 / 8
-"""The limit is never below this share of the pitch: attaching the skin again in the same place moves the centre by so
-much (0.5 mm of 4 mm include over 95 % of the simulated attachments), even where few or equal positions suggest less."""
+"""The limit is never below this share of the pitch: attaching the skin again in the same place
+moves the centre by so much (0.5 mm of 4 mm include over 95 % of the simulated attachments), even
+where few or equal positions suggest less."""
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
 """How far the skin is moved, in mm."""
 DIRECTIONS = {"rows": "dx_mm", "columns": "dy_mm"}
@@ -38,13 +41,15 @@ LOSS = 0.05
 """Accuracy counts as lost where it is so far below that of a skin that has not moved."""
 
 
-def place_of(sweeps: Dataset, loads: ContactLimit, pitch_mm: float | None = None) -> ContactPositions | None:
-    """The centre of contact at each position of a training set (else of each recording); None where the distance of the
-    taxels or the threshold is not known, or nothing touched them.
+def place_of(
+    sweeps: Dataset, loads: ContactLimit, pitch_mm: float | None = None
+) -> ContactPositions | None:
+    """The centre of contact at each position of a training set (else of each recording); None where
+    the distance of the taxels or the threshold is not known, or nothing touched them.
 
-    pitch_mm: of the skin; a simulated skin's is known. Loads are those of a box without a TARE.
-    The limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as novelty.limit
-    computes it; of 33 positions and fewer it keeps all.
+    pitch_mm: of the skin; a simulated skin's is known. Loads are those of a box without a TARE. The
+    limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as
+    novelty.limit computes it; of 33 positions and fewer it keeps all.
     """
     if pitch_mm is None and all(part.startswith("sim:") for part in sweeps.source.split(" + ")):
         pitch_mm = skin.PITCH_MM
@@ -55,15 +60,27 @@ def place_of(sweeps: Dataset, loads: ContactLimit, pitch_mm: float | None = None
     if not touched.any():
         return None
     points = np.array([point for point in found if point]) * pitch_mm
-    member = np.unique(sweeps.groups.get("position", sweeps.group("recording"))[touched], return_inverse=True)[1]
-    centres = np.stack([points[member == number].mean(axis=0) for number in range(member.max() + 1)])
-    limit = max(pitch_mm * MIN_LIMIT, novelty.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0)
-    kept = centres[np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)].round(3)
-    return ContactPositions(float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3))
+    member = np.unique(
+        sweeps.groups.get("position", sweeps.group("recording"))[touched], return_inverse=True
+    )[1]
+    centres = np.stack(
+        [points[member == number].mean(axis=0) for number in range(member.max() + 1)]
+    )
+    limit = max(
+        pitch_mm * MIN_LIMIT,
+        novelty.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0,
+    )
+    kept = centres[
+        np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)
+    ].round(3)
+    return ContactPositions(
+        float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3)
+    )
 
 
 def farthest(points: Array, member: Array, centres: Array) -> Array:
-    """For each position [P] the distance in mm of its farthest sweep from the nearest other position.
+    """For each position [P] the distance in mm of its farthest sweep from the nearest other
+    position.
 
     points [N, 2] belong to the positions member [N], whose centres are [P, 2].
     """
@@ -76,17 +93,29 @@ def farthest(points: Array, member: Array, centres: Array) -> Array:
 
 
 def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:
-    """The box's answers to simulated sweeps with the skin elsewhere: at positions that were not trained (`unseen`, which
-    are then moved), at those that were (`seen`), and at T-HARD's (`hard`).
+    """The box's answers to simulated sweeps with the skin elsewhere: at positions that were not
+    trained (`unseen`, which are then moved), at those that were (`seen`), and at T-HARD's (`hard`).
 
     Raises FormatError where the bundle has no positions.
     """
     place = box.bundle.manifest.place
     if place is None:
-        raise FormatError(f"bundle {box.bundle.id} has no positions to compare with; export it again")
-    result: Json = {"bundle": box.bundle.id, "limit_mm": place.limit_mm, "positions": len(place.rows_mm)}
-    result |= {name: _point(box, EvaluationSweeps.simulated(spec)) | {"set": spec} for name, spec in
-             (("trained positions, other sweeps", seen), ("other positions", unseen), ("T-HARD", hard))}  # fmt: skip
+        raise FormatError(
+            f"bundle {box.bundle.id} has no positions to compare with; export it again"
+        )
+    result: Json = {
+        "bundle": box.bundle.id,
+        "limit_mm": place.limit_mm,
+        "positions": len(place.rows_mm),
+    }
+    result |= {
+        name: _point(box, EvaluationSweeps.simulated(spec)) | {"set": spec}
+        for name, spec in (
+            ("trained positions, other sweeps", seen),
+            ("other positions", unseen),
+            ("T-HARD", hard),
+        )
+    }
     test, result["moved"] = EvaluationSweeps.simulated(unseen), {}
     for direction, name in DIRECTIONS.items():
         points = []
@@ -103,21 +132,30 @@ def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
 
 
 def _point(
-    box: Classifier, test: EvaluationSweeps, where: Callable[[skin.Placement], skin.Placement] = lambda p: p
+    box: Classifier,
+    test: EvaluationSweeps,
+    where: Callable[[skin.Placement], skin.Placement] = lambda p: p,
 ) -> Json:
-    """The box's answers to the test sweeps, with the skin moved. Sweeps of one attachment form a cluster.
+    """The box's answers to the test sweeps, with the skin moved. Sweeps of one attachment form a
+    cluster.
 
-    accuracy, wrong: named with status ok, rightly and wrongly; unsure, unknown: the other answers; network: named rightly
-    by the network alone, whose most probable label counts whatever the box makes of it.
+    accuracy, wrong: named with status ok, rightly and wrongly; unsure, unknown: the other answers;
+    network: named rightly by the network alone, whose most probable label counts whatever the box
+    makes of it.
     """
     assert test.scene
     sweeps, place, limits = test.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
     assert place
     assert limits.contact is not None
-    right, moved, wrong, unsure, unknown, network, distance_mm = (np.zeros(len(sweeps)) for _ in range(7))
+    right, moved, wrong, unsure, unknown, network, distance_mm = (
+        np.zeros(len(sweeps)) for _ in range(7)
+    )
     for i, window in enumerate(test.scene.draw(where)):
         n = np.arange(len(window))
-        verdict, truth = box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window))), sweeps.materials[sweeps.labels[i]]
+        verdict, truth = (
+            box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window))),
+            sweeps.materials[sweeps.labels[i]],
+        )
         named = verdict.status is Status.OK
         right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
         unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN
@@ -127,12 +165,20 @@ def _point(
         distance_mm[i] = np.hypot(*place.offset(found)) if found else np.nan
     attachment = sweeps.group("position")
     return {
-        "n": len(sweeps), "attachments": len(np.unique(attachment)), "accuracy": _share(right, attachment),
-        "network": _share(network, attachment), "wrong_share": _share(wrong, attachment),
-        "unsure": int(unsure.sum()), "unknown": int(unknown.sum()),
-        "moved": _share(moved, attachment), "wrong": int(wrong.sum()), "wrong_unflagged": int((wrong * (1 - moved)).sum()),
-        "told_mm": round(float(np.nanmedian(distance_mm)), 2) if np.isfinite(distance_mm).any() else None,
-    }  # fmt: skip
+        "n": len(sweeps),
+        "attachments": len(np.unique(attachment)),
+        "accuracy": _share(right, attachment),
+        "network": _share(network, attachment),
+        "wrong_share": _share(wrong, attachment),
+        "unsure": int(unsure.sum()),
+        "unknown": int(unknown.sum()),
+        "moved": _share(moved, attachment),
+        "wrong": int(wrong.sum()),
+        "wrong_unflagged": int((wrong * (1 - moved)).sum()),
+        "told_mm": round(float(np.nanmedian(distance_mm)), 2)
+        if np.isfinite(distance_mm).any()
+        else None,
+    }
 
 
 def _share(values: Array, attachment: Array) -> list[float]:
@@ -148,24 +194,36 @@ def _halves(points: Sequence[Json]) -> Iterator[tuple[str, list[Json]]]:
 
 
 def _loss(points: Sequence[Json]) -> Json:
-    """The first displacement where accuracy has fallen by LOSS, and the share of sweeps flagged there and one step before."""
+    """The first displacement where accuracy has fallen by LOSS, and the share of sweeps flagged
+    there and one step before."""
     in_place = points[0]["accuracy"][0]
     for before, point in pairwise(points):
         if point["accuracy"][0] <= in_place - LOSS:
-            return {"lost_at_mm": abs(point["mm"]), "moved": point["moved"], "moved_before": before["moved"]}
+            return {
+                "lost_at_mm": abs(point["mm"]),
+                "moved": point["moved"],
+                "moved_before": before["moved"],
+            }
     return {"lost_at_mm": None, "moved": points[-1]["moved"], "moved_before": points[-2]["moved"]}
 
 
 def lines(result: Json) -> Iterator[str]:
-    """For the terminal: accuracy as the box answers and of the network alone, and share of flagged sweeps, with intervals,
-    at each displacement."""
+    """For the terminal: accuracy as the box answers and of the network alone, and share of flagged
+    sweeps, with intervals, at each displacement."""
     yield f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
     named = {k: v for k, v in result.items() if isinstance(v, dict) and "attachments" in v}
     rows = [(name, point) for name, point in named.items()]
-    rows += [(f"{direction} {p['mm']:+.1f} mm", p) for direction, points in result["moved"].items() for p in points]
+    rows += [
+        (f"{direction} {p['mm']:+.1f} mm", p)
+        for direction, points in result["moved"].items()
+        for p in points
+    ]
     for name, point in rows:
         right, wrong, network, moved = (
-            "{:.3f} [{:.3f}, {:.3f}]".format(*point[key]) for key in ("accuracy", "wrong_share", "network", "moved")
+            "{:.3f} [{:.3f}, {:.3f}]".format(*point[key])
+            for key in ("accuracy", "wrong_share", "network", "moved")
         )
-        yield (f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure {point['unsure']:>3}  unknown "
-               f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance {point['told_mm']} mm")  # fmt: skip
+        yield (
+            f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure {point['unsure']:>3}  unknown "
+            f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance {point['told_mm']} mm"
+        )

@@ -1,7 +1,8 @@
-"""What a packed model costs on this machine. In: folders of models, sweeps. Out: a Measurement of each: time, size, memory.
+"""What a packed model costs on this machine. In: folders of models, sweeps. Out: a Measurement of
+each: time, size, memory.
 
-Run by its path, this file is also the process of its own in which a model's memory is read. It therefore imports at its
-top only what the box has.
+Run by its path, this file is also the process of its own in which a model's memory is read. It
+therefore imports at its top only what the box has.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from appliance.core.errors import BundleError
 Array = NDArray[Any]
 Call = Callable[[Array], Any]
 ROUNDS, BLOCK = 60, 6
-"""Rounds; sweeps of a model in one round, after one that is not counted: the model before it has emptied the caches."""
+"""Rounds; sweeps of a model in one round, after one that is not counted: the model before it has
+emptied the caches."""
 TIMED_SWEEPS = 60
 """About so many different sweeps are used, spread evenly over those given."""
 SWEEPS_BEFORE_MEMORY = 20
@@ -43,10 +45,11 @@ DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
 class Measurement:
     """What one packed model costs on this machine.
 
-    ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks and features, in one
-    thread; of a model in its own library, of its logits. model_bytes: the model's file. bundle_bytes: all files, golden
-    sweeps too. rss_mib: resident memory (VmRSS) in MiB of a process of its own that has loaded the model and answered
-    SWEEPS_BEFORE_MEMORY sweeps. foreign: packages in that process that the box does not have.
+    ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks
+    and features, in one thread; of a model in its own library, of its logits. model_bytes: the
+    model's file. bundle_bytes: all files, golden sweeps too. rss_mib: resident memory (VmRSS) in
+    MiB of a process of its own that has loaded the model and answered SWEEPS_BEFORE_MEMORY sweeps.
+    foreign: packages in that process that the box does not have.
     """
 
     ms_p50: float
@@ -70,7 +73,8 @@ class Measurement:
 def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
     """The Measurement of the model in each of `folders`, in their order; all are timed in turns.
 
-    sweeps: raw counts [n, T, R, C], of the format of all the models. Raises BundleError where a model does not run.
+    sweeps: raw counts [n, T, R, C], of the format of all the models. Raises BundleError where a
+    model does not run.
     """
     some = sweeps[:: max(len(sweeps) // TIMED_SWEEPS, 1)]
     took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
@@ -89,14 +93,18 @@ def sizes(folder: Path) -> tuple[int, int]:
     return next(files[name] for name in (MODEL, TORCH, AEON) if name in files), sum(files.values())
 
 
-def timed(calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block: int = BLOCK) -> dict[str, Array]:
+def timed(
+    calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block: int = BLOCK
+) -> dict[str, Array]:
     """Times in ms [rounds * block] of each call with `sweeps` [n, T, R, C] one by one, by name.
 
-    All take turns, a block each, and every round begins with another one: what slows the machine down slows all alike.
-    It is the time that the processor gave to one thread: by the clock, slow models would be interrupted by other
-    programs and quick ones would not.
+    All take turns, a block each, and every round begins with another one: what slows the machine
+    down slows all alike. It is the time that the processor gave to one thread: by the clock, slow
+    models would be interrupted by other programs and quick ones would not.
     """
-    from train.models.training import one_thread  # imports torch, which the process of `memory` must not hold
+    from train.models.training import (
+        one_thread,
+    )  # imports torch, which the process of `memory` must not hold
 
     names, took = list(calls), {name: np.empty(rounds * block) for name in calls}
     with one_thread():
@@ -113,8 +121,8 @@ def timed(calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block:
 
 
 def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
-    """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of `sweeps`, and the `foreign`
-    packages there.
+    """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of
+    `sweeps`, and the `foreign` packages there.
 
     Raises BundleError where it does not run in a process of its own.
     """
@@ -123,7 +131,9 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
         np.save(path, sweeps[:SWEEPS_BEFORE_MEMORY])
         # -P: the modules beside this file do not hide packages of their names
         command = [sys.executable, "-P", __file__, str(folder), str(path)]
-        env = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+        env = os.environ | dict.fromkeys(
+            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+        )
         env |= {"PYTHONPATH": str(Path(appliance.__file__).parents[1])}
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     if done.returncode:
@@ -135,9 +145,11 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
 
 
 def load(folder: Path) -> Call:
-    """What answers raw counts [T, R, C]: the box's classifier for a bundle, else the model in its own library.
+    """What answers raw counts [T, R, C]: the box's classifier for a bundle, else the model in its
+    own library.
 
-    Raises BundleError for a bundle that is not whole, and ImportError where a model's own library is missing.
+    Raises BundleError for a bundle that is not whole, and ImportError where a model's own library
+    is missing.
     """
     if (folder / TORCH).is_file():
         return _torch(folder / TORCH)
@@ -148,7 +160,9 @@ def load(folder: Path) -> Call:
 
 def _classifier(folder: Path) -> Call:
     """The box's classifier, given one sound sweep after another, each of an object of its own."""
-    from appliance.bundle import bundle  # here, not at the top: a model in its own library runs without the box's code
+    from appliance.bundle import (
+        bundle,
+    )  # here, not at the top: a model in its own library runs without the box's code
     from appliance.core.clock import SystemClock
     from appliance.core.types import Frames, Status, Sweep
     from appliance.inference.classifier import Classifier
@@ -168,7 +182,9 @@ def _torch(path: Path) -> Call:
     import torch
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript, which needs none of our code to be read
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of TorchScript, which needs none of our code to be read
         network = torch.jit.load(path)
 
     def answer(counts: Array) -> Any:
@@ -182,21 +198,29 @@ def _aeon(path: Path) -> Call:
     from aeon.transformations.collection.convolution_based import MiniRocket
 
     with np.load(path, allow_pickle=False) as z:
-        parameters, silence, weight, bias = tuple(z[f"p{i}"] for i in range(5)), z["silence"], z["weight"], z["bias"]
+        parameters, silence, weight, bias = (
+            tuple(z[f"p{i}"] for i in range(5)),
+            z["silence"],
+            z["weight"],
+            z["bias"],
+        )
     features, before = MiniRocket(n_jobs=1), np.random.get_state()
     features.fit(silence)  # it must have seen the form of a sweep; what it found there is not used
     np.random.set_state(before)
     features.parameters = parameters
 
     def answer(counts: Array) -> Any:
-        series = np.ascontiguousarray(counts.reshape(1, len(counts), -1).transpose(0, 2, 1), np.float32)
+        series = np.ascontiguousarray(
+            counts.reshape(1, len(counts), -1).transpose(0, 2, 1), np.float32
+        )
         return weight @ features.transform(series)[0] + bias
 
     return answer
 
 
 def main(folder: str, sweeps: str) -> None:
-    """Answer some sweeps, and print the resident memory in MiB and what of the desktop was loaded, as JSON."""
+    """Answer some sweeps, and print the resident memory in MiB and what of the desktop was loaded,
+    as JSON."""
     answer = load(Path(folder))
     counts = np.load(sweeps)
     for i in range(SWEEPS_BEFORE_MEMORY):

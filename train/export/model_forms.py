@@ -1,6 +1,8 @@
-"""Every form of a method as a packed model. In: a method, sweeps. Out: its bundles, and it as its own library runs it.
+"""Every form of a method as a packed model. In: a method, sweeps. Out: its bundles, and it as its
+own library runs it.
 
-The forms are the method itself, its other precisions, and for some a peer: the same model in a library that the box has not.
+The forms are the method itself, its other precisions, and for some a peer: the same model in a
+library that the box has not.
 """
 
 from __future__ import annotations
@@ -29,10 +31,11 @@ INDEX = "dots.json"
 
 @dataclass(frozen=True)
 class Packed:
-    """A model in `folder`, which measure.load reads. runtime: "onnx" is a bundle, else a peer in its own library.
+    """A model in `folder`, which measure.load reads. runtime: "onnx" is a bundle, else a peer in
+    its own library.
 
-    form: "" is the method itself, else the name of a form of it. precision, weights, macs: as onnx_tools.cost counts
-    them. window_s: length of a sweep in s.
+    form: "" is the method itself, else the name of a form of it. precision, weights, macs: as
+    onnx_tools.cost counts them. window_s: length of a sweep in s.
     """
 
     method: str
@@ -47,13 +50,17 @@ class Packed:
     @property
     def name(self) -> str:
         """No two models of a chart share one."""
-        return f"{self.method} {self.precision}" + ("" if self.runtime == "onnx" else f" in {self.runtime}")
+        return f"{self.method} {self.precision}" + (
+            "" if self.runtime == "onnx" else f" in {self.runtime}"
+        )
 
 
 def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
-    """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is not made again.
+    """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is
+    not made again.
 
-    Raises FormatError where the method cannot work with the set, ExportRefused where it would be no model on the box.
+    Raises FormatError where the method cannot work with the set, ExportRefused where it would be no
+    model on the box.
     """
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -61,11 +68,17 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
             entries = list(_packed_forms(method, sweeps, seed, work))
             (work / INDEX).write_text(json.dumps(entries))
     entries = json.loads((folder / INDEX).read_text())
-    return [Packed(**entry | {"method": method.name, "folder": folder / entry["folder"]}) for entry in entries]
+    return [
+        Packed(**entry | {"method": method.name, "folder": folder / entry["folder"]})
+        for entry in entries
+    ]
 
 
-def _packed_forms(method: Method, sweeps: Dataset, seed: int, work: Path) -> Iterator[dict[str, Any]]:
-    """Each form packed in a folder of its own; then the method as its own library runs it, where it has one."""
+def _packed_forms(
+    method: Method, sweeps: Dataset, seed: int, work: Path
+) -> Iterator[dict[str, Any]]:
+    """Each form packed in a folder of its own; then the method as its own library runs it, where it
+    has one."""
     model, content = pack.train_content(method, sweeps, seed)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "forms", {})}.items():
@@ -76,14 +89,18 @@ def _packed_forms(method: Method, sweeps: Dataset, seed: int, work: Path) -> Ite
         folder = work / precision
         if form:  # early answers and novelty belong to the method itself
             about = content.about | {"form": form}
-            pack.pack_to_measure(replace(content, model=graph, about=about, made=None, reference=None), folder)
+            pack.pack_to_measure(
+                replace(content, model=graph, about=about, made=None, reference=None), folder
+            )
         else:
             pack.pack_to_measure(content, folder)
         counted[form] = {
-            "form": form, "precision": precision, "weights": cost.weights(graph),
+            "form": form,
+            "precision": precision,
+            "weights": cost.weights(graph),
             "macs": cost.macs(graph) + cost.feature_macs(method.input, content.train.format),
             "window_s": content.train.format.window / content.train.format.rate_hz,
-        }  # fmt: skip
+        }
         yield counted[form] | {"runtime": "onnx", "folder": folder.name}
     if method.name in PEERS:
         runtime, save = PEERS[method.name]
@@ -103,8 +120,11 @@ def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
 
 
 def _save_aeon(model: Any, train: Dataset, seed: int, folder: Path) -> None:
-    """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its features."""
-    arrays: dict[str, Any] = {f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))}
+    """aeon's parameters, fitted to the same sweeps once more, and the head that was trained on its
+    features."""
+    arrays: dict[str, Any] = {
+        f"p{i}": p for i, p in enumerate(minirocket.fitted(train.samples, seed))
+    }
     arrays["silence"] = np.zeros((1, train.format.channels, train.format.window), np.float32)
     np.savez_compressed(folder / measure.AEON, weight=model.weight, bias=model.bias, **arrays)
 
@@ -116,8 +136,11 @@ PEERS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
 """Methods that are measured in their own library as well, which the box has not."""
 
 
-def measured(models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS) -> list[dict[str, Any]]:
-    """What each of the `models` costs, as chart.json names it; see docs/evaluation.md. sweeps: raw counts [n, T, R, C].
+def measured(
+    models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS
+) -> list[dict[str, Any]]:
+    """What each of the `models` costs, as chart.json names it; see docs/evaluation.md. sweeps: raw
+    counts [n, T, R, C].
 
     Raises BundleError where a model does not run.
     """
@@ -127,8 +150,16 @@ def measured(models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUN
 
 def _costs(one: Packed, measurement: Measurement) -> dict[str, Any]:
     return {
-        "method": one.method, "precision": one.precision, "runtime": one.runtime, "weights": one.weights,
-        "macs": one.macs, "file_kb": measurement.model_kb, "bundle_kb": measurement.bundle_kb,
-        "rss_mb": measurement.rss_mib, "ms_p50": measurement.ms_p50, "ms_p99": measurement.ms_p99,
-        "touch_s": one.window_s, "runs_on_box": one.runtime == "onnx" and not measurement.foreign,
-    }  # fmt: skip
+        "method": one.method,
+        "precision": one.precision,
+        "runtime": one.runtime,
+        "weights": one.weights,
+        "macs": one.macs,
+        "file_kb": measurement.model_kb,
+        "bundle_kb": measurement.bundle_kb,
+        "rss_mb": measurement.rss_mib,
+        "ms_p50": measurement.ms_p50,
+        "ms_p99": measurement.ms_p99,
+        "touch_s": one.window_s,
+        "runs_on_box": one.runtime == "onnx" and not measurement.foreign,
+    }

@@ -1,4 +1,5 @@
-"""Packing a trained model as a bundle. In: a graph, its sweeps, a folder. Out: the folder, or ExportRefused.
+"""Packing a trained model as a bundle. In: a graph, its sweeps, a folder. Out: the folder, or
+ExportRefused.
 
 A model is refused unless the box's classifier, on this machine, answers as the trained model does.
 """
@@ -44,8 +45,9 @@ from train.onnx_tools.graph_builder import run, slim
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
-"""Shares of held-out sweeps that the box may refuse (because of stuck taxels, for instance), and call unknown, which it
-does for about 5 % by its limit; more means that thresholds or limit do not fit."""
+"""Shares of held-out sweeps that the box may refuse (because of stuck taxels, for instance), and
+call unknown, which it does for about 5 % by its limit; more means that thresholds or limit do not
+fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 REFUSED, UNKNOWN = -1, -2
@@ -53,26 +55,31 @@ REFUSED, UNKNOWN = -1, -2
 FEWEST = 5
 """Training sweeps of a material, below which that is why none is recognised."""
 COARSEST = 8
-"""Steps to which golden sweeps are rounded at most, of what a number usually changes by in a frame. Coarser ones save little more."""
+"""Steps to which golden sweeps are rounded at most, of what a number usually changes by in a frame.
+Coarser ones save little more."""
 NEAR = 0.1
-"""By how much rounding may move a probability of a golden sweep; so the label stays as certain as it was, about."""
+"""By how much rounding may move a probability of a golden sweep; so the label stays as certain as
+it was, about."""
 NETWORK = "network alone"
-"""Ends the name of the figure of the labels that the network gives, whatever the box makes of them."""
+"""Ends the name of the figure of the labels that the network gives, whatever the box makes of
+them."""
 
 
 class ExportRefused(BundleError):
-    """A model that answers differently in its bundle than it was trained, or that the box could not use."""
+    """A model that answers differently in its bundle than it was trained, or that the box could not
+    use."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a bundle. model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need.
-    input: as in the manifest.
+    """The content of a bundle. model: `sweep` or `features` -> `logits`, and the outputs that
+    `early` and `known` need. input: as in the manifest.
 
-    train, held_out: the sweeps it was trained on and the others, split by the group `held_out_by`. about: how it was
-    made; figures: its results, both for the manifest. early, known, moved: for the manifest; means: the file means.npz,
-    where there is `known`. reference: the float form of a model in int8. made: the fit of a network of the compact
-    family, to which `pack` adds early answers and novelty.
+    train, held_out: the sweeps it was trained on and the others, split by the group `held_out_by`.
+    about: how it was made; figures: its results, both for the manifest. early, known, moved: for
+    the manifest; means: the file means.npz, where there is `known`. reference: the float form of a
+    model in int8. made: the fit of a network of the compact family, to which `pack` adds early
+    answers and novelty.
     """
 
     model: onnx.ModelProto
@@ -91,14 +98,21 @@ class Content:
 
 
 def pack(
-    content: Content, target: Path, name: str, version: str, commit: str, full_scale: float | None = None,
+    content: Content,
+    target: Path,
+    name: str,
+    version: str,
+    commit: str,
+    full_scale: float | None = None,
     pitch_mm: float | None = None,
-) -> bundle.Manifest:  # fmt: skip
-    """Check `content` and put it at `target`, whole or not at all; an older bundle there is replaced.
+) -> bundle.Manifest:
+    """Check `content` and put it at `target`, whole or not at all; an older bundle there is
+    replaced.
 
-    commit: of the code, for the manifest. full_scale: the sensor's highest raw count where that is not the maximum of its
-    type. pitch_mm: from taxel to taxel; without it the box cannot say how far a skin has moved.
-    Raises ExportRefused where a check fails, and BundleError where a label or the target cannot be used.
+    commit: of the code, for the manifest. full_scale: the sensor's highest raw count where that is
+    not the maximum of its type. pitch_mm: from taxel to taxel; without it the box cannot say how
+    far a skin has moved. Raises ExportRefused where a check fails, and BundleError where a label or
+    the target cannot be used.
     """
     train, held_out = content.train, content.held_out
     loads = contact_limit.find(train)
@@ -107,18 +121,36 @@ def pack(
     content = with_posthoc(content, place is not None)
     logits = run(content.model, model_inputs(content.input, train))
     golden = golden_file(
-        content, golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits)
+        content,
+        golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits),
     )
     files = {bundle.MODEL: slim(content.model).SerializeToString(), bundle.GOLDEN: golden}
     files |= {bundle.MEANS: content.means} if content.known else {}
     manifest = bundle.Manifest(
-        name=name, version=version, format=train.format, input=content.input, labels=train.materials,
-        thresholds=limits, place=place, unloaded=tuple(loads.tare.ravel().tolist()) if loads.tare.any() else (), runtime=RUNTIME, early=content.early, known=content.known, moved=content.moved,
+        name=name,
+        version=version,
+        format=train.format,
+        input=content.input,
+        labels=train.materials,
+        thresholds=limits,
+        place=place,
+        unloaded=tuple(loads.tare.ravel().tolist()) if loads.tare.any() else (),
+        runtime=RUNTIME,
+        early=content.early,
+        known=content.known,
+        moved=content.moved,
         files={k: bundle.file_entry(v) for k, v in files.items()},
-        made={"commit": commit, "set": train.source, "machine": platform.machine(), "cpus": os.cpu_count(),
-              "torch": metadata.version("torch") if find_spec("torch") else None, "onnxruntime": onnxruntime.__version__}
-             | ({"contact_unknown_because": loads.why} if loads.why else {}) | content.about,
-    )  # fmt: skip
+        made={
+            "commit": commit,
+            "set": train.source,
+            "machine": platform.machine(),
+            "cpus": os.cpu_count(),
+            "torch": metadata.version("torch") if find_spec("torch") else None,
+            "onnxruntime": onnxruntime.__version__,
+        }
+        | ({"contact_unknown_because": loads.why} if loads.why else {})
+        | content.about,
+    )
     with _replacing(target) as folder:
         for file, data in files.items():
             (folder / file).write_bytes(data)
@@ -136,7 +168,8 @@ def pack(
 
 
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
-    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, on which it is tested.
+    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, on which
+    it is tested.
 
     Raises FormatError for a method that the box cannot run.
     """
@@ -146,7 +179,9 @@ def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
 def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Content]:
     """The model that `trained` trains, and its content."""
     if why := method.why_not_on_the_box:
-        raise FormatError(f"method {method.name!r} {why}; compare it with evaluate, and pack another")
+        raise FormatError(
+            f"method {method.name!r} {why}; compare it with evaluate, and pack another"
+        )
     train, held_out, held_out_by = hold_out(sweeps, seed)
     model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
@@ -154,21 +189,33 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
     reference = forms["float"].graph() if "float" in forms else None
     made = getattr(model, "made", None)
     return model, Content(
-        model.graph(), method.input, train, held_out, held_out_by, about, reference=reference, made=made
+        model.graph(),
+        method.input,
+        train,
+        held_out,
+        held_out_by,
+        about,
+        reference=reference,
+        made=made,
     )
 
 
-def pack_to_measure(content: Content, target: Path, full_scale: float | None = None) -> bundle.Manifest:
-    """Pack `content` under its method's name, so that every command that measures a method measures the same bundle."""
+def pack_to_measure(
+    content: Content, target: Path, full_scale: float | None = None
+) -> bundle.Manifest:
+    """Pack `content` under its method's name, so that every command that measures a method measures
+    the same bundle."""
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
 def with_posthoc(content: Content, located: bool = True) -> Content:
-    """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps support them, and
-    novelty. Unchanged where nothing was held out, or not all its materials were trained.
+    """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps
+    support them, and novelty. Unchanged where nothing was held out, or not all its materials were
+    trained.
 
-    located: whether the box can say that a contact has moved. Where the held-out sweeps are the fit's own, figures of them
-    are added: of heads that did not see them, which those in the bundle did.
+    located: whether the box can say that a contact has moved. Where the held-out sweeps are the
+    fit's own, figures of them are added: of heads that did not see them, which those in the bundle
+    did.
     """
     made = content.made
     if made is None or made.train.materials != content.train.materials:
@@ -184,13 +231,20 @@ def with_posthoc(content: Content, located: bool = True) -> Content:
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     tenths = made.trunk(tenths=True) if rule.early else None
     return replace(
-        content, model=done.graph(made.trunk(), tenths), early=rule.early, known=done.known(), moved=done.moved_rule(),
-        means=done.means(), about=content.about | {"early": early}, figures=content.figures | own,
-    )  # fmt: skip
+        content,
+        model=done.graph(made.trunk(), tenths),
+        early=rule.early,
+        known=done.known(),
+        moved=done.moved_rule(),
+        means=done.means(),
+        about=content.about | {"early": early},
+        figures=content.figures | own,
+    )
 
 
 def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
-    """Figures of a fit's held-out sweeps, as `figures` gives them, by heads that did not see these sweeps."""
+    """Figures of a fit's held-out sweeps, as `figures` gives them, by heads that did not see these
+    sweeps."""
     sweeps = made.held.take(held.numbers - len(made.train))
     named = held.probabilities.argmax(1)
     sure = held.probabilities.max(1) >= LEAST_SURE
@@ -198,7 +252,9 @@ def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
     recording, known = sweeps.group("recording"), np.flatnonzero(held.known)
     fused = np.full(len(sweeps), UNKNOWN)
     if len(known):
-        scores, first = fuse(np.log(np.maximum(held.probabilities, LEAST_PROBABILITY))[known], recording[known])
+        scores, first = fuse(
+            np.log(np.maximum(held.probabilities, LEAST_PROBABILITY))[known], recording[known]
+        )
         decided = np.where(softmax(scores).max(1) >= LEAST_SURE, scores.argmax(1), UNKNOWN)
         by_recording = dict(zip(recording[known][first], decided, strict=True))
         fused = np.array([by_recording.get(number, UNKNOWN) for number in recording])
@@ -206,7 +262,8 @@ def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
 
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
-    """Logits [N, K] as the box computes them from class means where a label is enrolled, before temperature scaling."""
+    """Logits [N, K] as the box computes them from class means where a label is enrolled, before
+    temperature scaling."""
     with np.load(io.BytesIO(content.means)) as means:
         logits: Array = _embedded(content, sweeps) @ means["means"].T + means["bias"]
     return logits
@@ -218,7 +275,10 @@ def _unknown(content: Content, sweeps: Dataset) -> Array:
         return np.zeros(len(sweeps), bool)
     with np.load(io.BytesIO(content.means)) as means:
         away = _embedded(content, sweeps)[:, None] - means["means"].astype(np.float64)
-        beyond: Array = shaped_distances(away, means["shapes"].astype(np.float64)).min(axis=1) > content.known.limit
+        beyond: Array = (
+            shaped_distances(away, means["shapes"].astype(np.float64)).min(axis=1)
+            > content.known.limit
+        )
     return beyond
 
 
@@ -234,14 +294,16 @@ def _embedded(content: Content, sweeps: Dataset) -> Array:
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:
     """One training sweep of the first and the last material.
 
-    Of the sweeps that both kinds of logits recognise it is the one with the median probability: not so certain that a
-    small fault does not show, and not so uncertain that rounding changes the label. Raises ExportRefused where none is
-    recognised.
+    Of the sweeps that both kinds of logits recognise it is the one with the median probability: not
+    so certain that a small fault does not show, and not so uncertain that rounding changes the
+    label. Raises ExportRefused where none is recognised.
     """
     index = []
     for label in (0, len(sweeps.materials) - 1):
         known = np.flatnonzero(
-            (sweeps.labels == label) & (logits.argmax(1) == label) & (logits_of_means.argmax(1) == label)
+            (sweeps.labels == label)
+            & (logits.argmax(1) == label)
+            & (logits_of_means.argmax(1) == label)
         )
         if not len(known):
             raise ExportRefused(
@@ -255,8 +317,8 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dat
 def golden_file(content: Content, golden: Dataset) -> bytes:
     """golden.npz: sweeps, and the logits of the model for exactly these.
 
-    Sweeps are rounded, since noise does not pack: as coarsely as leaves labels as they are, probabilities NEAR, and known
-    sweeps known.
+    Sweeps are rounded, since noise does not pack: as coarsely as leaves labels as they are,
+    probabilities NEAR, and known sweeps known.
     """
 
     def answers(samples: Array) -> tuple[Array, ...]:
@@ -277,8 +339,8 @@ def golden_file(content: Content, golden: Dataset) -> bytes:
 
 
 def _rounded(samples: Array) -> Iterator[Array]:
-    """Sweeps as multiples of powers of two, from COARSEST times what a number usually changes by in a frame down to half of
-    that change. Sweeps of whole numbers stay such."""
+    """Sweeps as multiples of powers of two, from COARSEST times what a number usually changes by in
+    a frame down to half of that change. Sweeps of whole numbers stay such."""
     whole = samples.dtype.kind != "f"
     usual = float(np.median(np.abs(np.diff(samples.astype(np.float64), axis=1))))
     if not usual:
@@ -302,15 +364,21 @@ def _why(sweeps: Dataset, label: int) -> str:
     return "they look like others; record it at more positions, or leave it out with --only"
 
 
-def thresholds(sweeps: Dataset, contact: float | None, full_scale: float | None) -> bundle.Thresholds:
-    """The thresholds for a window; without `full_scale` the highest count of the type is taken for it."""
+def thresholds(
+    sweeps: Dataset, contact: float | None, full_scale: float | None
+) -> bundle.Thresholds:
+    """The thresholds for a window; without `full_scale` the highest count of the type is taken for
+    it."""
     kind = sweeps.samples.dtype
     top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
-    return bundle.Thresholds(contact=contact, full_scale=float(top if full_scale is None else full_scale))
+    return bundle.Thresholds(
+        contact=contact, full_scale=float(top if full_scale is None else full_scale)
+    )
 
 
 def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> tuple[Array, Array]:
-    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN; and bool [N], whether it is sure of them.
+    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN; and bool [N], whether
+    it is sure of them.
 
     fused: each sweep gets the box's answer after all sweeps of its recording.
     """
@@ -320,27 +388,42 @@ def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> tu
     for i, verdict in bundle_score.answers(classifier, sweeps, fused=fused):
         if verdict.label:
             answered = recording == recording[i] if fused else i
-            answers[answered], sure[answered] = labels.index(verdict.label), verdict.status is Status.OK
+            answers[answered], sure[answered] = (
+                labels.index(verdict.label),
+                verdict.status is Status.OK,
+            )
         elif verdict.status is Status.UNKNOWN and not fused:
             answers[i] = UNKNOWN
     return answers, sure
 
 
-def figures(classifier: Classifier, sweeps: Dataset, protocol: str, logits: Array) -> dict[str, Any]:
-    """Accuracy as the box answers, by sweep and, where one holds several, by recording: what is refused, unknown or unsure
-    is not right. Beside it that of the network alone, whose logits [N, K] name every sweep."""
+def figures(
+    classifier: Classifier, sweeps: Dataset, protocol: str, logits: Array
+) -> dict[str, Any]:
+    """Accuracy as the box answers, by sweep and, where one holds several, by recording: what is
+    refused, unknown or unsure is not right. Beside it that of the network alone, whose logits [N,
+    K] name every sweep."""
     fused, decided = score(classifier, sweeps, fused=True)
     fused[~decided] = UNKNOWN
     return _figures(*score(classifier, sweeps), fused, logits.argmax(1), sweeps, protocol)
 
 
-def _figures(answers: Array, sure: Array, fused: Array, named: Array, sweeps: Dataset, protocol: str) -> dict[str, Any]:
-    """The figures of answers to sweeps, as `score` gives them, to their recordings, and of the labels `named` [N]."""
+def _figures(
+    answers: Array, sure: Array, fused: Array, named: Array, sweeps: Dataset, protocol: str
+) -> dict[str, Any]:
+    """The figures of answers to sweeps, as `score` gives them, to their recordings, and of the
+    labels `named` [N]."""
     right = (answers == sweeps.labels) & sure
-    counts = {"wrong": int(((answers >= 0) & sure & ~right).sum()), "unsure": int(((answers >= 0) & ~sure).sum()),
-              "unknown": int((answers == UNKNOWN).sum()), "refused": int((answers == REFUSED).sum())}  # fmt: skip
+    counts = {
+        "wrong": int(((answers >= 0) & sure & ~right).sum()),
+        "unsure": int(((answers >= 0) & ~sure).sum()),
+        "unknown": int((answers == UNKNOWN).sum()),
+        "refused": int((answers == REFUSED).sum()),
+    }
     result = {protocol: accuracy_figure(int(right.sum()), len(sweeps)) | counts}
-    result[f"{protocol}, {NETWORK}"] = accuracy_figure(int((named == sweeps.labels).sum()), len(sweeps))
+    result[f"{protocol}, {NETWORK}"] = accuracy_figure(
+        int((named == sweeps.labels).sum()), len(sweeps)
+    )
     first = np.unique(sweeps.group("recording"), return_index=True)[1]
     if len(first) < len(sweeps):
         by_recording = (fused == sweeps.labels)[first]
@@ -349,7 +432,8 @@ def _figures(answers: Array, sure: Array, fused: Array, named: Array, sweeps: Da
 
 
 def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
-    """Figures of the bundle in `folder` on `held_out`, run as the box runs it; logits [N, K]: of the graph, on the same.
+    """Figures of the bundle in `folder` on `held_out`, run as the box runs it; logits [N, K]: of
+    the graph, on the same.
 
     Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.
     """
@@ -358,9 +442,13 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
     answers = score(box, held_out)[0]
     refused, unknown = answers == REFUSED, answers == UNKNOWN
     if other := int(np.sum((answers != logits.argmax(1)) & (answers >= 0))):
-        raise ExportRefused(f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did")
+        raise ExportRefused(
+            f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did"
+        )
     if refused.mean() > MOST_REFUSED:
-        reasons = Counter(str(v.status) for _, v in bundle_score.answers(box, held_out) if not v.label)
+        reasons = Counter(
+            str(v.status) for _, v in bundle_score.answers(box, held_out) if not v.label
+        )
         raise ExportRefused(
             f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}), by status: "
             f"{counted(reasons)}. Drop such sweeps from the set; where they are saturated, name the skin's --full-scale"
@@ -374,9 +462,12 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
 
 
 def check_target(target: Path) -> None:
-    """Make the folders above `target`. Raises ExportRefused where no bundle can be put there, before anything is computed."""
+    """Make the folders above `target`. Raises ExportRefused where no bundle can be put there,
+    before anything is computed."""
     if target.exists() and not (target / bundle.MANIFEST).is_file():
-        raise ExportRefused(f"{target} is not a bundle and will not be replaced; name another folder with --out")
+        raise ExportRefused(
+            f"{target} is not a bundle and will not be replaced; name another folder with --out"
+        )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent):
@@ -389,10 +480,13 @@ def check_target(target: Path) -> None:
 
 @contextlib.contextmanager
 def _replacing(target: Path) -> Iterator[Path]:
-    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it fails."""
+    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it
+    fails."""
     check_target(target)
     try:
         with storage.folder(target.resolve()) as new:
             yield new
     except OSError as e:
-        raise ExportRefused(f"the bundle cannot be written to {target}: {e}; name another folder with --out") from e
+        raise ExportRefused(
+            f"the bundle cannot be written to {target}: {e}; name another folder with --out"
+        ) from e

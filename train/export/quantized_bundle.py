@@ -35,29 +35,38 @@ Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
 """Of a logit, between PyTorch and the float graph: they add the same numbers in another order."""
 MOST_LOST = 0.005
-"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities (AnswerDifference.expected_loss),
-whatever the number of sweeps; and as counted, where that is significant. Counting alone is not enough: two uncertain
-sweeps of a hundred that change their label are two points lost or won."""
+"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities
+(AnswerDifference.expected_loss), whatever the number of sweeps; and as counted, where that is
+significant. Counting alone is not enough: two uncertain sweeps of a hundred that change their label
+are two points lost or won."""
 CHANCE = 0.05
-"""Level of significance: of the one-sided sign test on the sweeps on which both forms differ, that int8 is not worse. The
-counted loss is used only where the probability is below it."""
+"""Level of significance: of the one-sided sign test on the sweeps on which both forms differ, that
+int8 is not worse. The counted loss is used only where the probability is below it."""
 LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 0.025
-"""Share of held-out sweeps with equal labels, of which one may always differ; largest change of a probability, and its
-mean. Of 14 fits of four sizes to five sets the worst had 0.974, 0.199 and 0.015."""
+"""Share of held-out sweeps with equal labels, of which one may always differ; largest change of a
+probability, and its mean. Of 14 fits of four sizes to five sets the worst had 0.974, 0.199 and
+0.015."""
 
 SATURATED = 0.01
-"""Where a larger share of a tensor's values is beyond the range of int8, this tensor is named as the cause, although the
-noise grows with every later layer."""
+"""Where a larger share of a tensor's values is beyond the range of int8, this tensor is named as
+the cause, although the noise grows with every later layer."""
 
 
 def export(
-    fit: Fit, target: Path, name: str, version: str, commit: str, full_scale: float | None = None,
+    fit: Fit,
+    target: Path,
+    name: str,
+    version: str,
+    commit: str,
+    full_scale: float | None = None,
     pitch_mm: float | None = None,
-) -> bundle.Manifest:  # fmt: skip
-    """Quantize `fit`, check it, and pack it; see pack.pack. Where int8 differs too much the bundle holds the float form, and
-    `made` says why. Raises ExportRefused where another check fails."""
+) -> bundle.Manifest:
+    """Quantize `fit`, check it, and pack it; see pack.pack. Where int8 differs too much the bundle
+    holds the float form, and `made` says why. Raises ExportRefused where another check fails."""
     if fit.about["held_out_by"] == "nothing":
-        hold_out(fit.train, fit.about["seed"])  # says why: no sweep is left that could judge the bundle
+        hold_out(
+            fit.train, fit.about["seed"]
+        )  # says why: no sweep is left that could judge the bundle
     reference, model = graphs(fit)
     about = (
         fit.about
@@ -68,12 +77,15 @@ def export(
     try:
         content = checked(content, reference)
     except ExportRefused as e:
-        content = replace(content, model=reference, made=fit.in_float(), about=about | {"float_because": str(e)})
+        content = replace(
+            content, model=reference, made=fit.in_float(), about=about | {"float_because": str(e)}
+        )
     return pack(content, target, name, version, commit, full_scale, pitch_mm)
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
-    """The largest of a logit between PyTorch and the float graph. Raises ExportRefused above MOST_TORCH_DIFFERENCE."""
+    """The largest of a logit between PyTorch and the float graph. Raises ExportRefused above
+    MOST_TORCH_DIFFERENCE."""
     import torch  # here: a fit without trained stages is exported without PyTorch
 
     with torch.no_grad():
@@ -88,13 +100,17 @@ def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
 
 
 def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
-    """(float, int8): `sweep` -> `logits`, each with a head fitted on the features of its own trunk."""
-    reference = with_head(fit.trunk(int8=False), fit.weights["head.weight"], fit.weights["head.bias"])
+    """(float, int8): `sweep` -> `logits`, each with a head fitted on the features of its own
+    trunk."""
+    reference = with_head(
+        fit.trunk(int8=False), fit.weights["head.weight"], fit.weights["head.bias"]
+    )
     return reference, with_head(fit.trunk(), *fit.int8_head())
 
 
 def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
-    """`content`, whose model is int8, with a comparison with its float form `reference`; unchanged where that is None.
+    """`content`, whose model is int8, with a comparison with its float form `reference`; unchanged
+    where that is None.
 
     Raises ExportRefused where `check` does.
     """
@@ -113,21 +129,28 @@ def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
 
 
 def check(found: Parity) -> None:
-    """Raises ExportRefused, with the number, its limit and what to try, where int8 differs too much from float."""
+    """Raises ExportRefused, with the number, its limit and what to try, where int8 differs too much
+    from float."""
     apart, lost = found.apart, found.lost
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
     hint = "drop training sweeps that are unlike all others, or record more"
     if found.layers:
         worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
-        hint = (f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; "
-                f"see palpate-train parity): {hint}")  # fmt: skip
+        hint = (
+            f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; "
+            f"see palpate-train parity): {hint}"
+        )
     if lost.lost > MOST_LOST and lost.chance < CHANCE:
         raise ExportRefused(
             f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on {lost.float_right}: "
             f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
         )
-    expected, moved, moved_mean = apart.expected_loss, apart.probability_difference, apart.probability_mean
+    expected, moved, moved_mean = (
+        apart.expected_loss,
+        apart.probability_difference,
+        apart.probability_mean,
+    )
     if not expected <= MOST_LOST:
         raise ExportRefused(
             f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own probabilities "
@@ -145,7 +168,8 @@ def check(found: Parity) -> None:
 
 
 def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
-    """The table of float against int8 on `sweeps`; source: a fit, or a bundle, which has no float form. file: JSON.
+    """The table of float against int8 on `sweeps`; source: a fit, or a bundle, which has no float
+    form. file: JSON.
 
     Raises FormatError where formats or materials differ, or nothing is in int8.
     """
@@ -162,7 +186,9 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
             f"{source.name} is of {form} and {', '.join(materials)}; {sweeps.source} of {sweeps.format} and "
             f"{', '.join(sweeps.materials)}: name a set of the same kind"
         )
-    found = parity.measure(model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording"))
+    found = parity.measure(
+        model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording")
+    )
     if file:
         result = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
         put(file, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
@@ -170,23 +196,28 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
 
 
 def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with random weights.
+    """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with
+    random weights.
 
-    The first is a trunk like the packaged bundle's in float32, with stages and the fewest filters, the second the paper's CNN
-    in int8; both take its sweeps.
+    The first is a trunk like the packaged bundle's in float32, with stages and the fewest filters,
+    the second the paper's CNN in int8; both take its sweeps.
     """
     from train.models.compact.network import Compact  # here, as what follows: it imports PyTorch
     from train.models.paper_cnn import INT8_NODES, random_paper_cnn
 
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     counts = rng.integers(0, 256, (4, form.window, *form.shape), np.uint8)
-    sweeps = Dataset(counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts")
+    sweeps = Dataset(
+        counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts"
+    )
     trunk = recipe.fixed_trunk(sweeps, seed)
     stages = Compact(form, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
     filters = Bank.of(trunk.weights)
     filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
     architecture = replace(recipe.STAGES, pools=2, distribution=True, spectrum=True)
-    small = graph.trunk_graph(form, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture)
+    small = graph.trunk_graph(
+        form, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
+    )
     size = small.graph.output[0].type.tensor_type.shape.dim[1].dim_value
     small = with_head(small, rng.standard_normal((classes, size)), np.zeros(classes))
     paper = quantize(random_paper_cnn(form, classes, rng), counts, INT8_NODES)

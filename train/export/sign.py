@@ -1,7 +1,8 @@
 """Signing a bundle. In: a bundle's folder, a key, a counter. Out: the bundle with its signature.
 
-The box refuses a bundle whose counter is not above that of every bundle it has committed, so that nobody can install an
-old one again, even with a valid signature. The signer chooses the counter: number your deliveries, from 1.
+The box refuses a bundle whose counter is not above that of every bundle it has committed, so that
+nobody can install an old one again, even with a valid signature. The signer chooses the counter:
+number your deliveries, from 1.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from appliance.deployment import signature
 
 
 def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
-    """Sign the bundle in `folder`; its manifest. counter: is written into the manifest first, so the bundle's id changes.
+    """Sign the bundle in `folder`; its manifest. counter: is written into the manifest first, so
+    the bundle's id changes.
 
-    Labels that a box has enrolled become part of the bundle, so that other boxes take them, too. Raises BundleError where the
-    bundle is incomplete or has no counter yet, and ConfigError where `key` does not sign.
+    Labels that a box has enrolled become part of the bundle, so that other boxes take them, too.
+    Raises BundleError where the bundle is incomplete or has no counter yet, and ConfigError where
+    `key` does not sign.
     """
     loaded = bundle.load(folder)
     if counter is not None and counter < (had := loaded.manifest.counter):
@@ -51,7 +54,8 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
 
 
 def _with_labels(loaded: Bundle) -> dict[str, bytes]:
-    """Golden sweeps and class means with those of enrolled labels, as a bundle holds them without an enrolment beside it."""
+    """Golden sweeps and class means with those of enrolled labels, as a bundle holds them without
+    an enrolment beside it."""
     assert loaded.classes
     return {
         bundle.GOLDEN: bundle.golden_file(loaded.golden, loaded.golden_logits),

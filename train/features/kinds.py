@@ -1,7 +1,8 @@
-"""All feature sets by name. In: raw counts of one sweep's window, frame rate. Out: float32 features.
+"""All feature sets by name. In: raw counts of one sweep's window, frame rate. Out: float32
+features.
 
-They are those that the box computes and those of prior work, for the desktop alone. A bundle may name only a feature set
-of appliance.signal.features.
+They are those that the box computes and those of prior work, for the desktop alone. A bundle may
+name only a feature set of appliance.signal.features.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
 
 
 def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float32]:
-    """The feature set `kind` of KINDS of raw counts [T, R, C] at `rate_hz`, as float32 [n]. Raises FormatError."""
+    """The feature set `kind` of KINDS of raw counts [T, R, C] at `rate_hz`, as float32 [n]. Raises
+    FormatError."""
     return features.compute(kind, taxels, rate_hz, KINDS)
 
 
 def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
-    """The input `kind` of a graph for raw counts [T, R, C]: the counts themselves where it is "raw", else `compute`."""
+    """The input `kind` of a graph for raw counts [T, R, C]: the counts themselves where it is
+    "raw", else `compute`."""
     return features.given(kind, taxels, rate_hz, KINDS)

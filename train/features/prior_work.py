@@ -1,9 +1,12 @@
-"""Features of the work that the paper compares itself with. In: raw counts of one window, frame rate. Out: float64 [n].
+"""Features of the work that the paper compares itself with. In: raw counts of one window, frame
+rate. Out: float64 [n].
 
-Static features (Hoelscher et al. 2015), spectrogram (Sinapov et al. 2011), correlation features (Kaboli et al. 2015,
-Chathuranga et al. 2015). The papers used other sensors (BioTac, accelerometers, three magnetic axes); each function says
-how it was adapted to a pressure skin. Any grid, rate and data type is accepted; the functions are pure. Raw counts are
-[T, R, C], or [T, R, C, A] where a taxel has several axes: each axis is a series, load and place are those of the normal one.
+Static features (Hoelscher et al. 2015), spectrogram (Sinapov et al. 2011), correlation features
+(Kaboli et al. 2015, Chathuranga et al. 2015). The papers used other sensors (BioTac,
+accelerometers, three magnetic axes); each function says how it was adapted to a pressure skin. Any
+grid, rate and data type is accepted; the functions are pure. Raw counts are [T, R, C], or [T, R, C,
+A] where a taxel has several axes: each axis is a series, load and place are those of the normal
+one.
 """
 
 from __future__ import annotations
@@ -27,13 +30,15 @@ TIME_BINS, FREQUENCY_BINS = 5, 25
 
 
 def static(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Features that do not depend on the order of the frames (Hoelscher et al. 2015), [2 M + 7] with M = R * C * A.
+    """Features that do not depend on the order of the frames (Hoelscher et al. 2015), [2 M + 7]
+    with M = R * C * A.
 
-    taxels: raw counts; rate_hz is not used. Each series' mean [M] and standard deviation over time [M]; mean,
-    standard deviation, minimum and maximum of the pressure, which is the mean count of a frame; the centre of pressure
-    (row, column; in taxels from the middle of the grid, weights by eq. 4); the share of taxels in contact. The choice is
-    ours: a pressure skin has none of their best features, temperature and thermal flow. One frame is enough.
-    Raises FormatError for an array that is not a sweep.
+    taxels: raw counts; rate_hz is not used. Each series' mean [M] and standard deviation over time
+    [M]; mean, standard deviation, minimum and maximum of the pressure, which is the mean count of a
+    frame; the centre of pressure (row, column; in taxels from the middle of the grid, weights by
+    eq. 4); the share of taxels in contact. The choice is ours: a pressure skin has none of their
+    best features, temperature and thermal flow. One frame is enough. Raises FormatError for an
+    array that is not a sweep.
     """
     x = time_series.of(taxels)
     load = x[axes(taxels) - 1 :: axes(taxels)]
@@ -47,18 +52,22 @@ def static(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Log power in 5 parts of the sweep x 25 bands of frequency (Sinapov et al. 2011), [125], log(counts^2).
+    """Log power in 5 parts of the sweep x 25 bands of frequency (Sinapov et al. 2011), [125],
+    log(counts^2).
 
-    taxels: raw counts; rate_hz is not used. The number of bins is theirs, the rest our interpretation: equal
-    parts of the sweep, equal bands from 0 to Nyquist. Each part loses its mean and is weighted with a Hann window; the
-    power of its bins without DC is averaged within each band, and the taxels are added by eq. 4 as the paper does for H.
-    The spectrum of a part shorter than 50 frames has fewer than 25 bins and is interpolated (zeros are appended). Power
-    is at least FLOOR: a silent skin gives log(FLOOR).
-    Raises FormatError for an array that is not a sweep, and where a part would have fewer than four frames.
+    taxels: raw counts; rate_hz is not used. The number of bins is theirs, the rest our
+    interpretation: equal parts of the sweep, equal bands from 0 to Nyquist. Each part loses its
+    mean and is weighted with a Hann window; the power of its bins without DC is averaged within
+    each band, and the taxels are added by eq. 4 as the paper does for H. The spectrum of a part
+    shorter than 50 frames has fewer than 25 bins and is interpolated (zeros are appended). Power is
+    at least FLOOR: a silent skin gives log(FLOOR). Raises FormatError for an array that is not a
+    sweep, and where a part would have fewer than four frames.
     """
     x = time_series.of(taxels)
     if x.shape[1] < 4 * TIME_BINS:
-        raise FormatError(f"{x.shape[1]} frames are too few for a spectrogram; use at least {4 * TIME_BINS}, or L")
+        raise FormatError(
+            f"{x.shape[1]} frames are too few for a spectrogram; use at least {4 * TIME_BINS}, or L"
+        )
     weights = time_series.weights(x, axes(taxels))
     parts = []
     for part in np.array_split(x, TIME_BINS, axis=1):
@@ -73,32 +82,41 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
-    """Nine numbers for any grid: how each taxel varies, and how taxels vary together. taxels: raw counts.
+    """Nine numbers for any grid: how each taxel varies, and how taxels vary together. taxels: raw
+    counts.
 
-    Of Kaboli et al. 2015: Hjorth's activity (log of the variance, in log(counts^2)), mobility (deviation of the change
-    per second over that of the counts, in 1/s) and complexity (mobility of the change over mobility), each summed over
-    taxels by eq. 4; mean and spread over all pairs of taxels of the linear (Pearson) and non-linear (Spearman, by
-    ranks) correlation. Of Chathuranga et al. 2015: the log of the Frobenius norm of the covariance matrix, in
-    log(counts^2), and the mean count. Their axes and cells are our taxels; a constant one is left out of correlations,
-    which are 0 where fewer than two vary. Variances are at least FLOOR: for a silent skin mobility is `rate_hz` and
-    complexity 1. Raises FormatError for an array that is not a sweep, fewer than three frames, or an invalid rate.
+    Of Kaboli et al. 2015: Hjorth's activity (log of the variance, in log(counts^2)), mobility
+    (deviation of the change per second over that of the counts, in 1/s) and complexity (mobility of
+    the change over mobility), each summed over taxels by eq. 4; mean and spread over all pairs of
+    taxels of the linear (Pearson) and non-linear (Spearman, by ranks) correlation. Of Chathuranga
+    et al. 2015: the log of the Frobenius norm of the covariance matrix, in log(counts^2), and the
+    mean count. Their axes and cells are our taxels; a constant one is left out of correlations,
+    which are 0 where fewer than two vary. Variances are at least FLOOR: for a silent skin mobility
+    is `rate_hz` and complexity 1. Raises FormatError for an array that is not a sweep, fewer than
+    three frames, or an invalid rate.
     """
     x = time_series.of(taxels)
     time_series.check_rate(rate_hz)
     if x.shape[1] < 3:
-        raise FormatError(f"{x.shape[1]} frames are too few for a change of the change; use at least 3, or L")
+        raise FormatError(
+            f"{x.shape[1]} frames are too few for a change of the change; use at least 3, or L"
+        )
     centred = x - x.mean(axis=1, keepdims=True)
     varying = centred[centred.var(axis=1) > time_series.FLOOR]
     covariance = np.sqrt(_sum_of_squared_products(centred)) / x.shape[1]
     together = [*_pairs(varying), *_pairs(np.array([_ranks(one) for one in varying]))]
     last = [np.log(max(covariance, time_series.FLOOR)), time_series.means(x.mean(axis=0)[None])[0]]
-    return np.concatenate([_hjorth(x, rate_hz) @ time_series.weights(x, axes(taxels)), together, last])
+    return np.concatenate(
+        [_hjorth(x, rate_hz) @ time_series.weights(x, axes(taxels)), together, last]
+    )
 
 
 def _hjorth(x: Array, rate_hz: float) -> Array:
     """Activity, mobility and complexity of each series in `x` [M, T]: [3, M]."""
     change = np.diff(x, axis=1)
-    variances = [np.maximum(s.var(axis=1), time_series.FLOOR) for s in (x, change, np.diff(change, axis=1))]
+    variances = [
+        np.maximum(s.var(axis=1), time_series.FLOOR) for s in (x, change, np.diff(change, axis=1))
+    ]
     mobility, of_change = (np.sqrt(after / before) for before, after in pairwise(variances))
     return np.array([np.log(variances[0]), mobility * rate_hz, of_change / mobility])
 
@@ -112,13 +130,15 @@ def _ranks(one: Array) -> Array:
 
 
 def _sum_of_squared_products(z: Array) -> float:
-    """Sum over all i and j of (z_i . z_j)^2 for `z` [M, T], by whichever of the two Gram matrices is smaller."""
+    """Sum over all i and j of (z_i . z_j)^2 for `z` [M, T], by whichever of the two Gram matrices
+    is smaller."""
     gram = z @ z.T if len(z) <= z.shape[1] else z.T @ z
     return float((gram**2).sum())
 
 
 def _pairs(varying: Array) -> tuple[float, float]:
-    """Mean and standard deviation of the correlation over all pairs in `varying` [m, T], each of mean 0 and not constant.
+    """Mean and standard deviation of the correlation over all pairs in `varying` [m, T], each of
+    mean 0 and not constant.
 
     From sums over all taxels, so that a large grid needs no matrix of all its pairs.
     """

@@ -1,4 +1,5 @@
-"""Scores: right answers of how many, with a 95 % interval. In: right or wrong, logits. Out: figures for results."""
+"""Scores: right answers of how many, with a 95 % interval. In: right or wrong, logits. Out: figures
+for results."""
 
 from __future__ import annotations
 
@@ -42,18 +43,22 @@ class Score:
 def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]:
     """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
 
-    Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position do (clusters [n]),
-    it is that of the cluster bootstrap (percentiles of 2,000 draws), or Wilson's where that is wider: a bootstrap of few
-    clusters, or where all answers are right, is too narrow.
+    Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position
+    do (clusters [n]), it is that of the cluster bootstrap (percentiles of 2,000 draws), or Wilson's
+    where that is wider: a bootstrap of few clusters, or where all answers are right, is too narrow.
     """
     low, high = widen(wilson(float(right.sum()), len(right)), right, clusters)
     return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
 
 
-def widen(bounds: tuple[float, float], values: Array, clusters: Array | None) -> tuple[float, float]:
-    """The interval `bounds` of the mean of `values` [n], extended to that of the bootstrap over `clusters` [n].
+def widen(
+    bounds: tuple[float, float], values: Array, clusters: Array | None
+) -> tuple[float, float]:
+    """The interval `bounds` of the mean of `values` [n], extended to that of the bootstrap over
+    `clusters` [n].
 
-    The bootstrap's is from 2.5 to 97.5 % of DRAWS draws; without clusters `bounds` stay as they are.
+    The bootstrap's is from 2.5 to 97.5 % of DRAWS draws; without clusters `bounds` stay as they
+    are.
     """
     if clusters is None:
         return bounds
@@ -61,12 +66,15 @@ def widen(bounds: tuple[float, float], values: Array, clusters: Array | None) ->
     sums, size = np.bincount(member, values), np.bincount(member)
     drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
     means = sums[drawn].sum(1) / size[drawn].sum(1)
-    return min(bounds[0], float(np.quantile(means, 0.025))), max(bounds[1], float(np.quantile(means, 0.975)))
+    return min(bounds[0], float(np.quantile(means, 0.025))), max(
+        bounds[1], float(np.quantile(means, 0.975))
+    )
 
 
 def fuse(logits: Array, together: Array) -> tuple[Array, Array]:
-    """Fuse the sweeps with the same value of `together` [n]: log scores [G, K], each the logarithm of the product of the
-    probabilities of `logits` [n, K], and the number [G] of the first sweep of each."""
+    """Fuse the sweeps with the same value of `together` [n]: log scores [G, K], each the logarithm
+    of the product of the probabilities of `logits` [n, K], and the number [G] of the first sweep of
+    each."""
     _, first, member = np.unique(together, return_index=True, return_inverse=True)
     scores = np.zeros((len(first), logits.shape[1]))
     np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
@@ -81,14 +89,17 @@ def accuracy_figure(right: int, n: int) -> dict[str, Any]:
 
 @cache
 def provenance() -> dict[str, str]:
-    """The origin that a result file records beside its sets and seeds. shipped: the id of the packaged bundle.
+    """The origin that a result file records beside its sets and seeds. shipped: the id of the
+    packaged bundle.
 
     All is of the first call: other commits, and another day, may follow during a long run.
     """
     return {
-        "commit": commit(), "shipped": shipped(), "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "commit": commit(),
+        "shipped": shipped(),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-    }  # fmt: skip
+    }
 
 
 def shipped() -> str:

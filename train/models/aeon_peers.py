@@ -1,6 +1,8 @@
-"""MultiRocket-Hydra and QUANT with aeon's default settings. In: sweeps. Out: the METHODS multirocket-hydra and quant.
+"""MultiRocket-Hydra and QUANT with aeon's default settings. In: sweeps. Out: the METHODS
+multirocket-hydra and quant.
 
-They are what a user of a time-series library would take. They have no graph: they are timed in aeon, and cannot be packed.
+They are what a user of a time-series library would take. They have no graph: they are timed in
+aeon, and cannot be packed.
 """
 
 from __future__ import annotations
@@ -24,18 +26,21 @@ from train.models.training import one_thread
 
 Array = NDArray[Any]
 SHORTEST = 10
-"""Frames: kernels have nine, and MultiRocket takes the differences of a window too. QUANT would need fewer."""
+"""Frames: kernels have nine, and MultiRocket takes the differences of a window too. QUANT would
+need fewer."""
 BATCH = 64
 """Sweeps that are transformed at a time: QUANT makes a hundred thousand features of a long one."""
 LEAST = 1e-4
 """Of the probabilities of QUANT's 200 trees, before their logarithm."""
 Fit = Callable[[Array, Array, int], Callable[[Array], Array]]
-"""(series float32 [N, R * C, T], labels [N] from 0 on, seed) -> what gives scores [n, k] of series."""
+"""(series float32 [N, R * C, T], labels [N] from 0 on, seed) -> what gives scores [n, k] of
+series."""
 
 
 @dataclass(frozen=True)
 class AeonModel:
-    """A classifier of aeon. scores: as Fit gives it; present [k]: labels that were trained, of `classes`."""
+    """A classifier of aeon. scores: as Fit gives it; present [k]: labels that were trained, of
+    `classes`."""
 
     name: str
     scores: Callable[[Array], Array]
@@ -53,7 +58,9 @@ class AeonModel:
 
     def graph(self) -> onnx.ModelProto:
         """There is none: raises FormatError."""
-        raise FormatError(f"{self.name} runs in aeon alone and has no graph; choose another method for the box")
+        raise FormatError(
+            f"{self.name} runs in aeon alone and has no graph; choose another method for the box"
+        )
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int, *, name: str, fit: Fit) -> AeonModel:
@@ -71,13 +78,17 @@ def train(sweeps: Dataset, inputs: Array, seed: int, *, name: str, fit: Fit) -> 
         with _undisturbed():
             scores = fit(series(inputs), labels, seed)
     except ImportError as e:
-        raise FormatError(f"{name} needs aeon ({e}); try pip install 'palpate-train[minirocket]'") from e
+        raise FormatError(
+            f"{name} needs aeon ({e}); try pip install 'palpate-train[minirocket]'"
+        ) from e
     return AeonModel(name, scores, present, len(sweeps.materials))
 
 
 def series(counts: Array) -> Array:
     """Raw counts [n, T, R, C] as aeon takes them: float32 [n, R * C, T], in C order."""
-    return np.ascontiguousarray(counts.reshape(*counts.shape[:2], -1).transpose(0, 2, 1), np.float32)
+    return np.ascontiguousarray(
+        counts.reshape(*counts.shape[:2], -1).transpose(0, 2, 1), np.float32
+    )
 
 
 @contextmanager
@@ -98,10 +109,13 @@ def fit_multirocket_hydra(x: Array, labels: Array, seed: int) -> Callable[[Array
     it = MultiRocketHydraClassifier(random_state=seed, n_jobs=1).fit(x, labels)
 
     def scores(x: Array) -> Array:
-        """What `it` compares: its own method returns labels alone, with which no recordings could be fused."""
+        """What `it` compares: its own method returns labels alone, with which no recordings could
+        be fused."""
         hydra = it._scale_hydra.transform(it._transform_hydra.transform(x))
         rocket = it._scale_multirocket.transform(it._transform_multirocket.transform(x))
-        margins = SHARPENING * it.classifier.decision_function(np.concatenate((hydra, rocket), axis=1))
+        margins = SHARPENING * it.classifier.decision_function(
+            np.concatenate((hydra, rocket), axis=1)
+        )
         found = np.stack([-margins, margins], axis=1) if margins.ndim == 1 else margins
         centred: Array = found - found.mean(axis=1, keepdims=True)
         return centred
@@ -123,10 +137,20 @@ def fit_quant(x: Array, labels: Array, seed: int) -> Callable[[Array], Array]:
 
 
 def _method(name: str, about: str, fit: Fit) -> Method:
-    return Method(name, about, "raw", partial(train, name=name, fit=fit), "minirocket", library="aeon")
+    return Method(
+        name, about, "raw", partial(train, name=name, fit=fit), "minirocket", library="aeon"
+    )
 
 
 METHODS = (
-    _method("multirocket-hydra", "MultiRocket-Hydra of aeon + ridge (Dempster et al. 2023)", fit_multirocket_hydra),
-    _method("quant", "QUANT of aeon: quantiles of intervals + extra trees (Dempster et al. 2024)", fit_quant),
+    _method(
+        "multirocket-hydra",
+        "MultiRocket-Hydra of aeon + ridge (Dempster et al. 2023)",
+        fit_multirocket_hydra,
+    ),
+    _method(
+        "quant",
+        "QUANT of aeon: quantiles of intervals + extra trees (Dempster et al. 2024)",
+        fit_quant,
+    ),
 )

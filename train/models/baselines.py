@@ -1,8 +1,9 @@
-"""The paper's classical classifiers. In: features of training sweeps. Out: Models that the box runs.
+"""The paper's classical classifiers. In: features of training sweeps. Out: Models that the box
+runs.
 
-`learn` trains every method on features: it fits a scikit-learn estimator, writes it as an ONNX graph and finds one
-temperature on groups that were held out. A model answers by running its graph as the box does, so that what is scored
-here is what is exported.
+`learn` trains every method on features: it fits a scikit-learn estimator, writes it as an ONNX
+graph and finds one temperature on groups that were held out. A model answers by running its graph
+as the box does, so that what is scored here is what is exported.
 """
 
 from __future__ import annotations
@@ -41,15 +42,20 @@ Array = NDArray[Any]
 NEIGHBOURS = 4
 """The paper's k; also the fewest sweeps that a feature method is trained on."""
 SMOOTHING = 0.1
-"""Added to the neighbours' votes before their logarithm: a class without a vote is unlikely, not impossible."""
+"""Added to the neighbours' votes before their logarithm: a class without a vote is unlikely, not
+impossible."""
 FOLDS = 5
-"""Parts of the training set, at most, that are held out one after another to find the temperature."""
+"""Parts of the training set, at most, that are held out one after another to find the
+temperature."""
 SHARPENING = 10
-"""Factor on logits before fit_temperature, which only softens: votes are less certain than they might be."""
+"""Factor on logits before fit_temperature, which only softens: votes are less certain than they
+might be."""
 ABSENT = math.log(LEAST_PROBABILITY)
-"""Log probability of a material without a sweep in training: the box's lower limit when it fuses sweeps."""
+"""Log probability of a material without a sweep in training: the box's lower limit when it fuses
+sweeps."""
 LIMIT = 1e9
-"""Features are clipped here, so that no broken reading overflows float32; no valid one comes near."""
+"""Features are clipped here, so that no broken reading overflows float32; no valid one comes
+near."""
 OPSETS = {"": OPSET, "ai.onnx.ml": 3, "com.microsoft": 1}
 """Operators that the box's onnxruntime has."""
 
@@ -71,16 +77,18 @@ class Estimator(Protocol):
 class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
     """One normal distribution for each class (Bishop 2006, sec. 4.2), with equal priors.
 
-    A class's covariance is that of its sweeps and of one sweep more, which varies as the whole set does, each feature
-    by itself: this ridge of 1 / (n + 1) keeps the matrix regular where sweeps are few or features collinear.
-    independent: no covariance between features. first: use only the first so many features; 0 for all.
+    A class's covariance is that of its sweeps and of one sweep more, which varies as the whole set
+    does, each feature by itself: this ridge of 1 / (n + 1) keeps the matrix regular where sweeps
+    are few or features collinear. independent: no covariance between features. first: use only the
+    first so many features; 0 for all.
     """
 
     def __init__(self, independent: bool = False, first: int = 0) -> None:
         self.independent, self.first = independent, first
 
     def fit(self, x: Array, y: Array) -> Self:
-        """x: float64 [n, F], y: labels [n]. Keeps means [K, F] and each class's whitening matrix [K, F, F']."""
+        """x: float64 [n, F], y: labels [n]. Keeps means [K, F] and each class's whitening matrix
+        [K, F, F']."""
         self.classes_ = np.unique(y)
         used = slice(0, self.first or x.shape[1])
         spread = x[:, used].var(axis=0)
@@ -110,8 +118,11 @@ class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lea
         return labels
 
     def nodes(self, g: GraphBuilder, features: str) -> str:
-        """`decision_function` in ONNX, which skl2onnx does not know; the name of its output [1, K]."""
-        white = g("MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_))
+        """`decision_function` in ONNX, which skl2onnx does not know; the name of its output [1,
+        K]."""
+        white = g(
+            "MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_)
+        )
         squares = g("ReduceSum", g("Mul", white, white), g.constant([1, 2], "int64"), keepdims=0)
         half = g("Mul", squares, g.constant(-0.5))
         return g("Add", half, g.constant(self.constants_[None]))
@@ -120,9 +131,10 @@ class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lea
 def svm(**options: Any) -> Pipeline:
     """A one-against-one SVM with C = 1, gamma = 1 / N (if RBF) on standardised features.
 
-    The paper does not say that features were standardised. But gamma = 1 / N suits features of unit variance: on raw
-    H-features, which are small fractions, the RBF kernel is nearly flat. break_ties: where several classes have equally
-    many votes the larger confidence wins, as in the graph.
+    The paper does not say that features were standardised. But gamma = 1 / N suits features of unit
+    variance: on raw H-features, which are small fractions, the RBF kernel is nearly flat.
+    break_ties: where several classes have equally many votes the larger confidence wins, as in the
+    graph.
     """
     return make_pipeline(StandardScaler(), SVC(gamma="auto", break_ties=True, **options))
 
@@ -134,7 +146,8 @@ def knn() -> KNeighborsClassifier:
 
 @dataclass(frozen=True)
 class FeatureModel:
-    """A trained method on features: its graph, `features` float32 [1, F] -> `logits` float32 [1, K]."""
+    """A trained method on features: its graph, `features` float32 [1, F] -> `logits` float32 [1,
+    K]."""
 
     model: onnx.ModelProto
 
@@ -143,22 +156,29 @@ class FeatureModel:
         return self.model
 
     def logits(self, inputs: Array) -> Array:
-        """Features float32 [n, F] -> log probabilities float32 [n, K], from the graph, one by one as on the box."""
+        """Features float32 [n, F] -> log probabilities float32 [n, K], from the graph, one by one
+        as on the box."""
         run = session(self.model.SerializeToString())
         classes = self.model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-        rows = [run.run(None, {"features": row[None]})[0][0] for row in inputs.astype(np.float32, copy=False)]
+        rows = [
+            run.run(None, {"features": row[None]})[0][0]
+            for row in inputs.astype(np.float32, copy=False)
+        ]
         return np.array(rows, np.float32).reshape(-1, classes)
 
 
 def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: int) -> FeatureModel:
-    """Train what `make` makes on `inputs`, features float32 [N, F] of `sweeps`. Nothing is random: `seed` is unused.
+    """Train what `make` makes on `inputs`, features float32 [N, F] of `sweeps`. Nothing is random:
+    `seed` is unused.
 
-    The temperature is that of the sweeps held out in turn: by position, or by recording where there is only one position
-    or each position has its own materials; 1 where nothing can be held out.
+    The temperature is that of the sweeps held out in turn: by position, or by recording where there
+    is only one position or each position has its own materials; 1 where nothing can be held out.
     Raises FormatError where there are too few sweeps or only one material.
     """
     if len(sweeps.require_materials()) < NEIGHBOURS:
-        raise FormatError(f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} or more")
+        raise FormatError(
+            f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} or more"
+        )
     features, labels, classes = inputs.astype(np.float64), sweeps.labels, len(sweeps.materials)
     held_out, held_out_labels = [np.empty((0, classes))], [labels[:0]]
     for train, test in _folds(sweeps):
@@ -171,13 +191,16 @@ def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: i
 
 
 def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
-    """(training, held-out) numbers of sweeps; only sweeps whose material is in training are held out."""
+    """(training, held-out) numbers of sweeps; only sweeps whose material is in training are held
+    out."""
     names = ("position", "recording") if "position" in sweeps.groups else ("recording",)
     for group in map(sweeps.group, names):
         folds = []
         n = min(FOLDS, len(np.unique(group)), np.bincount(sweeps.labels).max())
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a material with fewer sweeps than folds
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # of a material with fewer sweeps than folds
             splits = StratifiedGroupKFold(n).split(group, sweeps.labels, group) if n > 1 else ()
             for train, test in splits:
                 test = test[np.isin(sweeps.labels[test], sweeps.labels[train])]
@@ -189,15 +212,24 @@ def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
 
 
 def to_onnx(estimator: Estimator, classes: int, temperature: float = 1.0) -> onnx.ModelProto:
-    """A fitted estimator in ONNX: `features` float32 [1, F] -> `logits`, log probabilities float32 [1, classes].
+    """A fitted estimator in ONNX: `features` float32 [1, F] -> `logits`, log probabilities float32
+    [1, classes].
 
-    temperature: divides the estimator's scores: log likelihoods of Gauss, log votes of kNN, votes and bounded confidences
-    of the SVM. A class that the estimator never saw gets ABSENT.
+    temperature: divides the estimator's scores: log likelihoods of Gauss, log votes of kNN, votes
+    and bounded confidences of the SVM. A class that the estimator never saw gets ABSENT.
     """
     g = GraphBuilder()
-    size = estimator.means_.shape[1] if isinstance(estimator, Gauss) else int(getattr(estimator, "n_features_in_", 0))
+    size = (
+        estimator.means_.shape[1]
+        if isinstance(estimator, Gauss)
+        else int(getattr(estimator, "n_features_in_", 0))
+    )
     clipped = g("Clip", "features", g.constant(-LIMIT), g.constant(LIMIT), output="sound")
-    scores = estimator.nodes(g, clipped) if isinstance(estimator, Gauss) else _converted(g, estimator, clipped, size)
+    scores = (
+        estimator.nodes(g, clipped)
+        if isinstance(estimator, Gauss)
+        else _converted(g, estimator, clipped, size)
+    )
     log_p = g("LogSoftmax", g("Mul", scores, g.constant(1 / temperature)))
     column = np.full(classes, len(estimator.classes_))
     column[estimator.classes_] = np.arange(len(estimator.classes_))
@@ -213,33 +245,48 @@ def to_onnx(estimator: Estimator, classes: int, temperature: float = 1.0) -> onn
 
 
 def _converted(g: GraphBuilder, estimator: Estimator, features: str, size: int) -> str:
-    """skl2onnx's nodes for a KNeighborsClassifier or Pipeline, added to `g`; the name of its scores [1, K]."""
-    steps: list[Any] = [step for _, step in estimator.steps] if isinstance(estimator, Pipeline) else [estimator]
+    """skl2onnx's nodes for a KNeighborsClassifier or Pipeline, added to `g`; the name of its scores
+    [1, K]."""
+    steps: list[Any] = (
+        [step for _, step in estimator.steps] if isinstance(estimator, Pipeline) else [estimator]
+    )
     *before, last = steps
     options: dict[str, Any]
     if votes := isinstance(last, KNeighborsClassifier):
-        options = {"optim": "cdist"}  # skl2onnx's default distances are a loop over all sweeps, twelve times as slow
+        options = {
+            "optim": "cdist"
+        }  # skl2onnx's default distances are a loop over all sweeps, twelve times as slow
     else:
         # skl2onnx's votes are thousands of nodes for 36 classes
         last = copy(last).set_params(decision_function_shape="ovo")
         options = {"raw_scores": True}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # skl2onnx reads attributes of SVC that will be removed
-        inputs, of_last = [(features, FloatTensorType([1, size]))], {id(last): options | {"zipmap": False}}
-        model = convert_sklearn(make_pipeline(*before, last), "m", inputs, options=of_last, target_opset=OPSETS)
+        warnings.simplefilter(
+            "ignore", FutureWarning
+        )  # skl2onnx reads attributes of SVC that will be removed
+        inputs, of_last = (
+            [(features, FloatTensorType([1, size]))],
+            {id(last): options | {"zipmap": False}},
+        )
+        model = convert_sklearn(
+            make_pipeline(*before, last), "m", inputs, options=of_last, target_opset=OPSETS
+        )
     g.nodes.extend(model.graph.node)
     g.constants.extend(model.graph.initializer)
     scores: str = model.graph.output[1].name
     if votes:
-        return g("Log", g("Add", g("Mul", scores, g.constant(float(NEIGHBOURS))), g.constant(SMOOTHING)))
+        return g(
+            "Log", g("Add", g("Mul", scores, g.constant(float(NEIGHBOURS))), g.constant(SMOOTHING))
+        )
     return scores if len(last.classes_) == 2 else _votes(g, scores, len(last.classes_))
 
 
 def _votes(g: GraphBuilder, decisions: str, classes: int) -> str:
-    """SVC's `decision_function`: decisions one against one [1, pairs] -> votes and bounded confidences [1, classes].
+    """SVC's `decision_function`: decisions one against one [1, pairs] -> votes and bounded
+    confidences [1, classes].
 
-    The decision of a pair (i, j), i < j, is a vote for j where it is below 0, else for i; a sum s of a class's decisions
-    adds s / 3 (|s| + 1), which only decides between equally many votes.
+    The decision of a pair (i, j), i < j, is a vote for j where it is below 0, else for i; a sum s
+    of a class's decisions adds s / 3 (|s| + 1), which only decides between equally many votes.
     """
     pairs = list(combinations(range(classes), 2))
     side = np.array([[(k == i) - (k == j) for k in range(classes)] for i, j in pairs])
@@ -258,7 +305,8 @@ ESTIMATORS: dict[str, Callable[[], Estimator]] = {
     "H-knn": knn,
     "H-svm": svm,
 }
-"""The paper's classifiers on the paper's features. L-features have units (log, Hz, Hz): kNN gets them standardised."""
+"""The paper's classifiers on the paper's features. L-features have units (log, Hz, Hz): kNN gets
+them standardised."""
 ABOUT = (
     "L-features, a normal distribution for each class (sec. III.C; Bishop 2006)",
     "L-features standardised, 4 nearest neighbours (sec. III.C)",

@@ -1,6 +1,8 @@
-"""An unfinished training in a file. In: all that it changes. Out: after an interruption the same training, bit for bit.
+"""An unfinished training in a file. In: all that it changes. Out: after an interruption the same
+training, bit for bit.
 
-The file holds the state after some step. It is written whole or not at all; one that cannot be read counts as none.
+The file holds the state after some step. It is written whole or not at all; one that cannot be read
+counts as none.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ from torch import Generator
 from appliance.core.storage import put
 
 EVERY_S, WRITING = 10.0, 0.003
-"""How often an unfinished training is written, and the share of the time that writing may take: the paper's CNN takes
-250 MB and half a second each time."""
+"""How often an unfinished training is written, and the share of the time that writing may take: the
+paper's CNN takes 250 MB and half a second each time."""
 
 
 class Stateful(Protocol):
@@ -35,17 +37,21 @@ class Stateful(Protocol):
 
 
 class Checkpoint:
-    """The state of a training: its parts, its random generators and (iteration, cost) of the steps done.
+    """The state of a training: its parts, its random generators and (iteration, cost) of the steps
+    done.
 
     path None: kept nowhere.
     """
 
-    def __init__(self, path: Path | None, parts: Mapping[str, Stateful], generators: Sequence[Generator]) -> None:
+    def __init__(
+        self, path: Path | None, parts: Mapping[str, Stateful], generators: Sequence[Generator]
+    ) -> None:
         self._path, self._parts, self._generators = path, parts, generators
         self._next = time.monotonic() + wait(0.0)
 
     def load(self) -> list[tuple[int, float]]:
-        """Bring all parts and generators to the state in the file, and give the cost so far; [] where there is none."""
+        """Bring all parts and generators to the state in the file, and give the cost so far; []
+        where there is none."""
         kept = self._read()
         if kept is None:
             return []
@@ -66,12 +72,15 @@ class Checkpoint:
         return kept
 
     def save(self, cost: list[tuple[int, float]]) -> None:
-        """Write the state, where the last time was long enough ago. cost: of every step done. Raises OSError."""
+        """Write the state, where the last time was long enough ago. cost: of every step done.
+        Raises OSError."""
         if self._path is None or (start := time.monotonic()) < self._next:
             return
         packed = io.BytesIO()
         states: dict[str, Any] = {name: part.state_dict() for name, part in self._parts.items()}
-        torch.save(states | {"generators": [g.get_state() for g in self._generators], "cost": cost}, packed)
+        torch.save(
+            states | {"generators": [g.get_state() for g in self._generators], "cost": cost}, packed
+        )
         put(self._path, packed.getvalue(), parents=True)
         self._next = (end := time.monotonic()) + wait(end - start)
 
@@ -83,5 +92,7 @@ def wait(took: float) -> float:
 
 def default_generators(device: str) -> tuple[Generator, ...]:
     """PyTorch's own generators, from which dropout is drawn on `device`."""
-    on_gpu = (torch.cuda.default_generators[torch.cuda.current_device()],) if device == "cuda" else ()
+    on_gpu = (
+        (torch.cuda.default_generators[torch.cuda.current_device()],) if device == "cuda" else ()
+    )
     return torch.default_generator, *on_gpu

@@ -1,8 +1,10 @@
-"""Linear discriminant analysis with shrinkage, quick where there are fewer sweeps than features. In: features. Out: a head.
+"""Linear discriminant analysis with shrinkage, quick where there are fewer sweeps than features.
+In: features. Out: a head.
 
-Sweeps of every material are taken to scatter alike about their mean. The covariance is Ledoit and Wolf's (2004), of
-features scaled to the same scatter; materials are equally probable. Where there are fewer sweeps than features the
-equations are solved among the sweeps (Woodbury's identity): the same solution, many times as fast.
+Sweeps of every material are taken to scatter alike about their mean. The covariance is Ledoit and
+Wolf's (2004), of features scaled to the same scatter; materials are equally probable. Where there
+are fewer sweeps than features the equations are solved among the sweeps (Woodbury's identity): the
+same solution, many times as fast.
 """
 
 from __future__ import annotations
@@ -18,19 +20,23 @@ Array = NDArray[Any]
 ABSENT = -1e4
 """Logit of a material without a sweep."""
 LEAST_SHRINKAGE = 1e-4
-"""Where the scatter is known so well that none is needed, equations with equal features must have a solution."""
+"""Where the scatter is known so well that none is needed, equations with equal features must have a
+solution."""
 
 
 def fit(features: Array, labels: Array, classes: int) -> tuple[Array, Array]:
-    """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below `classes`.
+    """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below
+    `classes`.
 
-    The logits of a material without a sweep are ABSENT. Raises FormatError where there is only one sweep of each
-    material, which says nothing of how materials vary.
+    The logits of a material without a sweep are ABSENT. Raises FormatError where there is only one
+    sweep of each material, which says nothing of how materials vary.
     """
     present, member = np.unique(labels, return_inverse=True)
     x = np.asarray(features, np.float64)
     if len(x) <= len(present):
-        raise FormatError(f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record more")
+        raise FormatError(
+            f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record more"
+        )
     means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
     scatter = x - means[member]
     spread = scatter.std(axis=0)
@@ -45,7 +51,8 @@ def fit(features: Array, labels: Array, classes: int) -> tuple[Array, Array]:
 
 
 def _solve(z: Array, wanted: Array) -> Array:
-    """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are 0."""
+    """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are
+    0."""
     n, size = z.shape
     few = n < size
     gram = z @ z.T if few else z.T @ z
@@ -62,7 +69,8 @@ def _solve(z: Array, wanted: Array) -> Array:
 
 
 def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
-    """Ledoit and Wolf's share of the mean variance in the covariance of `z` [N, F], whose means are 0, and that variance.
+    """Ledoit and Wolf's share of the mean variance in the covariance of `z` [N, F], whose means are
+    0, and that variance.
 
     gram: z @ z.T or z.T @ z, whichever is smaller.
     """

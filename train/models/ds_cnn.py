@@ -1,7 +1,9 @@
-"""DS-CNN, a small network as it is deployed on microcontrollers. In: an Effort. Out: the METHOD ds-cnn.
+"""DS-CNN, a small network as it is deployed on microcontrollers. In: an Effort. Out: the METHOD
+ds-cnn.
 
-A convolution, then four depthwise separable ones, each with batch norm, and a mean over time (Zhang et al. 2017, "Hello
-Edge"). Theirs sees an image of 49 x 10 speech features; here it sees the series of the taxels.
+A convolution, then four depthwise separable ones, each with batch norm, and a mean over time (Zhang
+et al. 2017, "Hello Edge"). Theirs sees an image of 49 x 10 speech features; here it sees the series
+of the taxels.
 """
 
 from __future__ import annotations
@@ -26,14 +28,16 @@ Array = NDArray[Any]
 CHANNELS, BLOCKS, TAPS = 64, 4, 9
 """As in the small DS-CNN; a depthwise kernel of 3 x 3 becomes one of nine frames."""
 STEPS, FIRST_TAPS = 50, 10
-"""About so many steps of time are left after the first convolution, whose kernel has ten frames or two strides."""
+"""About so many steps of time are left after the first convolution, whose kernel has ten frames or
+two strides."""
 RECIPE = TrainingRecipe(ema=0.9, dropout=0.0)
 """That of our own networks with a shorter average, as batch norms want it; no means are dropped."""
 INT8_NODES = ("Conv", "Relu")
 
 
 class DepthwiseSeparable(Network):
-    """DS-CNN over time; the taxels are the channels of its first convolution. Zero padding keeps sizes in the blocks."""
+    """DS-CNN over time; the taxels are the channels of its first convolution. Zero padding keeps
+    sizes in the blocks."""
 
     def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
         super().__init__(form, scale)
@@ -67,7 +71,14 @@ class DepthwiseSeparable(Network):
         for conv, norm in self._convolutions():
             one = fuse_conv_bn_eval(conv.eval(), norm.eval())
             pads = [int(one.padding[0])] * 2
-            x = g("Conv", x, *layer_constants(g, one), strides=list(one.stride), pads=pads, group=one.groups)
+            x = g(
+                "Conv",
+                x,
+                *layer_constants(g, one),
+                strides=list(one.stride),
+                pads=pads,
+                group=one.groups,
+            )
             x = g("Relu", x)
         mean = g("ReduceMean", x, axes=[2], keepdims=0)
         g("Gemm", mean, *layer_constants(g, self.head), transB=1, output="logits")
@@ -75,14 +86,17 @@ class DepthwiseSeparable(Network):
 
 
 def build(form: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact network."""
+    """The network with random weights; each taxel's mean is subtracted, as in the compact
+    network."""
     return DepthwiseSeparable(form, classes, texture_scale(samples))
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The method, trained with this effort. log: called after every iteration."""
     about = "DS-CNN, as deployed on microcontrollers, over time (Zhang et al. 2017); also in int8"
-    return (network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),)
+    return (
+        network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),
+    )
 
 
 METHODS = methods()

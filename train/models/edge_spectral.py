@@ -1,7 +1,9 @@
-"""The recipe of the edge tools: spectral features and a small dense network. In: an Effort. Out: the METHOD edge-spectral.
+"""The recipe of the edge tools: spectral features and a small dense network. In: an Effort. Out:
+the METHOD edge-spectral.
 
-Of each taxel the log power spectrum, averaged over half-overlapping frames, with root mean square, skewness and kurtosis,
-as the spectral block of Edge Impulse makes them (Hymel et al. 2022); then dense layers of 20 and 10 neurons, its default.
+Of each taxel the log power spectrum, averaged over half-overlapping frames, with root mean square,
+skewness and kurtosis, as the spectral block of Edge Impulse makes them (Hymel et al. 2022); then
+dense layers of 20 and 10 neurons, its default.
 """
 
 from __future__ import annotations
@@ -19,7 +21,14 @@ from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.networks import Network, layer_constants
 from train.models.scale import texture_scale
-from train.models.training import TrainingRecipe, batches, float_batches, network_method, one_thread, scale_steps
+from train.models.training import (
+    TrainingRecipe,
+    batches,
+    float_batches,
+    network_method,
+    one_thread,
+    scale_steps,
+)
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
@@ -27,7 +36,8 @@ SHORTEST, LONGEST = 64, 256
 """Frames of a Fourier transform: the largest power of two within half a window, from 64 to 256."""
 HIDDEN = (20, 10)
 FLOOR = 1e-6
-"""Added to a power before its logarithm and to a variance, where the variance of all taxels together is 1."""
+"""Added to a power before its logarithm and to a variance, where the variance of all taxels
+together is 1."""
 RECIPE = TrainingRecipe(dropout=0.0, noise=0.0, gain=0.0)
 """That of our own networks without what changes sweeps: the tools' blocks augment nothing."""
 
@@ -40,8 +50,8 @@ def transform_length(window: int) -> int:
 class SpectralNetwork(Network):
     """Two dense layers and a head on standardised spectra and statistics of each taxel.
 
-    A window that is shorter than a transform is followed by zeros. waves [2 B, 1, L]: cosines, then sines, under a Hann
-    window. centre, spread [F]: of the training features.
+    A window that is shorter than a transform is followed by zeros. waves [2 B, 1, L]: cosines, then
+    sines, under a Hann window. centre, spread [F]: of the training features.
     """
 
     waves: Tensor
@@ -63,7 +73,8 @@ class SpectralNetwork(Network):
         self.head = nn.Linear(HIDDEN[1], classes)
 
     def spectral(self, prepared: Tensor) -> Tensor:
-        """[B, M, T] -> [B, M * (3 + bins)]: all root mean squares, skewnesses, kurtoses, then log powers taxel by taxel."""
+        """[B, M, T] -> [B, M * (3 + bins)]: all root mean squares, skewnesses, kurtoses, then log
+        powers taxel by taxel."""
         variance = (prepared**2).mean(2) + FLOOR
         skewness = (prepared**3).mean(2) / variance**1.5
         kurtosis = (prepared**4).mean(2) / variance**2 - 3
@@ -82,7 +93,10 @@ class SpectralNetwork(Network):
     def standardise(self, samples: Array) -> None:
         """Take centre and spread of the features from raw counts [N, T, R, C]."""
         with one_thread():
-            parts = [self.spectral(self.prepare(x)) for x in float_batches(samples, batches(len(samples)))]
+            parts = [
+                self.spectral(self.prepare(x))
+                for x in float_batches(samples, batches(len(samples)))
+            ]
         spread, self.centre = torch.std_mean(torch.cat(parts), 0, correction=0)
         self.spread = torch.where(spread > FLOOR, spread, torch.ones_like(spread))
 
@@ -98,10 +112,19 @@ class SpectralNetwork(Network):
         skewness = g("Div", third, g("Mul", variance, root))
         kurtosis = g("Sub", g("Div", fourth, g("Mul", variance, variance)), g.constant(3.0))
         rows = g("Reshape", x, g.constant([taxels, 1, self.form.window], "int64"))
-        parts = g("Conv", rows, g.constant(self.waves.numpy()), strides=[self.hop], pads=[0, self.missing])
+        parts = g(
+            "Conv", rows, g.constant(self.waves.numpy()), strides=[self.hop], pads=[0, self.missing]
+        )
         frames = (self.form.window + self.missing - 2 * self.bins) // self.hop + 1
-        parts = g("Reshape", g("Mul", parts, parts), g.constant([taxels, 2, self.bins, frames], "int64"))
-        power = g("ReduceMean", g("ReduceSum", parts, g.constant([1], "int64"), keepdims=0), axes=[2], keepdims=0)
+        parts = g(
+            "Reshape", g("Mul", parts, parts), g.constant([taxels, 2, self.bins, frames], "int64")
+        )
+        power = g(
+            "ReduceMean",
+            g("ReduceSum", parts, g.constant([1], "int64"), keepdims=0),
+            axes=[2],
+            keepdims=0,
+        )
         log_power = g("Log", g("Add", power, g.constant(FLOOR)))
         log_power = g("Reshape", log_power, g.constant([1, taxels * self.bins], "int64"))
         x = g("Concat", root, skewness, kurtosis, log_power, axis=1)
@@ -113,7 +136,8 @@ class SpectralNetwork(Network):
 
 
 def build(form: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights and the features of `samples` standardised; each taxel's mean is subtracted."""
+    """The network with random weights and the features of `samples` standardised; each taxel's mean
+    is subtracted."""
     network = SpectralNetwork(form, classes, texture_scale(samples))
     network.standardise(samples)
     return network
@@ -121,9 +145,7 @@ def build(form: SweepFormat, classes: int, samples: Array) -> Network:
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The method, trained with this effort. log: called after every iteration."""
-    about = (
-        "log spectra and statistics of each taxel + dense layers of 20 and 10, as the edge tools do (Hymel et al. 2022)"
-    )
+    about = "log spectra and statistics of each taxel + dense layers of 20 and 10, as the edge tools do (Hymel et al. 2022)"
     return (network_method("edge-spectral", about, build, scale_steps(RECIPE, effort), log),)
 
 

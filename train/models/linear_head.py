@@ -1,7 +1,9 @@
-"""Linear heads. In: features of training sweeps, or a graph that computes them. Out: a head, a temperature, a Model.
+"""Linear heads. In: features of training sweeps, or a graph that computes them. Out: a head, a
+temperature, a Model.
 
-A head is found in closed form or by scikit-learn. One temperature, found on groups that were held out, makes its
-probabilities honest. minirocket.py and sthmp.py build the graphs; heads are fitted to what the graph gives on the box.
+A head is found in closed form or by scikit-learn. One temperature, found on groups that were held
+out, makes its probabilities honest. minirocket.py and sthmp.py build the graphs; heads are fitted
+to what the graph gives on the box.
 """
 
 from __future__ import annotations
@@ -22,19 +24,23 @@ from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
 HELD_OUT = 0.2
-"""Share of the groups that training does not see: they give the temperature and the validation accuracy."""
+"""Share of the groups that training does not see: they give the temperature and the validation
+accuracy."""
 TEMPERATURES = np.geomspace(1, 100, 200)
-"""Candidates, from LDA's own posteriors, which are never too modest, to an almost uniform distribution."""
+"""Candidates, from LDA's own posteriors, which are never too modest, to an almost uniform
+distribution."""
 ABSENT = -30.0
-"""Logit of a material that training never saw, where the best of the others is never below 0: its probability is below
-1e-12."""
+"""Logit of a material that training never saw, where the best of the others is never below 0: its
+probability is below 1e-12."""
 SHARPENING = 30.0
-"""Factor on margins before `fit_temperature`: margins are about 1 and need sharpening, while it only softens."""
+"""Factor on margins before `fit_temperature`: margins are about 1 and need sharpening, while it
+only softens."""
 
 
 @dataclass(frozen=True)
 class LinearHeadModel:
-    """A trained model: features that a graph computes, and a linear head with the temperature folded in.
+    """A trained model: features that a graph computes, and a linear head with the temperature
+    folded in.
 
     features: `sweep` [1, T, R, C] -> `features` float32 [1, F]. weight [K, F], bias [K]: float32.
     """
@@ -53,9 +59,11 @@ class LinearHeadModel:
 
 
 def hold_out(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
-    """(to train on, held out, by which group): whole positions where there are several and these allow it, else recordings.
+    """(to train on, held out, by which group): whole positions where there are several and these
+    allow it, else recordings.
 
-    Raises FormatError where the set has too few groups, or only one sweep of a material would be left to train on.
+    Raises FormatError where the set has too few groups, or only one sweep of a material would be
+    left to train on.
     """
     if len(np.unique(sweeps.groups.get("position", 0))) > 1:
         with suppress(FormatError):
@@ -79,14 +87,20 @@ def _split(sweeps: Dataset, by: str, seed: int) -> tuple[Dataset, Dataset, str]:
     counts = np.bincount(train.labels, minlength=len(sweeps.materials))
     if 1 in counts:
         material = sweeps.materials[int(np.flatnonzero(counts == 1)[0])]
-        raise FormatError(f"{sweeps.source}: split by {by!r} leaves one sweep of {material!r}; record more of it")
+        raise FormatError(
+            f"{sweeps.source}: split by {by!r} leaves one sweep of {material!r}; record more of it"
+        )
     return train, held_out, by
 
 
-def closed_form_head(features: Array, labels: Array, held_out: Array, held_out_labels: Array) -> tuple[Array, Array]:
-    """Weight [K, F] and bias [K], float32, of shrinkage LDA on `features` [N, F], with the temperature of `held_out` [n, F].
+def closed_form_head(
+    features: Array, labels: Array, held_out: Array, held_out_labels: Array
+) -> tuple[Array, Array]:
+    """Weight [K, F] and bias [K], float32, of shrinkage LDA on `features` [N, F], with the
+    temperature of `held_out` [n, F].
 
-    Raises FormatError where there is only one sweep of each material, which says nothing of how materials vary.
+    Raises FormatError where there is only one sweep of each material, which says nothing of how
+    materials vary.
     """
     if len(labels) <= len(np.unique(labels)):
         raise FormatError(
@@ -101,10 +115,11 @@ def closed_form_head(features: Array, labels: Array, held_out: Array, held_out_l
 
 
 def fit_temperature(logits: Array, labels: Array) -> float:
-    """The divisor of `logits` [N, K], one of TEMPERATURES, with the best likelihood of `labels` [N].
+    """The divisor of `logits` [N, K], one of TEMPERATURES, with the best likelihood of `labels`
+    [N].
 
-    Each label counts as right with probability (N + 1) / (N + 2), Platt's correction (Platt 1999): without it a few
-    held-out sweeps, all right, would allow any certainty.
+    Each label counts as right with probability (N + 1) / (N + 2), Platt's correction (Platt 1999):
+    without it a few held-out sweeps, all right, would allow any certainty.
     """
     wrong = 1 / (len(labels) + 2)
     costs = []
@@ -112,7 +127,11 @@ def fit_temperature(logits: Array, labels: Array) -> float:
         z = logits / t
         z = z - z.max(axis=1, keepdims=True)
         log_p = z - np.log(np.exp(z).sum(axis=1, keepdims=True))
-        costs.append(-np.mean((1 - wrong) * log_p[np.arange(len(labels)), labels] + wrong * log_p.mean(axis=1)))
+        costs.append(
+            -np.mean(
+                (1 - wrong) * log_p[np.arange(len(labels)), labels] + wrong * log_p.mean(axis=1)
+            )
+        )
     return float(TEMPERATURES[np.argmin(costs)])
 
 
@@ -123,11 +142,13 @@ def train_linear_head(
     inputs: Array,
     seed: int,
 ) -> LinearHeadModel:
-    """The graph `features` with a linear head, trained on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
+    """The graph `features` with a linear head, trained on `inputs`, the raw counts [N, T, R, C] of
+    `sweeps`.
 
-    fit: (features [n, F], labels [n]) -> scikit-learn's coefficients [k, F] and intercepts [k] for the k labels that
-    occur, one row where k is 2. The temperature is found on the groups that `hold_out` names, with a head that did not
-    see them; it is 1 where `sweeps` are too few for that.
+    fit: (features [n, F], labels [n]) -> scikit-learn's coefficients [k, F] and intercepts [k] for
+    the k labels that occur, one row where k is 2. The temperature is found on the groups that
+    `hold_out` names, with a head that did not see them; it is 1 where `sweeps` are too few for
+    that.
     """
     present, labels = np.unique(sweeps.labels, return_inverse=True)
     computed = run(features, inputs)
@@ -149,12 +170,18 @@ def _centred(coefficients: Array, intercepts: Array) -> tuple[Array, Array]:
     """One row for each label, less their mean: the largest margin is then never below 0."""
     coefficients, intercepts = np.atleast_2d(coefficients), np.atleast_1d(intercepts)
     if len(coefficients) == 1:  # of two labels scikit-learn gives the second one's margin
-        coefficients, intercepts = np.vstack([-coefficients, coefficients]), np.append(-intercepts, intercepts)
+        coefficients, intercepts = (
+            np.vstack([-coefficients, coefficients]),
+            np.append(-intercepts, intercepts),
+        )
     return coefficients - coefficients.mean(0), intercepts - intercepts.mean()
 
 
 def expanded_head(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
     """A head for all `classes`, of which `present` were trained; as Network.expand_head."""
-    all_weight, all_bias = np.zeros((classes, weight.shape[1]), np.float32), np.full(classes, ABSENT, np.float32)
+    all_weight, all_bias = (
+        np.zeros((classes, weight.shape[1]), np.float32),
+        np.full(classes, ABSENT, np.float32),
+    )
     all_weight[present], all_bias[present] = weight - weight.mean(axis=0), bias - bias.mean()
     return all_weight, all_bias

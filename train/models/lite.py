@@ -1,9 +1,11 @@
-"""LITE, a small network for time series with hand-crafted filters. In: an Effort. Out: the METHOD lite.
+"""LITE, a small network for time series with hand-crafted filters. In: an Effort. Out: the METHOD
+lite.
 
-Three convolutions of 32 filters and 40, 20 and 10 frames beside fixed detectors of rise, fall and peak, then two
-depthwise separable ones and a mean over time (Ismail-Fawaz et al. 2023, "LITE"). With several taxels the first layer is
-separable too, and each taxel has the detectors (Ismail-Fawaz et al. 2024, "Look Into the LITE"). Not as there: one network,
-not five together; trained as our own are, not for 1,500 epochs; a stride in the first layer where windows are long.
+Three convolutions of 32 filters and 40, 20 and 10 frames beside fixed detectors of rise, fall and
+peak, then two depthwise separable ones and a mean over time (Ismail-Fawaz et al. 2023, "LITE").
+With several taxels the first layer is separable too, and each taxel has the detectors (Ismail-Fawaz
+et al. 2024, "Look Into the LITE"). Not as there: one network, not five together; trained as our own
+are, not for 1,500 epochs; a stride in the first layer where windows are long.
 """
 
 from __future__ import annotations
@@ -38,10 +40,21 @@ STEPS = 256
 
 
 class SameConv(nn.Conv1d):
-    """A convolution without bias, with zeros at both ends: of T steps, T / stride are left, rounded up."""
+    """A convolution without bias, with zeros at both ends: of T steps, T / stride are left, rounded
+    up."""
 
-    def __init__(self, channels: int, filters: int, taps: int, stride: int = 1, dilation: int = 1, groups: int = 1):
-        super().__init__(channels, filters, taps, stride, dilation=dilation, groups=groups, bias=False)
+    def __init__(
+        self,
+        channels: int,
+        filters: int,
+        taps: int,
+        stride: int = 1,
+        dilation: int = 1,
+        groups: int = 1,
+    ):
+        super().__init__(
+            channels, filters, taps, stride, dilation=dilation, groups=groups, bias=False
+        )
 
     def ends(self, steps: int) -> tuple[int, int]:
         """Zeros before and after so many steps."""
@@ -61,7 +74,8 @@ def rise_and_fall(frames: int) -> Array:
 
 
 def peak(frames: int) -> Array:
-    """One filter [1, 1.5 * frames]: a hump between two hollows of half its height; `frames` is a multiple of four."""
+    """One filter [1, 1.5 * frames]: a hump between two hollows of half its height; `frames` is a
+    multiple of four."""
     flank = (np.arange(1, frames // 4 + 1) / (frames // 4)) ** 2
     hump = np.concatenate([flank, flank[::-1]])
     filters: Array = np.concatenate([-hump, 2 * hump, -hump])[None]
@@ -77,7 +91,8 @@ def fixed(filters: Array, taxels: int, stride: int) -> SameConv:
 
 
 def separable(channels: int, taps: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """A kernel for each channel, FILTERS mixtures of them, batch norm; a single channel is not mixed but has FILTERS kernels."""
+    """A kernel for each channel, FILTERS mixtures of them, batch norm; a single channel is not
+    mixed but has FILTERS kernels."""
     if channels == 1:
         return nn.Sequential(SameConv(1, FILTERS, taps, stride, dilation), nn.BatchNorm1d(FILTERS))
     depthwise = SameConv(channels, channels, taps, stride, dilation, groups=channels)
@@ -105,14 +120,18 @@ class Lite(Network):
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] -> means over time [B, FILTERS]."""
         found = [layer(prepared) for layer in self.learnt]
-        found += [norm(conv(prepared).relu()) for conv, norm in zip(self.detectors, self.norms, strict=True)]
+        found += [
+            norm(conv(prepared).relu())
+            for conv, norm in zip(self.detectors, self.norms, strict=True)
+        ]
         x = torch.cat(found, 1).relu()
         for layer in self.later:
             x = layer(x).relu()
         return x.mean(2)
 
     def graph(self) -> onnx.ModelProto:
-        """`sweep` -> `logits` float32 [1, K]; batch norms are folded into the convolutions before them where they can be."""
+        """`sweep` -> `logits` float32 [1, K]; batch norms are folded into the convolutions before
+        them where they can be."""
         g, frames = GraphBuilder(), self.form.window
         sweep = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
         parts = [g("Relu", _convolved(g, sweep, layer, frames)) for layer in self.learnt]
@@ -128,7 +147,8 @@ class Lite(Network):
 
 
 def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
-    """Nodes of a SameConv, or of those of `separable`, over so many steps; a batch norm is folded into the one before."""
+    """Nodes of a SameConv, or of those of `separable`, over so many steps; a batch norm is folded
+    into the one before."""
     convs: list[nn.Conv1d] = []
     for one in [*layer.children()] or [layer]:
         if isinstance(one, nn.BatchNorm1d):
@@ -138,9 +158,20 @@ def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
             convs.append(one)
     for conv in convs:
         assert isinstance(conv, SameConv)
-        constants = [g.constant(value.detach().numpy()) for value in (conv.weight, conv.bias) if value is not None]
-        x = g("Conv", x, *constants, pads=list(conv.ends(steps)), strides=list(conv.stride),
-              dilations=list(conv.dilation), group=conv.groups)  # fmt: skip
+        constants = [
+            g.constant(value.detach().numpy())
+            for value in (conv.weight, conv.bias)
+            if value is not None
+        ]
+        x = g(
+            "Conv",
+            x,
+            *constants,
+            pads=list(conv.ends(steps)),
+            strides=list(conv.stride),
+            dilations=list(conv.dilation),
+            group=conv.groups,
+        )
         steps = -(-steps // conv.stride[0])
     return x
 
@@ -157,14 +188,17 @@ def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
 
 
 def build(form: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact network."""
+    """The network with random weights; each taxel's mean is subtracted, as in the compact
+    network."""
     return Lite(form, classes, texture_scale(samples))
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The method, trained with this effort. log: called after every iteration."""
     about = "LITE, 10,000 weights, some filters hand-crafted (Ismail-Fawaz et al. 2023, 2024); also in int8"
-    return (network_method("lite", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),)
+    return (
+        network_method("lite", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),
+    )
 
 
 METHODS = methods()

@@ -1,6 +1,8 @@
-"""All methods that name a material, behind one interface. In: a name. Out: a Method, which trains Models.
+"""All methods that name a material, behind one interface. In: a name. Out: a Method, which trains
+Models.
 
-A model classifies many sweeps at once on the desktop, and gives the ONNX graph with which the box gives the same answers.
+A model classifies many sweeps at once on the desktop, and gives the ONNX graph with which the box
+gives the same answers.
 """
 
 from __future__ import annotations
@@ -53,9 +55,10 @@ MODULES = (
 class Effort:
     """How long networks are trained, for all of them.
 
-    share: of each network's default iterations. paper_steps: of the paper's CNN; None for the paper's 4,000 on a GPU and
-    fewer on a processor. bfloat16: compute the paper's CNN in it, where the processor can. unfinished: a file that keeps
-    the training of the paper's CNN from time to time, so that it goes on after an interruption.
+    share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
+    paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in it, where
+    the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
+    time, so that it goes on after an interruption.
     """
 
     share: float = 1.0
@@ -68,21 +71,24 @@ FULL_EFFORT = Effort()
 
 
 class Model(Protocol):
-    """A trained method. K: number of the training set's materials, whether or not each occurred in training.
+    """A trained method. K: number of the training set's materials, whether or not each occurred in
+    training.
 
-    It may have further attributes, which train.evaluation.fold reads: `ran` (what was computed), `cost` (of the training)
-    and `forms`, the same model in other precisions as Models by name.
+    It may have further attributes, which train.evaluation.fold reads: `ran` (what was computed),
+    `cost` (of the training) and `forms`, the same model in other precisions as Models by name.
     """
 
     def logits(self, inputs: Array) -> Array:
         """Inputs of n sweeps -> float32 [n, K]; their softmax are calibrated probabilities.
 
-        inputs: raw counts [n, T, R, C] where the method's `input` is "raw", else features float32 [n, F].
+        inputs: raw counts [n, T, R, C] where the method's `input` is "raw", else features float32
+        [n, F].
         """
         ...
 
     def graph(self) -> onnx.ModelProto:
-        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32 [1, K].
+        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32
+        [1, K].
 
         Raises FormatError where the method runs in its `library` alone.
         """
@@ -93,10 +99,11 @@ class Model(Protocol):
 class Method:
     """One way to name a material.
 
-    about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS. train: (training sweeps, their
-    model_inputs, seed) -> Model; the same arguments give the same model. extra: the optional dependency that it needs,
-    named as in train/pyproject.toml. effort: what an Effort changes in it. library: what runs its models where they have
-    no graph; they are timed there and cannot be packed.
+    about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS. train:
+    (training sweeps, their model_inputs, seed) -> Model; the same arguments give the same model.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: what an
+    Effort changes in it. library: what runs its models where they have no graph; they are timed
+    there and cannot be packed.
     """
 
     name: str
@@ -109,7 +116,8 @@ class Method:
 
     @property
     def why_not_on_the_box(self) -> str:
-        """Why the box cannot run it: no graph, or features that the box does not compute; "" where it can."""
+        """Why the box cannot run it: no graph, or features that the box does not compute; "" where
+        it can."""
         if self.library:
             return f"runs in {self.library} alone and has no graph"
         if self.input != "raw" and self.input not in features.KINDS:
@@ -127,7 +135,8 @@ def no_log(line: str) -> None:
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:
-    """What a method with the input `kind` takes of `sweeps`: raw counts [N, T, R, C], or features float32 [N, F]."""
+    """What a method with the input `kind` takes of `sweeps`: raw counts [N, T, R, C], or features
+    float32 [N, F]."""
     if kind == "raw":
         return sweeps.samples
     return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
@@ -140,7 +149,11 @@ def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
 
 def module_of(name: str) -> str:
     """The full name of the module that defines the method `name`, which must exist."""
-    return next(module for module in MODULES if name in {m.name for m in _of(import_module(module), FULL_EFFORT)})
+    return next(
+        module
+        for module in MODULES
+        if name in {m.name for m in _of(import_module(module), FULL_EFFORT)}
+    )
 
 
 def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
@@ -153,5 +166,7 @@ def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
 
 
 def _of(module: ModuleType, effort: Effort) -> Iterable[Method]:
-    found: Iterable[Method] = module.methods(effort) if hasattr(module, "methods") else module.METHODS
+    found: Iterable[Method] = (
+        module.methods(effort) if hasattr(module, "methods") else module.METHODS
+    )
     return found

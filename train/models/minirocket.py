@@ -1,6 +1,8 @@
-"""MiniRocket, the usual alternative for time series. In: sweeps. Out: the METHOD minirocket, aeon's transform and ridge.
+"""MiniRocket, the usual alternative for time series. In: sweeps. Out: the METHOD minirocket, aeon's
+transform and ridge.
 
-aeon fits the transform; its parameters are written as a graph, to which the head is fitted and which runs on the box.
+aeon fits the transform; its parameters are written as a graph, to which the head is fitted and
+which runs on the box.
 """
 
 from __future__ import annotations
@@ -24,57 +26,81 @@ from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
-"""Length of a kernel, and the 84 kernels: which three of the nine taps are 2, the others -1 (Dempster et al., sec. 3.1)."""
+"""Length of a kernel, and the 84 kernels: which three of the nine taps are 2, the others -1
+(Dempster et al., sec. 3.1)."""
 FEATURES = 10_000
 """The default of aeon and of Dempster et al.; rounded down to a multiple of 84."""
 ALPHAS = np.logspace(-3, 3, 10)
-"""Ridge penalties that leave-one-out chooses from, as in aeon's MiniRocketClassifier and the authors' code."""
+"""Ridge penalties that leave-one-out chooses from, as in aeon's MiniRocketClassifier and the
+authors' code."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
-    Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too few.
+    Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too
+    few.
     """
     return train_linear_head(
-        transform(sweeps.require_materials().format, fitted(inputs, seed)), _ridge, sweeps, inputs, seed
+        transform(sweeps.require_materials().format, fitted(inputs, seed)),
+        _ridge,
+        sweeps,
+        inputs,
+        seed,
     )
 
 
 def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
-    """aeon's parameters of the transform, fitted to raw counts [N, T, R, C]; see `transform` for what they are.
+    """aeon's parameters of the transform, fitted to raw counts [N, T, R, C]; see `transform` for
+    what they are.
 
     numpy's global random state, which aeon seeds, is restored. Raises FormatError as `train`.
     """
     if inputs.shape[1] < LENGTH:
-        raise FormatError(f"a window of {inputs.shape[1]} frames is too short for minirocket; record at least {LENGTH}")
+        raise FormatError(
+            f"a window of {inputs.shape[1]} frames is too short for minirocket; record at least {LENGTH}"
+        )
     try:
         from aeon.transformations.collection.convolution_based import MiniRocket
     except ImportError as e:
-        raise FormatError(f"minirocket needs aeon ({e}); try pip install 'palpate-train[minirocket]'") from e
+        raise FormatError(
+            f"minirocket needs aeon ({e}); try pip install 'palpate-train[minirocket]'"
+        ) from e
     # in C order: for any other numba compiles again
-    series = np.ascontiguousarray(inputs.reshape(*inputs.shape[:2], -1).transpose(0, 2, 1), np.float32)
+    series = np.ascontiguousarray(
+        inputs.reshape(*inputs.shape[:2], -1).transpose(0, 2, 1), np.float32
+    )
     before = np.random.get_state()
     try:
-        found: tuple[Array, ...] = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series).parameters
+        found: tuple[Array, ...] = (
+            MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series).parameters
+        )
     finally:
         np.random.set_state(before)
     return found
 
 
 def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:
-    """The fitted transform as a graph: `sweep` -> `features` float32 [1, F], each the share of frames above a bias.
+    """The fitted transform as a graph: `sweep` -> `features` float32 [1, F], each the share of
+    frames above a bias.
 
-    parameters: for each dilation and kernel the number of taxels; those taxels one after another; the dilations [D]; the
-    number of biases of each kernel per dilation [D]; the biases [F] by dilation and kernel, as the features are. Where
-    dilation number plus kernel number is even, the window is padded with zeros; else the kernel stays within it.
+    parameters: for each dilation and kernel the number of taxels; those taxels one after another;
+    the dilations [D]; the number of biases of each kernel per dilation [D]; the biases [F] by
+    dilation and kernel, as the features are. Where dilation number plus kernel number is even, the
+    window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
     g, size, at = GraphBuilder(), form.channels, 0
     chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
-    x = g("Cast", g("Reshape", "sweep", g.constant([1, form.window, size], "int64")), to=TensorProto.FLOAT)
+    x = g(
+        "Cast",
+        g("Reshape", "sweep", g.constant([1, form.window, size], "int64")),
+        to=TensorProto.FLOAT,
+    )
     x, parts = g("Transpose", x, perm=[0, 2, 1]), []
-    for number, (dilation, n) in enumerate(zip(dilations.tolist(), per_kernel.tolist(), strict=True)):
+    for number, (dilation, n) in enumerate(
+        zip(dilations.tolist(), per_kernel.tolist(), strict=True)
+    ):
         weights = np.zeros((len(KERNELS), size, LENGTH))
         for weight, kernel in zip(weights, KERNELS, strict=True):
             weight[next(chosen)] = np.where(np.isin(np.arange(LENGTH), kernel), 2, -1)
@@ -82,9 +108,19 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
         at, halves = at + bias.size, []
         for half in (0, 1):
             padding = 0 if (number + half) % 2 else LENGTH // 2 * dilation
-            y = g("Conv", x, g.constant(weights[half::2]), dilations=[dilation], pads=[padding, padding])
-            above = g("Greater", g("Unsqueeze", y, g.constant([2, 3], "int64")), g.constant(bias[half::2]))
-            halves.append(g("ReduceMean", g("Cast", above, to=TensorProto.FLOAT), axes=[4], keepdims=0))
+            y = g(
+                "Conv",
+                x,
+                g.constant(weights[half::2]),
+                dilations=[dilation],
+                pads=[padding, padding],
+            )
+            above = g(
+                "Greater", g("Unsqueeze", y, g.constant([2, 3], "int64")), g.constant(bias[half::2])
+            )
+            halves.append(
+                g("ReduceMean", g("Cast", above, to=TensorProto.FLOAT), axes=[4], keepdims=0)
+            )
         parts.append(g("Flatten", g("Concat", *halves, axis=2)))
     g("Concat", *parts, axis=1, output="features")
     return g.model(form, "features", len(biases))
@@ -97,4 +133,12 @@ def _ridge(features: Array, labels: Array) -> tuple[Array, Array]:
     return ridge.coef_ / scaler.scale_, ridge.intercept_
 
 
-METHODS = (Method("minirocket", "MiniRocket of aeon + ridge (Dempster et al. 2021)", "raw", train, "minirocket"),)
+METHODS = (
+    Method(
+        "minirocket",
+        "MiniRocket of aeon + ridge (Dempster et al. 2021)",
+        "raw",
+        train,
+        "minirocket",
+    ),
+)

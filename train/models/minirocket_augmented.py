@@ -1,4 +1,5 @@
-"""MiniRocket with the augmented copies that our own training gets. In: sweeps. Out: the METHOD minirocket-augmented.
+"""MiniRocket with the augmented copies that our own training gets. In: sweeps. Out: the METHOD
+minirocket-augmented.
 
 Beside `minirocket` it shows what is owed to the augmentation and what to the features.
 """
@@ -22,16 +23,20 @@ from train.models.methods import Method
 
 Array = NDArray[Any]
 COPIES = 2
-"""Of each training sweep, beside itself: as many as the closed-form head of the compact network sees."""
+"""Of each training sweep, beside itself: as many as the closed-form head of the compact network
+sees."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
-    """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`, and COPIES of them.
+    """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`, and COPIES of
+    them.
 
-    A copy belongs to the recording of its sweep, so that none of what is held out for the temperature is trained on.
-    Raises FormatError as minirocket.train does.
+    A copy belongs to the recording of its sweep, so that none of what is held out for the
+    temperature is trained on. Raises FormatError as minirocket.train does.
     """
-    known = replace(sweeps, samples=inputs, groups=sweeps.groups | {"recording": sweeps.group("recording")})
+    known = replace(
+        sweeps, samples=inputs, groups=sweeps.groups | {"recording": sweeps.group("recording")}
+    )
     changed = copies(known, augmentation(known.format.window), seed, COPIES)
     samples = np.concatenate([inputs, *(copy.samples for copy in changed)])
     several = replace(known.take(np.tile(np.arange(len(known)), COPIES + 1)), samples=samples)
@@ -39,7 +44,8 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 
 def augmentation(window: int) -> Augmentation:
-    """That of our own training for a window of so many frames; of one that our networks cannot take, as for slow sensors."""
+    """That of our own training for a window of so many frames; of one that our networks cannot
+    take, as for slow sensors."""
     try:
         return default_augmentation(DEFAULT.zero_sum(window))
     except FormatError:

@@ -1,7 +1,8 @@
-"""What all networks share. In: the form of a sweep. Out: the base class Network, which writes its own ONNX graph.
+"""What all networks share. In: the form of a sweep. Out: the base class Network, which writes its
+own ONNX graph.
 
-A network has a linear head on features of a sweep; `prepare` scales raw counts for the convolutions. Graphs are built
-with train.onnx_tools.graph_builder and take the sensor's raw counts.
+A network has a linear head on features of a sweep; `prepare` scales raw counts for the
+convolutions. Graphs are built with train.onnx_tools.graph_builder and take the sensor's raw counts.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ Array = NDArray[Any]
 class Network(nn.Module, ABC):
     """Base class of all networks.
 
-    scale: brings raw counts to about 1 after `offset` (None: each taxel's own mean) is subtracted. dropout: share of the
-    features that the head does not see in a training step.
+    scale: brings raw counts to about 1 after `offset` (None: each taxel's own mean) is subtracted.
+    dropout: share of the features that the head does not see in a training step.
     """
 
     head: nn.Linear
@@ -45,8 +46,11 @@ class Network(nn.Module, ABC):
         """[B, R * C, T] as `prepare` gives -> what the head sees of it [B, F]."""
 
     def training_logits(self, prepared: Tensor) -> Tensor:
-        """[B, R * C, T] as `prepare` gives -> logits [B, K]; with dropout before the head while training."""
-        logits: Tensor = self.head(functional.dropout(self.features(prepared), self.dropout, self.training))
+        """[B, R * C, T] as `prepare` gives -> logits [B, K]; with dropout before the head while
+        training."""
+        logits: Tensor = self.head(
+            functional.dropout(self.features(prepared), self.dropout, self.training)
+        )
         return logits
 
     def head_input(self, counts: Tensor) -> Tensor:
@@ -64,11 +68,16 @@ class Network(nn.Module, ABC):
 
     @torch.no_grad()
     def expand_head(self, present: Array, classes: int, temperature: float) -> None:
-        """Replace the head by one for all `classes`, of which `present` were trained; logits are divided by `temperature`.
+        """Replace the head by one for all `classes`, of which `present` were trained; logits are
+        divided by `temperature`.
 
-        The trained logits are shifted to sum to 0, which changes no softmax; ABSENT lies far below the largest of them.
+        The trained logits are shifted to sum to 0, which changes no softmax; ABSENT lies far below
+        the largest of them.
         """
-        old, new = self.head, nn.utils.skip_init(nn.Linear, self.head.in_features, classes)  # draws no random numbers
+        old, new = (
+            self.head,
+            nn.utils.skip_init(nn.Linear, self.head.in_features, classes),
+        )  # draws no random numbers
         new.weight.zero_()
         new.bias.fill_(ABSENT)
         new.weight[present] = (old.weight - old.weight.mean(0)) / temperature

@@ -1,4 +1,5 @@
-"""The paper's CNN and TactNet-II. In: an Effort. Out: the METHODS paper-cnn, paper-cnn-centred and tactnet2.
+"""The paper's CNN and TactNet-II. In: an Effort. Out: the METHODS paper-cnn, paper-cnn-centred and
+tactnet2.
 
 Both convolve over one image, time by taxels; the layers of each are an ImageLayers.
 """
@@ -28,23 +29,43 @@ from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
-"""Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, where one core needs about a
-second and a half for each."""
-PAPER_RECIPE = TrainingRecipe(batch=50, peak_rate=1e-4, weight_decay=0.0, smoothing=0.0, ema=0.0, dropout=0.25, noise=0.0,
-                              gain=0.0, cycle=False)  # fmt: skip
+"""Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, where one
+core needs about a second and a half for each."""
+PAPER_RECIPE = TrainingRecipe(
+    batch=50,
+    peak_rate=1e-4,
+    weight_decay=0.0,
+    smoothing=0.0,
+    ema=0.0,
+    dropout=0.25,
+    noise=0.0,
+    gain=0.0,
+    cycle=False,
+)
 """As printed (section IV.D); the paper's p_d = .75 is the share that is kept."""
 INT8_NODES = ("Conv", "Relu", "MaxPool", "Gemm")
 """Kinds of nodes that the int8 form of the paper's CNN has in int8."""
-TACTNET2_RECIPE = TrainingRecipe(steps=120, batch=32, peak_rate=2e-3, smoothing=0.0, ema=0.9, dropout=0.5, noise=0.0,
-                                 gain=0.0, adversarial=0.01)  # fmt: skip
-"""Adversarial training as in Goodfellow et al. 2015, half of the cost; dropout as in Gal and Ghahramani 2016. The numbers
-are our choice, so that one core needs about half a minute for 480 sweeps; an adversarial step larger than .01 only cost
-accuracy on positions held out inside a training set."""
+TACTNET2_RECIPE = TrainingRecipe(
+    steps=120,
+    batch=32,
+    peak_rate=2e-3,
+    smoothing=0.0,
+    ema=0.9,
+    dropout=0.5,
+    noise=0.0,
+    gain=0.0,
+    adversarial=0.01,
+)
+"""Adversarial training as in Goodfellow et al. 2015, half of the cost; dropout as in Gal and
+Ghahramani 2016. The numbers are our choice, so that one core needs about half a minute for 480
+sweeps; an adversarial step larger than .01 only cost accuracy on positions held out inside a
+training set."""
 
 
 @dataclass(frozen=True)
 class ImageLayers:
-    """Layers of an ImageNetwork. channels: of each convolution; strides: of each in (time, taxels); pool: in time.
+    """Layers of an ImageNetwork. channels: of each convolution; strides: of each in (time, taxels);
+    pool: in time.
 
     norm: whether batch norms follow the convolutions. dense: neurons of the layer before the head.
     """
@@ -60,7 +81,9 @@ KERNEL = (15, 5)
 """Of the paper's convolutions, frames by taxels (table I)."""
 PAPER = ImageLayers(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
 """The paper's CNN (eq. 6 to 9, table I)."""
-TACTNET2 = ImageLayers(channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024)
+TACTNET2 = ImageLayers(
+    channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024
+)
 """TactNet-II as far as it is published: three convolutions, batch norm, 1.84 M parameters (Tulbure and Baeuml 2018; here
 1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its predecessor. Channels, the dense layer and strides
 are our choice; the strides replace most of the pooling, at a twentieth of the work."""
@@ -73,13 +96,22 @@ class ImageNetwork(Network):
     """
 
     def __init__(
-        self, form: SweepFormat, classes: int, scale: float, offset: float | None, layers: ImageLayers
+        self,
+        form: SweepFormat,
+        classes: int,
+        scale: float,
+        offset: float | None,
+        layers: ImageLayers,
     ) -> None:
         super().__init__(form, scale, offset)
         self.layers, steps, taxels = layers, form.window, form.channels
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
-        for before, after, by in zip((1, *layers.channels), layers.channels, layers.strides, strict=False):
-            self.convs.append(nn.Conv2d(before, after, KERNEL, by, padding=(KERNEL[0] // 2, KERNEL[1] // 2)))
+        for before, after, by in zip(
+            (1, *layers.channels), layers.channels, layers.strides, strict=False
+        ):
+            self.convs.append(
+                nn.Conv2d(before, after, KERNEL, by, padding=(KERNEL[0] // 2, KERNEL[1] // 2))
+            )
             self.norms.append(nn.BatchNorm2d(after) if layers.norm else nn.Identity())
             steps, taxels = ceil(ceil(steps / by[0]) / layers.pool), ceil(taxels / by[1])
         self.dense = nn.Linear(layers.channels[-1] * steps * taxels, layers.dense)
@@ -111,22 +143,35 @@ class ImageNetwork(Network):
             x = g("Transpose", centred(g, form)[0], perm=[0, 2, 1])
         else:
             x = g("Sub", g("Cast", "sweep", to=TensorProto.FLOAT), g.constant(self.offset))
-        x = g("Mul", g("Reshape", x, g.constant([1, 1, steps, taxels], "int64")), g.constant(self.scale))
+        x = g(
+            "Mul",
+            g("Reshape", x, g.constant([1, 1, steps, taxels], "int64")),
+            g.constant(self.scale),
+        )
         for conv, norm in self._convolutions():
             if isinstance(norm, nn.BatchNorm2d):
                 conv = fuse_conv_bn_eval(conv.eval(), norm.eval())
             padding = [KERNEL[0] // 2, KERNEL[1] // 2]
             x = g("Conv", x, *layer_constants(g, conv), pads=padding * 2, strides=list(conv.stride))
             steps = ceil(steps / conv.stride[0])
-            x = g("MaxPool", g("Relu", x), kernel_shape=[pool, 1], strides=[pool, 1], pads=[0, 0, -steps % pool, 0])
+            x = g(
+                "MaxPool",
+                g("Relu", x),
+                kernel_shape=[pool, 1],
+                strides=[pool, 1],
+                pads=[0, 0, -steps % pool, 0],
+            )
             steps = ceil(steps / pool)
         x = g("Relu", g("Gemm", g("Flatten", x), *layer_constants(g, self.dense), transB=1))
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
         return g.model(form, "logits", classes)
 
 
-def build_paper_cnn(form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER) -> Network:
-    """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`, since no scale is printed.
+def build_paper_cnn(
+    form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
+) -> Network:
+    """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`, since
+    no scale is printed.
 
     15,891,910 parameters for 1500 x 4 x 4 and six materials.
     """
@@ -135,22 +180,27 @@ def build_paper_cnn(form: SweepFormat, classes: int, samples: Array, layers: Ima
     return ImageNetwork(form, classes, scale, mean, layers)
 
 
-def build_centred(form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER) -> Network:
-    """The paper's CNN behind a layer that subtracts each taxel's mean, as in the compact network."""
+def build_centred(
+    form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
+) -> Network:
+    """The paper's CNN behind a layer that subtracts each taxel's mean, as in the compact
+    network."""
     return ImageNetwork(form, classes, texture_scale(samples), None, layers)
 
 
 def build_tactnet2(form: SweepFormat, classes: int, samples: Array) -> Network:
-    """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted, as in the compact network.
+    """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted, as in the
+    compact network.
 
-    Dropout is off at test time, on the box and here: the mean field of the published Monte Carlo dropout, so that the
-    same sweep always gets the same answer.
+    Dropout is off at test time, on the box and here: the mean field of the published Monte Carlo
+    dropout, so that the same sweep always gets the same answer.
     """
     return ImageNetwork(form, classes, texture_scale(samples), None, TACTNET2)
 
 
 def random_paper_cnn(form: SweepFormat, classes: int, rng: np.random.Generator) -> onnx.ModelProto:
-    """The graph of the paper's CNN with random weights: a reference model for time and memory, not for accuracy."""
+    """The graph of the paper's CNN with random weights: a reference model for time and memory, not
+    for accuracy."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         return ImageNetwork(form, classes, 1 / 255, 0.0, PAPER).graph()
@@ -160,17 +210,36 @@ def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ..
     """The methods, trained with this effort. log: called after every iteration."""
     steps = effort.paper_steps
     if steps is None:
-        steps = round((PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS) * effort.share)
+        steps = round(
+            (PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS) * effort.share
+        )
     recipe = replace(PAPER_RECIPE, steps=max(steps, MIN_STEPS))
 
     def paper(name: str, about: str, build: Build) -> Method:
         """As printed: trained on everything, so that no temperature is found."""
-        return network_method(name, about, build, recipe, log, calibrated=False, bfloat16=effort.bfloat16,
-                              int8=INT8_NODES, unfinished=effort.unfinished)  # fmt: skip
+        return network_method(
+            name,
+            about,
+            build,
+            recipe,
+            log,
+            calibrated=False,
+            bfloat16=effort.bfloat16,
+            int8=INT8_NODES,
+            unfinished=effort.unfinished,
+        )
 
     return (
-        paper("paper-cnn", f"the paper's CNN on raw counts (section IV), {recipe.steps} iterations", build_paper_cnn),
-        paper("paper-cnn-centred", "the paper's CNN behind a layer that subtracts each taxel's mean", build_centred),
+        paper(
+            "paper-cnn",
+            f"the paper's CNN on raw counts (section IV), {recipe.steps} iterations",
+            build_paper_cnn,
+        ),
+        paper(
+            "paper-cnn-centred",
+            "the paper's CNN behind a layer that subtracts each taxel's mean",
+            build_centred,
+        ),
         network_method(
             "tactnet2",
             "TactNet-II as far as it is published (Tulbure and Baeuml 2018)",

@@ -1,7 +1,9 @@
-"""Methods of the work that the paper compares itself with. In: features of training sweeps. Out: METHODS, `explore`.
+"""Methods of the work that the paper compares itself with. In: features of training sweeps. Out:
+METHODS, `explore`.
 
-train.features.prior_work computes their features as far as a pressure skin allows, baselines.learn trains them. `explore`
-is the exploration of Xu et al. 2013, for any method: sweeps are added until the posterior is high enough.
+train.features.prior_work computes their features as far as a pressure skin allows, baselines.learn
+trains them. `explore` is the exploration of Xu et al. 2013, for any method: sweeps are added until
+the posterior is high enough.
 """
 
 from __future__ import annotations
@@ -45,23 +47,29 @@ METHODS = (
         partial(learn, svm),
     ),
 )
-"""Fishel and Loeb measured one property at a time, so their likelihoods are multiplied. SVMs are those of baselines.svm;
-that of Hoelscher et al. is linear."""
+"""Fishel and Loeb measured one property at a time, so their likelihoods are multiplied. SVMs are
+those of baselines.svm; that of Hoelscher et al. is linear."""
 
 
 def explore(log_probabilities: Array, min_posterior: float) -> tuple[int, int]:
-    """One object, sweep after sweep, until a label's posterior reaches `min_posterior`: (label, sweeps used).
+    """One object, sweep after sweep, until a label's posterior reaches `min_posterior`: (label,
+    sweeps used).
 
-    log_probabilities: [S, K] of its S sweeps in the order in which they are made. Priors are equal and sweeps independent,
-    so that log probabilities add (Xu et al. 2013; the product that the box computes). A probability counts as at least
-    1e-12, as on the box. Where no posterior is high enough all sweeps are used.
-    Raises FormatError where there is no sweep, or `min_posterior` is not a probability.
+    log_probabilities: [S, K] of its S sweeps in the order in which they are made. Priors are equal
+    and sweeps independent, so that log probabilities add (Xu et al. 2013; the product that the box
+    computes). A probability counts as at least 1e-12, as on the box. Where no posterior is high
+    enough all sweeps are used. Raises FormatError where there is no sweep, or `min_posterior` is
+    not a probability.
     """
     if not 0 < min_posterior <= 1:
-        raise FormatError(f"a posterior of {min_posterior} cannot be reached; use more than 0, at most 1")
+        raise FormatError(
+            f"a posterior of {min_posterior} cannot be reached; use more than 0, at most 1"
+        )
     if log_probabilities.ndim != 2 or 0 in log_probabilities.shape:
         shape = list(log_probabilities.shape)
-        raise FormatError(f"log probabilities have the shape {shape}; give [sweeps, materials], at least one of each")
+        raise FormatError(
+            f"log probabilities have the shape {shape}; give [sweeps, materials], at least one of each"
+        )
     posterior = softmax(np.maximum(log_probabilities, ABSENT).cumsum(axis=0))
     enough = posterior.max(axis=1) >= min_posterior
     last = int(enough.argmax()) if enough.any() else len(enough) - 1

@@ -19,15 +19,18 @@ from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 STATE, PATCHES, MIN_PATCH = 64, 128, 8
-"""Size of the state, number of patches that cover a window (approximately), frames of the shortest patch."""
+"""Size of the state, number of patches that cover a window (approximately), frames of the shortest
+patch."""
 RECIPE = TrainingRecipe(steps=400)
 """That of the compact network with fewer iterations."""
 
 
 class Recurrent(Network):
-    """A gated recurrent unit over patches of time whose channels are the taxels; the head sees its mean state.
+    """A gated recurrent unit over patches of time whose channels are the taxels; the head sees its
+    mean state.
 
-    A patch is two strides long; about PATCHES of them cover the window, whatever its rate and length.
+    A patch is two strides long; about PATCHES of them cover the window, whatever its rate and
+    length.
     """
 
     def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
@@ -49,10 +52,20 @@ class Recurrent(Network):
         x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
         x = g("Relu", g("Conv", x, *layer_constants(g, self.patches), strides=[self.stride]))
         gates = dict(self.unit.named_parameters())
-        from_input, from_state = (_onnx_gate_order(gates[name]) for name in ("weight_ih_l0", "weight_hh_l0"))
-        biases = np.concatenate([_onnx_gate_order(gates[name]) for name in ("bias_ih_l0", "bias_hh_l0")])
+        from_input, from_state = (
+            _onnx_gate_order(gates[name]) for name in ("weight_ih_l0", "weight_hh_l0")
+        )
+        biases = np.concatenate(
+            [_onnx_gate_order(gates[name]) for name in ("bias_ih_l0", "bias_hh_l0")]
+        )
         weights = [g.constant(w[None]) for w in (from_input, from_state, biases)]
-        x = g("GRU", g("Transpose", x, perm=[2, 0, 1]), *weights, hidden_size=STATE, linear_before_reset=1)
+        x = g(
+            "GRU",
+            g("Transpose", x, perm=[2, 0, 1]),
+            *weights,
+            hidden_size=STATE,
+            linear_before_reset=1,
+        )
         x = g("Reshape", g("ReduceMean", x, axes=[0]), g.constant([1, STATE], "int64"))
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
         return g.model(self.form, "logits", self.head.out_features)
@@ -65,7 +78,8 @@ def _onnx_gate_order(gates: Tensor) -> Array:
 
 
 def build_recurrent(form: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact network."""
+    """The network with random weights; each taxel's mean is subtracted, as in the compact
+    network."""
     return Recurrent(form, classes, texture_scale(samples))
 
 

@@ -1,12 +1,15 @@
-"""ST-HMP, learned dictionaries. In: sweeps. Out: the METHOD st-hmp, a graph of pooled sparse codes with a linear SVM.
+"""ST-HMP, learned dictionaries. In: sweeps. Out: the METHOD st-hmp, a graph of pooled sparse codes
+with a linear SVM.
 
-Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011 and ISER 2012. The text
-of 2014 was not available; from the others: a dictionary learned with K-SVD on patches less their means, orthogonal
-matching pursuit with a fixed number of atoms, codes split by sign, the largest of each over a pyramid of cells in space
-and in time, each cell divided by its length (contrast normalisation), a linear SVM. Our adaptation to a skin that slides
-instead of a hand that closes: texture is in time, so a patch has several frames as well as taxels; its taxels are its
-channels, and each loses its own mean, as colours do in their work; the grid is hardly larger than one patch, so there is
-one layer. Several axes of a taxel are columns beside each other, which a patch holds together.
+Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011
+and ISER 2012. The text of 2014 was not available; from the others: a dictionary learned with K-SVD
+on patches less their means, orthogonal matching pursuit with a fixed number of atoms, codes split
+by sign, the largest of each over a pyramid of cells in space and in time, each cell divided by its
+length (contrast normalisation), a linear SVM. Our adaptation to a skin that slides instead of a
+hand that closes: texture is in time, so a patch has several frames as well as taxels; its taxels
+are its channels, and each loses its own mean, as colours do in their work; the grid is hardly
+larger than one patch, so there is one layer. Several axes of a taxel are columns beside each other,
+which a patch holds together.
 """
 
 from __future__ import annotations
@@ -28,8 +31,9 @@ from train.onnx_tools.graph_builder import GraphBuilder, run
 
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
-"""Of a patch: frames, taxels along each axis, and frames from one to the next. Fixed before any data was examined, half as
-long as the compact network's first kernel. A short window's patches are half as long as it, and none is wider than the grid."""
+"""Of a patch: frames, taxels along each axis, and frames from one to the next. Fixed before any
+data was examined, half as long as the compact network's first kernel. A short window's patches are
+half as long as it, and none is wider than the grid."""
 MIN_WINDOW = 8
 """Frames of the shortest window."""
 ATOMS, ACTIVE = 100, 4
@@ -37,10 +41,11 @@ ATOMS, ACTIVE = 100, 4
 SAMPLED, ROUNDS = 4000, 8
 """Patches that the dictionary is learned from, and rounds of K-SVD."""
 MIN_RESIDUAL = 0.01
-"""Smallest squared length, of 1, of an atom's part orthogonal to those chosen before; smaller values are raised to it, so
-that division is safe."""
+"""Smallest squared length, of 1, of an atom's part orthogonal to those chosen before; smaller
+values are raised to it, so that division is safe."""
 LEVELS = (1, 2, 4)
-"""Of the pyramid in time: parts of the window. In space there are two: the whole grid, and its quarters."""
+"""Of the pyramid in time: parts of the window. In space there are two: the whole grid, and its
+quarters."""
 CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
@@ -52,7 +57,9 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     """
     form = sweeps.require_materials().format
     if form.window < MIN_WINDOW:
-        raise FormatError(f"a window of {form.window} frames is too short for st-hmp; record at least {MIN_WINDOW}")
+        raise FormatError(
+            f"a window of {form.window} frames is too short for st-hmp; record at least {MIN_WINDOW}"
+        )
     rng = np.random.default_rng(seed)
     patches = sample_patches(inputs, rng)
     scale = 1 / max(float(np.sqrt(np.mean(patches**2))), 1e-6)
@@ -61,22 +68,29 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 
 def sample_patches(inputs: Array, rng: np.random.Generator) -> Array:
-    """Patches drawn from raw counts [N, T, R, C] or [N, T, R, C, A]: float64 [SAMPLED, frames, r, c * A], each column less
-    its mean there."""
-    frames, (rows, cols) = min(FRAMES, inputs.shape[1] // 2), (min(SIDE, n) for n in inputs.shape[2:4])
+    """Patches drawn from raw counts [N, T, R, C] or [N, T, R, C, A]: float64 [SAMPLED, frames, r, c
+    * A], each column less its mean there."""
+    frames, (rows, cols) = (
+        min(FRAMES, inputs.shape[1] // 2),
+        (min(SIDE, n) for n in inputs.shape[2:4]),
+    )
     margins = np.array(inputs.shape[:4]) - (1, frames, rows, cols) + 1
     corners = rng.integers(0, margins, (SAMPLED, 4))
-    cut = np.stack([inputs[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]).astype(np.float64)
+    cut = np.stack(
+        [inputs[i, t : t + frames, r : r + rows, c : c + cols] for i, t, r, c in corners]
+    ).astype(np.float64)
     centred: Array = cut - cut.mean(axis=1, keepdims=True)
     return centred.reshape(*centred.shape[:3], -1)
 
 
 def learn_dictionary(patches: Array, rng: np.random.Generator) -> Array:
-    """K-SVD (Aharon, Elad, Bruckstein 2006) on patches [n, frames, r, c]: atoms float32 [ATOMS, frames, r, c].
+    """K-SVD (Aharon, Elad, Bruckstein 2006) on patches [n, frames, r, c]: atoms float32 [ATOMS,
+    frames, r, c].
 
-    Each atom in turn becomes the main direction of the residual, without it, of the patches that use it, by one step of
-    power iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that no patch uses becomes the patch with the largest
-    residual. Atoms have the length 1, or 0 where the patches leave no residual.
+    Each atom in turn becomes the main direction of the residual, without it, of the patches that
+    use it, by one step of power iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that no
+    patch uses becomes the patch with the largest residual. Atoms have the length 1, or 0 where the
+    patches leave no residual.
     """
     x = patches.reshape(len(patches), -1)
     atoms = _unit(x[rng.choice(len(x), ATOMS, replace=False)])
@@ -97,30 +111,44 @@ def learn_dictionary(patches: Array, rng: np.random.Generator) -> Array:
 
 
 def encode(patches: Array, atoms: Array) -> Array:
-    """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, in one long sweep."""
+    """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, in one
+    long sweep."""
     n, frames, rows, cols = patches.shape
     g, form = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
-    g("Reshape", _codes(g, form, atoms, frames, 1.0), g.constant([1, -1], "int64"), output="features")
+    g(
+        "Reshape",
+        _codes(g, form, atoms, frames, 1.0),
+        g.constant([1, -1], "int64"),
+        output="features",
+    )
     sweep = patches.reshape(1, n * frames, rows, cols).astype(np.float32)
     return run(g.model(form, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
 
 
 def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
-    """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above zero and below.
+    """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above
+    zero and below.
 
-    atoms: [ATOMS, frames, r, c * A]. scale: from raw counts to the scale of the patches that the atoms were learned from.
+    atoms: [ATOMS, frames, r, c * A]. scale: from raw counts to the scale of the patches that the
+    atoms were learned from.
     """
     g, steps = GraphBuilder(), (form.window - atoms.shape[1]) // STEP + 1
     rows, cols = form.rows - atoms.shape[2] + 1, form.cols - atoms.shape[3] // form.axes + 1
-    codes = g("Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64"))
+    codes = g(
+        "Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64")
+    )
     both = g("Concat", codes, g("Neg", codes), axis=3)
     times = [part for level in LEVELS if level <= steps for part in _parts(steps, level)]
-    spaces = {(r, c): None for level in (1, 2) for r in _parts(rows, level) for c in _parts(cols, level)}
+    spaces = {
+        (r, c): None for level in (1, 2) for r in _parts(rows, level) for c in _parts(cols, level)
+    }
     cells = []
     for time in times:
         during = g("ReduceMax", _cut(g, both, 0, time), axes=[0])
         for r, c in spaces:
-            cells.append(g("ReduceMax", _cut(g, _cut(g, during, 1, r), 2, c), axes=[1, 2], keepdims=0))
+            cells.append(
+                g("ReduceMax", _cut(g, _cut(g, during, 1, r), 2, c), axes=[1, 2], keepdims=0)
+            )
     above = g("Relu", g("Concat", *cells, axis=0))
     length = g("Sqrt", g("Add", g("ReduceSumSquare", above, axes=[1]), g.constant(CONTRAST)))
     g("Reshape", g("Div", above, length), g.constant([1, -1], "int64"), output="features")
@@ -128,7 +156,8 @@ def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
 
 
 def _parts(n: int, parts: int) -> list[tuple[int, int]]:
-    """`n` positions in so many parts (first, last + 1), which overlap by one where they do not divide evenly."""
+    """`n` positions in so many parts (first, last + 1), which overlap by one where they do not
+    divide evenly."""
     return [(i * n // parts, -(-(i + 1) * n // parts)) for i in range(parts)]
 
 
@@ -138,27 +167,36 @@ def _cut(g: GraphBuilder, x: str, axis: int, part: tuple[int, int]) -> str:
 
 
 def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
-    """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by time, row, column.
+    """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by
+    time, row, column.
 
-    Atoms sum to zero on each taxel, so their products with a patch equal those with the patch less its means: one
-    convolution. After it the pursuit needs only the products of atoms with each other (batch OMP; Rubinstein et al.
-    2008).
+    Atoms sum to zero on each taxel, so their products with a patch equal those with the patch less
+    its means: one convolution. After it the pursuit needs only the products of atoms with each
+    other (batch OMP; Rubinstein et al. 2008).
     """
     flat = atoms.reshape(len(atoms), -1)
     shape = [1, 1, form.window, form.rows, form.cols * form.axes]
     x = g("Cast", g("Reshape", "sweep", g.constant(shape, "int64")), to=TensorProto.FLOAT)
     products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, form.axes])
-    left = g("Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0])
+    left = g(
+        "Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0]
+    )
     return _pursuit(g, left, flat @ flat.T)
 
 
 def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
-    """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms, `gram` [K, K].
+    """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms,
+    `gram` [K, K].
 
-    The atoms that a patch chooses are made orthogonal one after another (Cholesky); a direction is represented by its
-    products with all atoms. At the end the triangular system is solved from its last row up.
+    The atoms that a patch chooses are made orthogonal one after another (Cholesky); a direction is
+    represented by its products with all atoms. At the end the triangular system is solved from its
+    last row up.
     """
-    products, least, zeros = g.constant(gram), g.constant(MIN_RESIDUAL), g("Mul", left, g.constant(0.0))
+    products, least, zeros = (
+        g.constant(gram),
+        g.constant(MIN_RESIDUAL),
+        g("Mul", left, g.constant(0.0)),
+    )
     chosen: list[str] = []
     directions: list[str] = []
     lengths: list[str] = []
@@ -175,7 +213,9 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
         direction = g("Div", new, length)
         amount = g("Div", g("GatherElements", left, at, axis=1), length)
         left = g("Sub", left, g("Mul", amount, direction))
-        for row, value in zip((chosen, directions, lengths, amounts), (at, direction, length, amount), strict=True):
+        for row, value in zip(
+            (chosen, directions, lengths, amounts), (at, direction, length, amount), strict=True
+        ):
             row.append(value)
         triangle.append(beside)
     solved: dict[int, str] = {}
@@ -185,7 +225,12 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
         solved[i] = g("Div", amounts[i], lengths[i])
     values = [solved[i] for i in range(ACTIVE)]
     return g(
-        "ScatterElements", zeros, g("Concat", *chosen, axis=1), g("Concat", *values, axis=1), axis=1, reduction="add"
+        "ScatterElements",
+        zeros,
+        g("Concat", *chosen, axis=1),
+        g("Concat", *values, axis=1),
+        axis=1,
+        reduction="add",
     )
 
 
@@ -201,4 +246,11 @@ def _svm(features: Array, labels: Array) -> tuple[Array, Array]:
     return machine.coef_, machine.intercept_
 
 
-METHODS = (Method("st-hmp", "codes of learned dictionaries, pooled, linear SVM (Madry et al. 2014)", "raw", train),)
+METHODS = (
+    Method(
+        "st-hmp",
+        "codes of learned dictionaries, pooled, linear SVM (Madry et al. 2014)",
+        "raw",
+        train,
+    ),
+)

@@ -1,7 +1,8 @@
-"""Training of networks. In: a Network, a Dataset, a TrainingRecipe. Out: the trained network, its cost curve, a Method.
+"""Training of networks. In: a Network, a Dataset, a TrainingRecipe. Out: the trained network, its
+cost curve, a Method.
 
-Sweeps are drawn and augmented with a generator of their own. `learn` draws dropout from PyTorch's global generator, which
-the caller seeds and forks; no other random state is read or changed.
+Sweeps are drawn and augmented with a generator of their own. `learn` draws dropout from PyTorch's
+global generator, which the caller seeds and forks; no other random state is read or changed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ Net = TypeVar("Net", bound=Network)
 Recipe = TypeVar("Recipe", bound="TrainingRecipe")
 Augment = Callable[[Tensor, Generator], Tensor]
 Watch = Callable[[int, Network], None]
-"""Called after each step with its number and the network, which it leaves as it was; so it draws no random numbers."""
+"""Called after each step with its number and the network, which it leaves as it was; so it draws no
+random numbers."""
 Build = Callable[[SweepFormat, int, Array], Network]
 """(format, number of materials, training samples [N, T, R, C]) -> an untrained network."""
 MIN_STEPS = 2
@@ -46,12 +48,14 @@ MIN_STEPS = 2
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """How a network is trained: AdamW (Adam where `weight_decay` is 0) on batches drawn from shuffled rounds.
+    """How a network is trained: AdamW (Adam where `weight_decay` is 0) on batches drawn from
+    shuffled rounds.
 
-    cycle: the learning rate rises to `peak_rate` and falls again; else it is constant. ema: share that the moving average
-    of the weights keeps of itself each step. dropout: of the features before the head. noise and gain: standard
-    deviations, of a scaled taxel and of its factor. adversarial: how far each scaled count is also moved in the direction
-    in which the cost grows (fast gradient sign; Goodfellow 2015); 0 for none.
+    cycle: the learning rate rises to `peak_rate` and falls again; else it is constant. ema: share
+    that the moving average of the weights keeps of itself each step. dropout: of the features
+    before the head. noise and gain: standard deviations, of a scaled taxel and of its factor.
+    adversarial: how far each scaled count is also moved in the direction in which the cost grows
+    (fast gradient sign; Goodfellow 2015); 0 for none.
     """
 
     steps: int = 800
@@ -83,7 +87,9 @@ class NetworkModel:
     def logits(self, inputs: Array) -> Array:
         """Raw counts [n, T, R, C] -> float32 [n, K]."""
         with one_thread():
-            return np.concatenate([self.network(x).numpy() for x in float_batches(inputs, batches(len(inputs), 32))])
+            return np.concatenate(
+                [self.network(x).numpy() for x in float_batches(inputs, batches(len(inputs), 32))]
+            )
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
@@ -97,9 +103,11 @@ def unchanged(x: Tensor, rng: Generator) -> Tensor:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let PyTorch compute in one thread: the same bits whatever the number of cores, and hardly slower.
+    """Let PyTorch compute in one thread: the same bits whatever the number of cores, and hardly
+    slower.
 
-    On a busy machine two threads wait for one another; a fit was once seen to take twenty times as long there.
+    On a busy machine two threads wait for one another; a fit was once seen to take twenty times as
+    long there.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -115,7 +123,9 @@ def deterministic_device(seed: int) -> Iterator[str]:
 
     It gives the same bits each time, and no random state outside is changed.
     """
-    exact = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)  # float32 means float32
+    exact = torch.backends.cudnn.flags(
+        enabled=True, deterministic=True, allow_tf32=False
+    )  # float32 means float32
     with one_thread(), exact, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         yield "cuda" if torch.cuda.is_available() else "cpu"
@@ -140,28 +150,40 @@ def learn(
     unfinished: Path | None = None,
     watch: Watch = lambda step, network: None,
 ) -> tuple[Net, Cost]:
-    """Train by gradient descent; gives the moving average of the weights, ready for inference on the processor, and the
-    cost of each step.
+    """Train by gradient descent; gives the moving average of the weights, ready for inference on
+    the processor, and the cost of each step.
 
-    augment: changes sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16: multiply in it.
-    Dropout is drawn from PyTorch's global generator: the caller seeds and forks it. unfinished: a file that keeps the
-    training from time to time, and from which it goes on with the same bits.
+    augment: changes sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16:
+    multiply in it. Dropout is drawn from PyTorch's global generator: the caller seeds and forks it.
+    unfinished: a file that keeps the training from time to time, and from which it goes on with the
+    same bits.
     """
     rng, n = torch.Generator().manual_seed(seed), len(sweeps)
     rounds = -(-recipe.steps * recipe.batch // n)
-    order = torch.cat([torch.randperm(n, generator=rng) for _ in range(rounds)])[: recipe.steps * recipe.batch]
+    order = torch.cat([torch.randperm(n, generator=rng) for _ in range(rounds)])[
+        : recipe.steps * recipe.batch
+    ]
     model = model.to(device)
-    optimizer = torch.optim.AdamW(model.parameters(), recipe.peak_rate, weight_decay=recipe.weight_decay)
+    optimizer = torch.optim.AdamW(
+        model.parameters(), recipe.peak_rate, weight_decay=recipe.weight_decay
+    )
     schedule = _schedule(optimizer, recipe)
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema), use_buffers=True)
     labels = torch.from_numpy(sweeps.labels.astype(np.int64))
-    parts: dict[str, Stateful] = {"model": model, "optimizer": optimizer, "schedule": schedule, "average": average}
+    parts: dict[str, Stateful] = {
+        "model": model,
+        "optimizer": optimizer,
+        "schedule": schedule,
+        "average": average,
+    }
     checkpoint = Checkpoint(unfinished, parts, (rng, *default_generators(device)))
     cost = checkpoint.load()
     picks = order.split(recipe.batch)[len(cost) :]
     done, begun = len(cost), time.monotonic()
     model.train().dropout = recipe.dropout
-    for step, (pick, counts) in enumerate(zip(picks, float_batches(sweeps.samples, picks), strict=True), len(cost) + 1):
+    for step, (pick, counts) in enumerate(
+        zip(picks, float_batches(sweeps.samples, picks), strict=True), len(cost) + 1
+    ):
         x = perturbed(augment(model.prepare(counts), rng), recipe, rng).to(device)
         optimizer.zero_grad()
         with torch.autocast(device, torch.bfloat16, enabled=bfloat16):
@@ -186,9 +208,12 @@ def _schedule(optimizer: torch.optim.Optimizer, recipe: TrainingRecipe) -> lr_sc
 
 
 def backward(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
-    """Leave the gradients of the cost in the weights; the cost itself, of the sweeps as they are."""
+    """Leave the gradients of the cost in the weights; the cost itself, of the sweeps as they
+    are."""
     x.requires_grad_(recipe.adversarial > 0)
-    loss = functional.cross_entropy(model.training_logits(x).float(), labels, label_smoothing=recipe.smoothing)
+    loss = functional.cross_entropy(
+        model.training_logits(x).float(), labels, label_smoothing=recipe.smoothing
+    )
     loss.backward()
     if recipe.adversarial:
         assert x.grad is not None
@@ -206,7 +231,8 @@ def batches(n: int, batch: int = 128) -> tuple[Tensor, ...]:
 
 
 def float_batches(samples: Array, picks: tuple[Tensor, ...]) -> Iterator[Tensor]:
-    """The picked sweeps of `samples` as float32, a batch at a time; PyTorch supports too little of uint16."""
+    """The picked sweeps of `samples` as float32, a batch at a time; PyTorch supports too little of
+    uint16."""
     for pick in picks:
         yield torch.from_numpy(samples[pick.numpy()].astype(np.float32))
 
@@ -224,22 +250,33 @@ def train_network(
     int8: Sequence[str] = (),
     unfinished: Path | None = None,
 ) -> NetworkModel:
-    """Train what `build` gives on the materials that occur in `inputs`, the raw counts [N, T, R, C] of `sweeps`.
+    """Train what `build` gives on the materials that occur in `inputs`, the raw counts [N, T, R, C]
+    of `sweeps`.
 
-    A material that does not occur gets a logit that no sweep can raise. calibrated: hold some groups out for the
-    temperature; else all are trained on, with temperature 1. int8: kinds of nodes that the form "int8" has in int8;
-    without any there is no such form. unfinished: as in `learn`. Raises FormatError where only one material occurs.
+    A material that does not occur gets a logit that no sweep can raise. calibrated: hold some
+    groups out for the temperature; else all are trained on, with temperature 1. int8: kinds of
+    nodes that the form "int8" has in int8; without any there is no such form. unfinished: as in
+    `learn`. Raises FormatError where only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
     train, held_out = hold_out_or_all(known, seed)[:2] if calibrated else (known, known)
     with deterministic_device(seed) as device:
-        half = bfloat16 and (device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16")))
+        half = bfloat16 and (
+            device == "cuda" or bool(torch.cpu.get_capabilities().get("avx512_bf16"))
+        )
         network = build(train.format, len(train.materials), train.samples)
-        network, cost = learn(network, train, recipe, seed, log, device, half, unfinished=unfinished)
+        network, cost = learn(
+            network, train, recipe, seed, log, device, half, unfinished=unfinished
+        )
         trained = NetworkModel(network, describe_run(recipe, device, half, bfloat16), cost)
-    temperature = fit_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
+    temperature = (
+        fit_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
+    )
     network.expand_head(np.unique(sweeps.labels), len(sweeps.materials), temperature)
-    return replace(trained, forms={"int8": GraphModel(quantize(network.graph(), train.samples, int8))} if int8 else {})
+    return replace(
+        trained,
+        forms={"int8": GraphModel(quantize(network.graph(), train.samples, int8))} if int8 else {},
+    )
 
 
 def network_method(
@@ -256,10 +293,18 @@ def network_method(
 ) -> Method:
     """The Method of this name that trains what `build` gives; see train_network."""
     train = partial(
-        train_network, build=build, recipe=recipe, calibrated=calibrated, bfloat16=bfloat16, log=log, int8=int8,
+        train_network,
+        build=build,
+        recipe=recipe,
+        calibrated=calibrated,
+        bfloat16=bfloat16,
+        log=log,
+        int8=int8,
         unfinished=unfinished,
-    )  # fmt: skip
-    return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations{', bfloat16' * bfloat16}")
+    )
+    return Method(
+        name, about, "raw", train, effort=f"{recipe.steps} iterations{', bfloat16' * bfloat16}"
+    )
 
 
 def describe_run(recipe: TrainingRecipe, device: str, half: bool, wanted: bool) -> str:

@@ -1,4 +1,5 @@
-"""Costs that are counted in a graph. In: an ONNX graph, the form of a sweep. Out: weights, multiply-accumulates.
+"""Costs that are counted in a graph. In: an ONNX graph, the form of a sweep. Out: weights,
+multiply-accumulates.
 
 They are the same on every machine; train.export.measure measures time and memory.
 """
@@ -31,24 +32,33 @@ def precision(model: onnx.ModelProto) -> str:
 
 
 def weights(model: onnx.ModelProto) -> int:
-    """How many trained numbers the graph holds, float or int8: its constants and the tables of its classifiers.
+    """How many trained numbers the graph holds, float or int8: its constants and the tables of its
+    classifiers.
 
     Scalars and the scales and zero points of int8 are not counted.
     """
     graph = model.graph
     scales = {name for node in graph.node if node.op_type in SCALED for name in node.input[1:]}
-    held = [c for c in graph.initializer if prod(c.dims) > 1 and c.data_type in NUMBERS and c.name not in scales]
+    held = [
+        c
+        for c in graph.initializer
+        if prod(c.dims) > 1 and c.data_type in NUMBERS and c.name not in scales
+    ]
     tables = [len(a.floats) for node in graph.node for a in node.attribute if len(a.floats) > 1]
     return int(sum(prod(c.dims) for c in held) + sum(tables))
 
 
 def macs(model: onnx.ModelProto) -> int:
-    """Multiply-accumulates of one sweep: convolutions, matrix products, GRU, kernels of an SVM, distances to neighbours.
+    """Multiply-accumulates of one sweep: convolutions, matrix products, GRU, kernels of an SVM,
+    distances to neighbours.
 
     Shapes are inferred. Raises FormatError naming a node with an unknown shape.
     """
     graph = onnx.shape_inference.infer_shapes(model).graph
-    known = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*graph.value_info, *graph.output)}
+    known = {
+        v.name: [d.dim_value for d in v.type.tensor_type.shape.dim]
+        for v in (*graph.value_info, *graph.output)
+    }
     known |= {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in graph.input}
     known |= {c.name: list(c.dims) for c in graph.initializer}
     # what does not depend on the sweep is computed once, when the box loads the graph
@@ -63,7 +73,9 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
 
     def shape(name: str) -> list[int]:
         if not all(found := known.get(name, [0])):
-            raise FormatError(f"node {node.name!r} ({node.op_type}): the shape of {name!r} is not known")
+            raise FormatError(
+                f"node {node.name!r} ({node.op_type}): the shape of {name!r} is not known"
+            )
         return found
 
     if node.op_type == "Conv":
@@ -71,7 +83,9 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
     if node.op_type in ("MatMul", "MatMulInteger"):
         return prod(shape(node.input[0])) * shape(node.input[1])[-1]
     if node.op_type == "Gemm":
-        return prod(shape(node.input[0])) * shape(node.input[1])[0 if attributes.get("transB") else -1]
+        return (
+            prod(shape(node.input[0])) * shape(node.input[1])[0 if attributes.get("transB") else -1]
+        )
     if node.op_type == "GRU":
         steps, _, inputs = shape(node.input[0])
         hidden = int(attributes["hidden_size"])
@@ -82,9 +96,11 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
 
 
 def feature_macs(kind: str, form: SweepFormat) -> int:
-    """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n real numbers.
+    """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n
+    real numbers.
 
-    A transform of n real numbers takes n/4 log2 n complex products of four each. Everything else is not counted.
+    A transform of n real numbers takes n/4 log2 n complex products of four each. Everything else is
+    not counted.
     """
     if kind == "raw":
         return 0

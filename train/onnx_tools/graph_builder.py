@@ -1,7 +1,8 @@
-"""ONNX graphs written by hand. In: operators and weights, node by node. Out: checked models that the box runs.
+"""ONNX graphs written by hand. In: operators and weights, node by node. Out: checked models that
+the box runs.
 
-Shapes are fixed and nothing is traced: a graph holds exactly the nodes that are written. Graphs take the sensor's raw
-counts, or features; all scaling is inside.
+Shapes are fixed and nothing is traced: a graph holds exactly the nodes that are written. Graphs
+take the sensor's raw counts, or features; all scaling is inside.
 """
 
 from __future__ import annotations
@@ -50,39 +51,55 @@ class GraphBuilder:
         return output
 
     def model(self, form: SweepFormat, output: str, *size: int) -> onnx.ModelProto:
-        """The finished, checked model: `sweep` [1, T, R, C] or [1, T, R, C, A] -> `output` float32 [1, *size]."""
-        sweep = helper.make_tensor_value_info("sweep", TENSOR[form.dtype], [1, form.window, *form.shape])
+        """The finished, checked model: `sweep` [1, T, R, C] or [1, T, R, C, A] -> `output` float32
+        [1, *size]."""
+        sweep = helper.make_tensor_value_info(
+            "sweep", TENSOR[form.dtype], [1, form.window, *form.shape]
+        )
         out = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, *size])
         graph = helper.make_graph(self.nodes, "palpate", [sweep], [out], self.constants)
         model = helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR, producer_name="palpate"
+            graph,
+            opset_imports=[helper.make_opsetid("", OPSET)],
+            ir_version=IR,
+            producer_name="palpate",
         )
         onnx.checker.check_model(model, full_check=True)
         return model
 
 
 def centred(g: GraphBuilder, form: SweepFormat) -> tuple[str, str]:
-    """Nodes that subtract the mean of each taxel and axis: `sweep` -> ([1, R * C * A, T], sums over time [1, R * C * A]), float32.
+    """Nodes that subtract the mean of each taxel and axis: `sweep` -> ([1, R * C * A, T], sums over
+    time [1, R * C * A]), float32.
 
-    Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and exactly for whole
-    counts, in whatever order a processor adds them.
+    Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and
+    exactly for whole counts, in whatever order a processor adds them.
     """
     taxels = form.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
     ones = g("ConstantOfShape", g.constant([form.window, 1], "int64"), value=one)
-    x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=TensorProto.FLOAT)
+    x = g(
+        "Cast",
+        g("Reshape", "sweep", g.constant([form.window, taxels], "int64")),
+        to=TensorProto.FLOAT,
+    )
     sums = g("Gemm", ones, x, transA=1)
     x = g("Gemm", ones, sums, x, alpha=-1 / form.window)
-    return g("Transpose", g("Reshape", x, g.constant([1, form.window, taxels], "int64")), perm=[0, 2, 1]), sums
+    return g(
+        "Transpose", g("Reshape", x, g.constant([1, form.window, taxels], "int64")), perm=[0, 2, 1]
+    ), sums
 
 
 def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) -> onnx.ModelProto:
-    """A trunk (float or int8) and a linear head, weight [K, F] and bias [K]: `sweep` -> `logits` float32 [1, K]."""
+    """A trunk (float or int8) and a linear head, weight [K, F] and bias [K]: `sweep` -> `logits`
+    float32 [1, K]."""
     model = onnx.ModelProto()
     model.CopyFrom(trunk)
     graph = model.graph
     for name, value in (("head.weight", weight), ("head.bias", bias)):
-        graph.initializer.append(numpy_helper.from_array(np.ascontiguousarray(value, np.float32), name))
+        graph.initializer.append(
+            numpy_helper.from_array(np.ascontiguousarray(value, np.float32), name)
+        )
     inputs = [graph.output[0].name, "head.weight", "head.bias"]
     graph.node.append(helper.make_node("Gemm", inputs, ["logits"], name="logits", transB=1))
     graph.output.pop()
@@ -92,15 +109,21 @@ def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) 
 
 
 def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
-    """One model with the outputs of both, which take the same input. What both compute alike is there once, as in `first`.
+    """One model with the outputs of both, which take the same input. What both compute alike is
+    there once, as in `first`.
 
-    So each output needs the nodes that it had alone, and gives the same bits where the box leaves out the others.
+    So each output needs the nodes that it had alone, and gives the same bits where the box leaves
+    out the others.
     """
     model = onnx.ModelProto()
     model.CopyFrom(first)
     graph, suffix = model.graph, second.graph.output[0].name
-    there: dict[bytes, list[str]] = {}  # what a node or a constant is -> the names that it gives in `model`
-    same: dict[str, str] = {}  # names in the graph that is gone through -> the first name of this value in `model`
+    there: dict[
+        bytes, list[str]
+    ] = {}  # what a node or a constant is -> the names that it gives in `model`
+    same: dict[
+        str, str
+    ] = {}  # names in the graph that is gone through -> the first name of this value in `model`
     taken: set[str] = set()
     for item in (*graph.initializer, *graph.node):
         names = there.setdefault(_content(item, same), _given(item))
@@ -119,8 +142,8 @@ def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def slim(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The same model in fewer bytes: equal constants are there once, and only what multiplies keeps the name of its output,
-    by which `palpate-train parity` tells layers."""
+    """The same model in fewer bytes: equal constants are there once, and only what multiplies keeps
+    the name of its output, by which `palpate-train parity` tells layers."""
     small = onnx.ModelProto()
     small.CopyFrom(model)
     graph = small.graph
@@ -137,7 +160,9 @@ def slim(model: onnx.ModelProto) -> onnx.ModelProto:
         renamed[constant.name] = there[key].name
     for node in graph.node:
         renamed |= {name: next(fresh) for name in node.output if name and name not in kept}
-        inputs, outputs = ([renamed.get(name, name) for name in names] for names in (node.input, node.output))
+        inputs, outputs = (
+            [renamed.get(name, name) for name in names] for names in (node.input, node.output)
+        )
         del node.input[:], node.output[:]
         node.input.extend(inputs)
         node.output.extend(outputs)
@@ -149,7 +174,12 @@ def slim(model: onnx.ModelProto) -> onnx.ModelProto:
     return small
 
 
-def _append(graph: onnx.GraphProto, content: bytes, item: onnx.NodeProto | onnx.TensorProto, names: list[str]) -> None:
+def _append(
+    graph: onnx.GraphProto,
+    content: bytes,
+    item: onnx.NodeProto | onnx.TensorProto,
+    names: list[str],
+) -> None:
     """Add what `_content` gave for `item`, under new names."""
     new = type(item).FromString(content)
     new.name = names[0]
@@ -166,7 +196,8 @@ def _given(item: onnx.NodeProto | onnx.TensorProto) -> list[str]:
 
 
 def _content(item: onnx.NodeProto | onnx.TensorProto, renamed: Mapping[str, str]) -> bytes:
-    """A node or a constant without its own names, with its inputs renamed: equal for two that give the same values."""
+    """A node or a constant without its own names, with its inputs renamed: equal for two that give
+    the same values."""
     bare = type(item)()
     bare.CopyFrom(item)
     bare.ClearField("name")
@@ -193,6 +224,7 @@ class GraphModel:
 
 
 def run(model: onnx.ModelProto, inputs: NDArray[Any]) -> NDArray[Any]:
-    """What `model` gives for each of `inputs` (raw counts or features), float32 [n, size], in the box's kind of session."""
+    """What `model` gives for each of `inputs` (raw counts or features), float32 [n, size], in the
+    box's kind of session."""
     on_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
     return np.concatenate([on_the_box.run(None, {name: one[None]})[0] for one in inputs])

@@ -1,8 +1,9 @@
 """Comparison of float and int8. In: both graphs of a model, sweeps with labels. Out: a Parity.
 
-It reports how much the answers differ, what accuracy is lost with its interval, and for every quantized tensor its range
-and saturation. Graphs are run as the box runs them, with their inner tensors as further outputs. A bundle holds no float
-form: then only tensors are compared, each with its own value before rounding.
+It reports how much the answers differ, what accuracy is lost with its interval, and for every
+quantized tensor its range and saturation. Graphs are run as the box runs them, with their inner
+tensors as further outputs. A bundle holds no float form: then only tensors are compared, each with
+its own value before rounding.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ Z95 = 1.96
 class Layer:
     """One tensor that int8 rounds. kind: activations or weights.
 
-    against: what it is compared with, `float` (the same tensor of the float graph) or `itself` (its value before it is
-    rounded, where the float graph has no such tensor). percentiles: PERCENTILES of that. low, high: the range of int8,
-    in steps of `step` (of weights: the median channel's). saturated: share of values beyond that range; what a ReLU cuts
-    off does not count. sqnr_db: power of the values over that of the difference, in decibel; for weights after one common
-    factor is divided out, which the float graph does not have.
+    against: what it is compared with, `float` (the same tensor of the float graph) or `itself` (its
+    value before it is rounded, where the float graph has no such tensor). percentiles: PERCENTILES
+    of that. low, high: the range of int8, in steps of `step` (of weights: the median channel's).
+    saturated: share of values beyond that range; what a ReLU cuts off does not count. sqnr_db:
+    power of the values over that of the difference, in decibel; for weights after one common factor
+    is divided out, which the float graph does not have.
     """
 
     tensor: str
@@ -59,10 +61,11 @@ class Layer:
 class AnswerDifference:
     """How far int8's answers are from float's.
 
-    agreement: share of equal labels. Probability and logit: of each sweep the largest difference of any label; then
-    largest and mean over sweeps. Logits are compared after each sweep's mean is subtracted, which changes no answer.
-    expected_loss: of accuracy, by float's own probabilities: where int8 gives another label, that of float's label less
-    that of int8's. Where these are calibrated it is what counting right answers gives on average, with far less variance.
+    agreement: share of equal labels. Probability and logit: of each sweep the largest difference of
+    any label; then largest and mean over sweeps. Logits are compared after each sweep's mean is
+    subtracted, which changes no answer. expected_loss: of accuracy, by float's own probabilities:
+    where int8 gives another label, that of float's label less that of int8's. Where these are
+    calibrated it is what counting right answers gives on average, with far less variance.
     """
 
     agreement: float
@@ -75,9 +78,11 @@ class AnswerDifference:
 
 @dataclass(frozen=True)
 class AccuracyLoss:
-    """Accuracy of both, as counts of `total` sweeps. lost: float's share less int8's; low, high: its 95 % interval.
+    """Accuracy of both, as counts of `total` sweeps. lost: float's share less int8's; low, high:
+    its 95 % interval.
 
-    chance: the probability, were neither form better, that int8 loses as many or more of the sweeps on which they differ.
+    chance: the probability, were neither form better, that int8 loses as many or more of the sweeps
+    on which they differ.
     """
 
     total: int
@@ -93,8 +98,9 @@ class AccuracyLoss:
 class Parity:
     """The comparison of a model's two forms on some sweeps.
 
-    apart, lost: None where there is no float form. tap_sum: the largest sum of the integer taps of one filter and taxel
-    in the first convolution: 0 where no offset changes the answer, -1 where there is no convolution in int8.
+    apart, lost: None where there is no float form. tap_sum: the largest sum of the integer taps of
+    one filter and taxel in the first convolution: 0 where no offset changes the answer, -1 where
+    there is no convolution in int8.
     """
 
     sweeps: int
@@ -115,7 +121,10 @@ class Parity:
             figures |= asdict(part) if part else {}
         if not self.layers:  # no tensor is in int8
             return figures
-        worst = {"saturated": max(x.saturated for x in self.layers), "sqnr_db": min(x.sqnr_db for x in self.layers)}
+        worst = {
+            "saturated": max(x.saturated for x in self.layers),
+            "sqnr_db": min(x.sqnr_db for x in self.layers),
+        }
         return figures | worst | {"tap_sum": self.tap_sum}
 
 
@@ -126,9 +135,11 @@ def measure(
     reference: onnx.ModelProto | None = None,
     clusters: Array | None = None,
 ) -> Parity:
-    """Compare `int8` with `reference`, its float form, on `inputs` (raw counts or features) of sweeps with these `labels`.
+    """Compare `int8` with `reference`, its float form, on `inputs` (raw counts or features) of
+    sweeps with these `labels`.
 
-    clusters: [n], sweeps that succeed or fail together. Raises FormatError where nothing in `int8` is quantized.
+    clusters: [n], sweeps that succeed or fail together. Raises FormatError where nothing in `int8`
+    is quantized.
     """
     int8_logits = logits(int8, inputs)
     right, difference, lost = int8_logits.argmax(1) == labels, None, None
@@ -157,21 +168,31 @@ def compare(float_logits: Array, int8_logits: Array) -> AnswerDifference:
     moved = np.abs(p - q).max(1)
     centred = [x - x.mean(1, keepdims=True) for x in (float_logits, int8_logits)]
     z = np.abs(centred[0] - centred[1]).max(1)
-    figures = (np.mean(label == other), given_away.mean(), moved.max(), moved.mean(), z.max(), z.mean())
+    figures = (
+        np.mean(label == other),
+        given_away.mean(),
+        moved.max(),
+        moved.mean(),
+        z.max(),
+        z.mean(),
+    )
     return AnswerDifference(*(float(x) for x in figures))
 
 
 def loss(float_right: Array, int8_right: Array, clusters: Array | None = None) -> AccuracyLoss:
     """Of booleans [n] of the same sweeps.
 
-    The interval of the difference of matched proportions is that of Agresti and Min (Statistics in Medicine 24, 2005): a
-    half is added to each of the four counts, so that it is valid where the forms never differ, too. With `clusters` it is
-    the cluster bootstrap's (as score.interval) where that is wider.
+    The interval of the difference of matched proportions is that of Agresti and Min (Statistics in
+    Medicine 24, 2005): a half is added to each of the four counts, so that it is valid where the
+    forms never differ, too. With `clusters` it is the cluster bootstrap's (as score.interval) where
+    that is wider.
     """
     difference = float_right.astype(float) - int8_right
     fewer, more = int((difference > 0).sum()), int((difference < 0).sum())
     n, worse, better = len(difference), fewer + 0.5, more + 0.5
-    chance = sum(comb(fewer + more, k) for k in range(fewer, fewer + more + 1)) / 2 ** (fewer + more)
+    chance = sum(comb(fewer + more, k) for k in range(fewer, fewer + more + 1)) / 2 ** (
+        fewer + more
+    )
     middle = (worse - better) / (n + 2)
     reach = Z95 * np.sqrt(((worse + better) / (n + 2) - middle**2) / (n + 2))
     low, high = widen((middle - reach, middle + reach), difference, clusters)
@@ -179,22 +200,35 @@ def loss(float_right: Array, int8_right: Array, clusters: Array | None = None) -
     return AccuracyLoss(n, int(float_right.sum()), int(int8_right.sum()), lost, low, high, chance)
 
 
-def layers(int8: onnx.ModelProto, reference: onnx.ModelProto | None, inputs: Array) -> Iterator[Layer]:
-    """Every rounded tensor of `int8`, then its weights where there is `reference`, its float form, to compare with."""
+def layers(
+    int8: onnx.ModelProto, reference: onnx.ModelProto | None, inputs: Array
+) -> Iterator[Layer]:
+    """Every rounded tensor of `int8`, then its weights where there is `reference`, its float form,
+    to compare with."""
     constants, nodes = _constants(int8), rounding_nodes(int8)
     tensors = outputs(int8, [q.input[0] for q in nodes] + [q.output[0] for q in nodes], inputs)
     twins = [_twin(int8, reference, q.input[0]) for q in nodes]
     names = [name for name in twins if name]
-    of_float = dict(zip(names, outputs(reference, names, inputs), strict=True)) if reference and names else {}
+    of_float = (
+        dict(zip(names, outputs(reference, names, inputs), strict=True))
+        if reference and names
+        else {}
+    )
     for q, before, after, twin in zip(nodes, tensors, tensors[len(nodes) :], twins, strict=False):
-        step, zero, limits = float(constants[q.input[1]]), int(constants[q.input[2]]), np.iinfo(after.dtype)
+        step, zero, limits = (
+            float(constants[q.input[1]]),
+            int(constants[q.input[2]]),
+            np.iinfo(after.dtype),
+        )
         low, high = (limits.min - zero) * step, (limits.max - zero) * step
         against = "float" if twin and of_float[twin].shape == after.shape else "itself"
         want = of_float[twin] if against == "float" else before
         want = np.maximum(want, 0) if low == 0 else want  # rounding does the ReLU as well
         beyond = float(np.mean((want > high + step / 2) | (want < low - step / 2)))
         sqnr = _sqnr(want, (after.astype(np.float64) - zero) * step)
-        yield Layer(q.input[0], "activations", against, _percentiles(want), low, high, step, beyond, sqnr)
+        yield Layer(
+            q.input[0], "activations", against, _percentiles(want), low, high, step, beyond, sqnr
+        )
     if reference:
         yield from _weight_layers(int8, reference)
 
@@ -209,7 +243,17 @@ def _weight_layers(int8: onnx.ModelProto, reference: onnx.ModelProto) -> Iterato
             have *= np.sum(want * have) / max(float(np.sum(have * have)), TINY)
             reach, step = float(np.abs(have).max()), float(np.median(steps))
             name = f"{node.output[0]} weights"
-            yield Layer(name, "weights", "float", _percentiles(want), -reach, reach, step, 0.0, _sqnr(want, have))
+            yield Layer(
+                name,
+                "weights",
+                "float",
+                _percentiles(want),
+                -reach,
+                reach,
+                step,
+                0.0,
+                _sqnr(want, have),
+            )
 
 
 def tap_sum(model: onnx.ModelProto) -> int:
@@ -225,7 +269,9 @@ def with_outputs(model: onnx.ModelProto, names: Sequence[str]) -> onnx.ModelProt
     shown = onnx.ModelProto()
     shown.CopyFrom(model)
     present = {out.name for out in shown.graph.output}
-    shown.graph.output.extend(onnx.ValueInfoProto(name=name) for name in dict.fromkeys(names) if name not in present)
+    shown.graph.output.extend(
+        onnx.ValueInfoProto(name=name) for name in dict.fromkeys(names) if name not in present
+    )
     return shown
 
 
@@ -254,25 +300,31 @@ def _maker(model: onnx.ModelProto, tensor: str) -> onnx.NodeProto | None:
     return next((node for node in model.graph.node if tensor in node.output), None)
 
 
-def _same(int8: onnx.ModelProto, reference: onnx.ModelProto, node: onnx.NodeProto) -> onnx.NodeProto | None:
-    """The node of `reference` that does what `node` does: the one with the same number, where its kind is as frequent."""
+def _same(
+    int8: onnx.ModelProto, reference: onnx.ModelProto, node: onnx.NodeProto
+) -> onnx.NodeProto | None:
+    """The node of `reference` that does what `node` does: the one with the same number, where its
+    kind is as frequent."""
     mine, its = _nodes(int8, node.op_type), _nodes(reference, node.op_type)
     return its[mine.index(node)] if len(mine) == len(its) else None
 
 
 def _twin(int8: onnx.ModelProto, reference: onnx.ModelProto | None, tensor: str) -> str:
-    """The name in `reference` of what `tensor` is in `int8`, after its ReLU; "" where there is no such tensor."""
+    """The name in `reference` of what `tensor` is in `int8`, after its ReLU; "" where there is no
+    such tensor."""
     node = _maker(int8, tensor)
     if reference is None or node is None or node.op_type not in COMPARED:
         return ""
     same = _same(int8, reference, node)
     name = same.output[0] if same else ""
-    return next((relu.output[0] for relu in _nodes(reference, "Relu") if relu.input[0] == name), name)
+    return next(
+        (relu.output[0] for relu in _nodes(reference, "Relu") if relu.input[0] == name), name
+    )
 
 
 def _weights(model: onnx.ModelProto, node: onnx.NodeProto) -> tuple[Array, Array] | None:
-    """Integer weights of `node` less their zero point, float64, and the step of each channel, shaped to fit; None where
-    they are float."""
+    """Integer weights of `node` less their zero point, float64, and the step of each channel,
+    shaped to fit; None where they are float."""
     maker, constants = _maker(model, node.input[1]), _constants(model)
     if maker is None or maker.op_type != "DequantizeLinear":
         return None
@@ -288,7 +340,8 @@ def _weights(model: onnx.ModelProto, node: onnx.NodeProto) -> tuple[Array, Array
 
 
 def _depends_on_input(model: onnx.ModelProto, tensor: str) -> bool:
-    """Whether `tensor` is, or is computed from, the model's input: else onnxruntime computes it when it loads the model."""
+    """Whether `tensor` is, or is computed from, the model's input: else onnxruntime computes it
+    when it loads the model."""
     if tensor == model.graph.input[0].name:
         return True
     maker = _maker(model, tensor)
@@ -307,7 +360,10 @@ def _percentiles(values: Array) -> tuple[float, ...]:
 
 
 def _sqnr(want: Array, have: Array) -> float:
-    noise, power = float(np.sum((want - have) ** 2)), float(np.sum(np.square(want, dtype=np.float64)))
+    noise, power = (
+        float(np.sum((want - have) ** 2)),
+        float(np.sum(np.square(want, dtype=np.float64))),
+    )
     return float(10 * np.log10(max(power, TINY) / max(noise, TINY)))
 
 
@@ -327,7 +383,11 @@ def table(parity: Parity) -> str:
         lines.append(
             f"int8 {parity.int8_right}/{parity.sweeps}; a bundle holds no float form: tensors are compared with themselves"
         )
-    taps = "zero, so no offset changes the answer" if parity.tap_sum == 0 else f"up to {parity.tap_sum}"
+    taps = (
+        "zero, so no offset changes the answer"
+        if parity.tap_sum == 0
+        else f"up to {parity.tap_sum}"
+    )
     lines.append(f"first convolution, sum of the integer taps of a filter and taxel: {taps}")
     percentiles = " ".join(f"{'max' if p == 100 else f'{p:g} %':>9}" for p in PERCENTILES)
     lines.append(
@@ -335,5 +395,7 @@ def table(parity: Parity) -> str:
     )
     for x in parity.layers:
         values = " ".join(f"{v:>9.3g}" for v in (*x.percentiles, x.low, x.high, x.step))
-        lines.append(f"{x.tensor[:36]:<36} {x.against:<8} {values} {x.saturated:>9.5f} {x.sqnr_db:>8.1f}")
+        lines.append(
+            f"{x.tensor[:36]:<36} {x.against:<8} {values} {x.saturated:>9.5f} {x.sqnr_db:>8.1f}"
+        )
     return "\n".join(lines)

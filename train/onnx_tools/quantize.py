@@ -1,4 +1,5 @@
-"""Static quantization. In: a float graph, sweeps of the training set. Out: the graph with its expensive nodes in int8."""
+"""Static quantization. In: a float graph, sweeps of the training set. Out: the graph with its
+expensive nodes in int8."""
 
 from __future__ import annotations
 
@@ -12,39 +13,59 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization import (
+    CalibrationDataReader,
+    CalibrationMethod,
+    QuantFormat,
+    QuantType,
+    quantize_static,
+)
 
 Array = NDArray[Any]
 CALIBRATION_SWEEPS = 96
 PERCENTILE = 99.9
-"""Of the values, the one that int8 reaches: with the full range one outlier sweep costs all others their resolution."""
+"""Of the values, the one that int8 reaches: with the full range one outlier sweep costs all others
+their resolution."""
 
 
 def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
-    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]: a step for all along the first axis. Their product is the
-    matrix, rounded."""
-    steps = np.maximum(np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny).astype(
-        np.float32
-    )
+    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]: a step for all along the first
+    axis. Their product is the matrix, rounded."""
+    steps = np.maximum(
+        np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny
+    ).astype(np.float32)
     return np.rint(matrix / steps).astype(np.int16), steps
 
 
-def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")) -> onnx.ModelProto:
-    """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: raw counts [N, T, R, C].
+def quantize(
+    model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")
+) -> onnx.ModelProto:
+    """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: raw counts [N, T, R,
+    C].
 
-    Weights have seven bits: two products of eight bits overflow the 16-bit sums of an x86 without VNNI, and the answer
-    there would differ from that on Arm.
+    Weights have seven bits: two products of eight bits overflow the 16-bit sums of an x86 without
+    VNNI, and the answer there would differ from that on Arm.
     """
     copy = onnx.ModelProto()
     copy.CopyFrom(model)  # onnxruntime moves the weights of what it is given to a file
-    copy.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")  # nothing to simplify beforehand
+    copy.metadata_props.add(
+        key="onnx.quant.pre_process", value="onnxruntime.quant"
+    )  # nothing to simplify beforehand
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         path = Path(folder) / "int8.onnx"
         quantize_static(
-            copy, path, _CalibrationReader(calibration_sweeps(sweeps)), QuantFormat.QDQ, list(ops), per_channel=True,
-            reduce_range=True, activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
-            calibrate_method=CalibrationMethod.Percentile, extra_options={"CalibPercentile": PERCENTILE},
-        )  # fmt: skip
+            copy,
+            path,
+            _CalibrationReader(calibration_sweeps(sweeps)),
+            QuantFormat.QDQ,
+            list(ops),
+            per_channel=True,
+            reduce_range=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            calibrate_method=CalibrationMethod.Percentile,
+            extra_options={"CalibPercentile": PERCENTILE},
+        )
         made = onnx.load(path)
     for constant in made.graph.initializer:
         constant.ClearField(
@@ -54,8 +75,11 @@ def quantize(model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv"
 
 
 def calibration_sweeps(sweeps: Array) -> Array:
-    """At most CALIBRATION_SWEEPS of `sweeps` [N, ...], evenly spaced: ranges and comparisons are taken from these."""
-    some: Array = sweeps[np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)]
+    """At most CALIBRATION_SWEEPS of `sweeps` [N, ...], evenly spaced: ranges and comparisons are
+    taken from these."""
+    some: Array = sweeps[
+        np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)
+    ]
     return some
 
 

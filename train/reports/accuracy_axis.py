@@ -1,6 +1,8 @@
-"""The axis of accuracy that pictures of many methods share. In: a plot. Out: its axis, to 100 %, stretched where the best are.
+"""The axis of accuracy that pictures of many methods share. In: a plot. Out: its axis, to 100 %,
+stretched where the best are.
 
-A place on it is the root of the error, so that 90 and 95 % are as far apart as 71 and 80 %, and 100 % is still there.
+A place on it is the root of the error, so that 90 and 95 % are as far apart as 71 and 80 %, and 100
+% is still there.
 """
 
 from __future__ import annotations
@@ -21,12 +23,19 @@ ROOM = 0.04
 
 
 def stretch(axes: Axes, way: str, lows: Iterable[float], ticks: Iterable[float] = SHARES) -> None:
-    """Make the axis `way` ("x" or "y") of `axes` one of accuracy, from a little below all `lows` to 100 %."""
+    """Make the axis `way` ("x" or "y") of `axes` one of accuracy, from a little below all `lows` to
+    100 %."""
     low = max(min(lows) - ROOM, 0.0)
-    set_scale, set_limits = (axes.set_xscale, axes.set_xlim) if way == "x" else (axes.set_yscale, axes.set_ylim)
+    set_scale, set_limits = (
+        (axes.set_xscale, axes.set_xlim) if way == "x" else (axes.set_yscale, axes.set_ylim)
+    )
     set_scale("function", functions=(_place, _share))
     set_limits(low, 1)
-    set_ticks(axes.xaxis if way == "x" else axes.yaxis, [tick for tick in ticks if tick >= low], percent=True)
+    set_ticks(
+        axes.xaxis if way == "x" else axes.yaxis,
+        [tick for tick in ticks if tick >= low],
+        percent=True,
+    )
 
 
 def draw_chance(axes: Axes, share: float) -> None:

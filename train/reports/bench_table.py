@@ -1,5 +1,5 @@
-"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench --json` wrote. Out:
-the table in Markdown; document_figures puts it into the documents.
+"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench
+--json` wrote. Out: the table in Markdown; document_figures puts it into the documents.
 """
 
 from __future__ import annotations
@@ -13,14 +13,22 @@ Json = dict[str, Any]
 
 
 def table(figures: Json) -> str:
-    """The figures as a table with a caption, in Markdown; where they are of an older bundle, it says so first.
+    """The figures as a table with a caption, in Markdown; where they are of an older bundle, it
+    says so first.
 
     Raises KeyError where one is missing.
     """
     older = provenance.of(figures).older
     rows = [f"| {what} | {value} |" for what, value in _rows(figures)]
     return "\n".join(
-        [*([f"**{older}**", ""] if older else []), _caption(figures), "", "| what | measured |", "|---|---|", *rows]
+        [
+            *([f"**{older}**", ""] if older else []),
+            _caption(figures),
+            "",
+            "| what | measured |",
+            "|---|---|",
+            *rows,
+        ]
     )
 
 
@@ -55,7 +63,10 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
     )
     yield "inference of the packaged bundle (int8)", _times(inference["int8"])
     yield "for comparison, inference of its network alone in float32", _times(inference["fp32"])
-    yield "for comparison, inference of the paper's network (CNN) in int8", _times(inference["paper_int8"])
+    yield (
+        "for comparison, inference of the paper's network (CNN) in int8",
+        _times(inference["paper_int8"]),
+    )
     yield (
         "resident memory after 1,000 sweeps, with the simulated readout board in it",
         f"{memory['after_1000']:.1f} MiB; {growth:+.1f} MiB in the next 900",
@@ -70,7 +81,10 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         f"median {figures['cold_start_s']:.2f} s, longest {figures['cold_start_worst_s']:.2f} s",
     )
     size = figures["bundle_kb"]
-    yield "size of the packaged bundle on the disk", f"{size['all']:.1f} kB, of it the network {size['model']:.1f} kB"
+    yield (
+        "size of the packaged bundle on the disk",
+        f"{size['all']:.1f} kB, of it the network {size['model']:.1f} kB",
+    )
 
 
 def _times(ms: Json) -> str:

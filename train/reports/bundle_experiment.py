@@ -1,7 +1,8 @@
-"""What a bundle answers to a set, and what it costs: the figures of the command `report`. In: a bundle's folder, labelled
-sweeps. Out: the figures as JSON.
+"""What a bundle answers to a set, and what it costs: the figures of the command `report`. In: a
+bundle's folder, labelled sweeps. Out: the figures as JSON.
 
-All of it comes from the box's classifier, so `unsure`, `unknown` and refused sweeps count as they do on the box.
+All of it comes from the box's classifier, so `unsure`, `unknown` and refused sweeps count as they
+do on the box.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ NOT_NAMED = (f"({Status.UNSURE})", f"({Status.UNKNOWN})")
 
 
 def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
-    """The figures. seed: of the corruptions. Raises FormatError where the set is not of the bundle's format or has none of
-    its materials, BundleError where the bundle does not load."""
+    """The figures. seed: of the corruptions. Raises FormatError where the set is not of the
+    bundle's format or has none of its materials, BundleError where the bundle does not load."""
     loaded = bundle.load(folder)
     classifier = Classifier(loaded, SystemClock())
     m = loaded.manifest
@@ -43,50 +44,78 @@ def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
     cost = measure.measure_all([folder], sweeps.samples)[0]
     known = sweeps.take(np.isin(np.array(sweeps.materials)[sweeps.labels], m.labels))
     return found.json() | {
-        "format": str(m.format), "labels": list(m.labels), "made": dict(m.made), "figures": dict(m.figures),
-        "fitted_to_this": m.made.get("set") == sweeps.source, "tells_unknown": m.known is not None,
+        "format": str(m.format),
+        "labels": list(m.labels),
+        "made": dict(m.made),
+        "figures": dict(m.figures),
+        "fitted_to_this": m.made.get("set") == sweeps.source,
+        "tells_unknown": m.known is not None,
         "groups": {name: len(np.unique(values)) for name, values in sweeps.groups.items()},
-        "named": named(known, found), "foreign_named": foreign_named(found),
+        "named": named(known, found),
+        "foreign_named": foreign_named(found),
         "materials": [material(name, found) for name in found.answered],
         "calibration": calibration(classifier, known),
-        "cost": {"ms": cost.ms_p50, "ms_p99": cost.ms_p99, "kb": cost.bundle_kb, "mib": cost.rss_mib},
+        "cost": {
+            "ms": cost.ms_p50,
+            "ms_p99": cost.ms_p99,
+            "kb": cost.bundle_kb,
+            "mib": cost.rss_mib,
+        },
         "corruptions": corruptions(classifier, EvaluationSweeps.of(known, seed=seed), log, seed),
-    }  # fmt: skip
+    }
 
 
 def named(known: Dataset, found: bundle_score.BundleScore) -> Json:
-    """Of the sweeps whose material the bundle has: how many are named rightly, wrongly and not at all, and how many of these
-    are called unknown."""
+    """Of the sweeps whose material the bundle has: how many are named rightly, wrongly and not at
+    all, and how many of these are called unknown."""
     answers = sum(found.answered.values(), Counter())
     right, unknown = int(found.right.sum()), answers[f"({Status.UNKNOWN})"]
     silent = sum(n for answer, n in answers.items() if answer.startswith("("))
     n = len(known)
-    return {"n": n, "right": right, "wrong": n - right - silent, "not_named": silent, "unknown": _share(unknown, n)}
+    return {
+        "n": n,
+        "right": right,
+        "wrong": n - right - silent,
+        "not_named": silent,
+        "unknown": _share(unknown, n),
+    }
 
 
 def foreign_named(found: bundle_score.BundleScore) -> list[float]:
-    """Of the sweeps of other materials the share that gets a label of the bundle, with its interval; empty without any."""
+    """Of the sweeps of other materials the share that gets a label of the bundle, with its
+    interval; empty without any."""
     answers = sum(found.foreign.values(), Counter())
-    return _share(sum(n for answer, n in answers.items() if not answer.startswith("(")), answers.total())
+    return _share(
+        sum(n for answer, n in answers.items() if not answer.startswith("(")), answers.total()
+    )
 
 
 def material(name: str, found: bundle_score.BundleScore) -> Json:
-    """One material: its sweeps, how many of them are named rightly, not named or refused, and how many of those that get
-    its name are of it."""
+    """One material: its sweeps, how many of them are named rightly, not named or refused, and how
+    many of those that get its name are of it."""
     given = found.answered[name]
-    others = sum(answers[name] for of, answers in (found.answered | found.foreign).items() if of != name)
+    others = sum(
+        answers[name] for of, answers in (found.answered | found.foreign).items() if of != name
+    )
     unsure, unknown = (given[answer] for answer in NOT_NAMED)
     refused = sum(n for answer, n in given.items() if answer.startswith("(")) - unsure - unknown
     return {
-        "name": name, "sweeps": given.total(), "recall": _share(given[name], given.total()),
-        "precision": _share(given[name], given[name] + others), "unsure": unsure, "unknown": unknown, "refused": refused,
+        "name": name,
+        "sweeps": given.total(),
+        "recall": _share(given[name], given.total()),
+        "precision": _share(given[name], given[name] + others),
+        "unsure": unsure,
+        "unknown": unknown,
+        "refused": refused,
         "taken_for": _commonest(given, name),
-    }  # fmt: skip
+    }
 
 
 def _commonest(given: Mapping[str, int], name: str) -> list[Any]:
     """The wrong label that it gets most often and how often; empty where it gets none."""
-    wrong = Counter({answer: n for answer, n in given.items() if answer != name and not answer.startswith("(")})
+    wrong = Counter(
+        {answer: n for answer, n in given.items() if answer != name and not answer.startswith("(")}
+    )
     return [*wrong.most_common(1)[0]] if wrong else []
 
 
@@ -96,7 +125,8 @@ def _share(right: int, n: int) -> list[float]:
 
 
 def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
-    """How often the most probable label is right, by its probability; of answers with a label, `unsure` among them."""
+    """How often the most probable label is right, by its probability; of answers with a label,
+    `unsure` among them."""
     said, right = [], []
     for i, verdict in bundle_score.answers(classifier, sweeps):
         if verdict.status.classified:
@@ -104,12 +134,15 @@ def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
             right.append(verdict.label == sweeps.materials[sweeps.labels[i]])
     confidence, hit = np.array(said), np.array(right, bool)
     return {
-        "n": len(said), "error": uncertainty.error(confidence, hit), "bins": uncertainty.reliability(confidence, hit)
-    }  # fmt: skip
+        "n": len(said),
+        "error": uncertainty.error(confidence, hit),
+        "bins": uncertainty.reliability(confidence, hit),
+    }
 
 
 def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: int) -> list[Json]:
-    """How many of the sweeps the box names rightly and wrongly when one thing goes wrong, what breaks it first on top.
+    """How many of the sweeps the box names rightly and wrongly when one thing goes wrong, what
+    breaks it first on top.
 
     falls: the severity at which five points are lost; None where none is.
     """
@@ -117,6 +150,11 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
     right, wrong = given["rightly"], given["wrongly"]
     first = breaks_first(right)
     others = sorted(right.keys() - set(first), key=lambda name: (right[name]["right"][-1], name))
-    return [{"name": name, "wrong": wrong[name]["right"]}
-            | {k: right[name][k] for k in ("title", "about", "unit", "severities", "right", "total", "falls")}
-            for name in (*first, *others)]  # fmt: skip
+    return [
+        {"name": name, "wrong": wrong[name]["right"]}
+        | {
+            k: right[name][k]
+            for k in ("title", "about", "unit", "severities", "right", "total", "falls")
+        }
+        for name in (*first, *others)
+    ]

@@ -1,4 +1,5 @@
-"""The report on one bundle, a page to hand to a colleague. In: the figures of bundle_experiment, the sweeps. Out: HTML.
+"""The report on one bundle, a page to hand to a colleague. In: the figures of bundle_experiment,
+the sweeps. Out: HTML.
 
 Nothing is computed here but shares of counts.
 """
@@ -19,7 +20,8 @@ from train.reports.stress_report import level
 Array = NDArray[Any]
 Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
-"""Labels up to which the confusion matrix can be read on a phone; with more there is the table alone."""
+"""Labels up to which the confusion matrix can be read on a phone; with more there is the table
+alone."""
 MOST_SHOWN = 6
 """Materials of which a sweep is shown."""
 MATERIALS = [
@@ -32,8 +34,18 @@ MATERIALS = [
     "refused",
     "taken for",
 ]
-CORRUPTIONS = ["what goes wrong", "five points are lost at", "at the largest tried: rightly / wrongly / not named"]
-LEFT_OUT = ["left out of training", "gets a known name", "known sweeps kept", "AUROC", "sweeps, known / unknown"]
+CORRUPTIONS = [
+    "what goes wrong",
+    "five points are lost at",
+    "at the largest tried: rightly / wrongly / not named",
+]
+LEFT_OUT = [
+    "left out of training",
+    "gets a known name",
+    "known sweeps kept",
+    "AUROC",
+    "sweeps, known / unknown",
+]
 
 
 def page(figures: Json, sweeps: Dataset) -> str:
@@ -44,18 +56,41 @@ def page(figures: Json, sweeps: Dataset) -> str:
     if len(figures.get("curve", ())) > 1:
         pictures["curve"] = html.picture(curve(figures["curve"]))
     return html.render(
-        "bundle.html.j2", header=provenance.of(figures), f=figures, pictures=pictures, short=list(_in_short(figures)),
-        right=[figures["named_rightly"]["right"] / figures["named_rightly"]["total"], *figures["named_rightly"]["interval"]],
+        "bundle.html.j2",
+        header=provenance.of(figures),
+        f=figures,
+        pictures=pictures,
+        short=list(_in_short(figures)),
+        right=[
+            figures["named_rightly"]["right"] / figures["named_rightly"]["total"],
+            *figures["named_rightly"]["interval"],
+        ],
         statuses=sorted(figures["statuses"].items(), key=lambda item: -item[1]),
-        material_head=MATERIALS, materials=[_material(row) for row in figures["materials"]],
-        corruption_head=CORRUPTIONS, corruptions=[_corruption(row) for row in figures["corruptions"]],
-        foreign=[[name, sum(given.values()), given.get("(unknown)", 0), sum(n for answer, n in given.items() if answer[0] != "(")]
-                 for name, given in figures["not_in_the_bundle"].items()],
-        left_out_head=LEFT_OUT, left_out=_left_out(figures.get("left_out")),
-        held_out=[[name, formatting.estimate([of[k] for k in ("accuracy", "low", "high")]), of["n"]]
-                  for name, of in figures["figures"].items() if "accuracy" in of],
-        signals=[html.picture(sweep_plot.draw(sweep_plot.of_set(sweeps, i), plain=False)) for i in _examples(sweeps)],
-    )  # fmt: skip
+        material_head=MATERIALS,
+        materials=[_material(row) for row in figures["materials"]],
+        corruption_head=CORRUPTIONS,
+        corruptions=[_corruption(row) for row in figures["corruptions"]],
+        foreign=[
+            [
+                name,
+                sum(given.values()),
+                given.get("(unknown)", 0),
+                sum(n for answer, n in given.items() if answer[0] != "("),
+            ]
+            for name, given in figures["not_in_the_bundle"].items()
+        ],
+        left_out_head=LEFT_OUT,
+        left_out=_left_out(figures.get("left_out")),
+        held_out=[
+            [name, formatting.estimate([of[k] for k in ("accuracy", "low", "high")]), of["n"]]
+            for name, of in figures["figures"].items()
+            if "accuracy" in of
+        ],
+        signals=[
+            html.picture(sweep_plot.draw(sweep_plot.of_set(sweeps, i), plain=False))
+            for i in _examples(sweeps)
+        ],
+    )
 
 
 def _in_short(figures: Json) -> Iterator[list[str]]:
@@ -68,10 +103,18 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
             "not_named": "not named (unsure, unknown or refused)",
         }[what]
         yield [text, f"{formatting.percent(named[what] / n)}, {named[what]} of {n}"]
-    worst = min((row for row in figures["materials"] if row["recall"]), key=lambda row: row["recall"][0])
-    yield [f"the material that is named rightly least often: {worst['name']}", formatting.estimate(worst["recall"])]
+    worst = min(
+        (row for row in figures["materials"] if row["recall"]), key=lambda row: row["recall"][0]
+    )
+    yield [
+        f"the material that is named rightly least often: {worst['name']}",
+        formatting.estimate(worst["recall"]),
+    ]
     if share := figures["foreign_named"]:
-        yield ["sweeps of materials that it does not have, yet it names them", formatting.estimate(share)]
+        yield [
+            "sweeps of materials that it does not have, yet it names them",
+            formatting.estimate(share),
+        ]
     elif found := figures.get("left_out"):
         yield [
             "sweeps of a material left out of training, yet named (mean)",
@@ -79,10 +122,16 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
         ]
     if breaks := [row for row in figures["corruptions"] if row["falls"] is not None]:
         first = breaks[0]
-        yield ["what breaks it first", f"{first['title']}: five points lost at {level(first, first['falls'])}"]
+        yield [
+            "what breaks it first",
+            f"{first['title']}: five points lost at {level(first, first['falls'])}",
+        ]
     yield ["mean error of its probabilities", formatting.percent(figures["calibration"]["error"])]
     cost = figures["cost"]
-    yield ["time of a sweep, memory, disk", f"{cost['ms']:.2f} ms, {cost['mib']:.0f} MiB, {cost['kb']:.0f} kB"]
+    yield [
+        "time of a sweep, memory, disk",
+        f"{cost['ms']:.2f} ms, {cost['mib']:.0f} MiB, {cost['kb']:.0f} kB",
+    ]
 
 
 def _left_out(found: Json | None) -> list[list[str]]:
@@ -90,31 +139,55 @@ def _left_out(found: Json | None) -> list[list[str]]:
     if not found:
         return []
     rows = [
-        [name, formatting.percent(m["false_known"]), formatting.percent(m["kept"]),
-         formatting.estimate([m[k] for k in ("auroc", "low", "high")]), f"{m['known']} / {m['unknown']}"]
+        [
+            name,
+            formatting.percent(m["false_known"]),
+            formatting.percent(m["kept"]),
+            formatting.estimate([m[k] for k in ("auroc", "low", "high")]),
+            f"{m['known']} / {m['unknown']}",
+        ]
         for name, m in found["materials"].items()
-    ]  # fmt: skip
-    return [*rows, ["mean", *(formatting.percent(found["mean"][k]) for k in ("false_known", "kept", "auroc")), ""]]
+    ]
+    return [
+        *rows,
+        [
+            "mean",
+            *(formatting.percent(found["mean"][k]) for k in ("false_known", "kept", "auroc")),
+            "",
+        ],
+    ]
 
 
 def _material(row: Json) -> list[str]:
     wrong = "{} ({})".format(*row["taken_for"]) if row["taken_for"] else ""
     shares = [formatting.estimate(row[k]) if row[k] else "–" for k in ("recall", "precision")]
-    return [row["name"], str(row["sweeps"]), *shares, *(str(row[k]) for k in ("unsure", "unknown", "refused")), wrong]
+    return [
+        row["name"],
+        str(row["sweeps"]),
+        *shares,
+        *(str(row[k]) for k in ("unsure", "unknown", "refused")),
+        wrong,
+    ]
 
 
 def _corruption(row: Json) -> list[str]:
     """One thing that goes wrong, and what becomes of the sweeps at its largest severity."""
     most, right, wrong = row["severities"][-1], row["right"][-1], row["wrong"][-1]
     falls = "–" if row["falls"] is None else level(row, row["falls"])
-    shares = " / ".join(f"{100 * n / row['total']:.0f}" for n in (right, wrong, row["total"] - right - wrong))
+    shares = " / ".join(
+        f"{100 * n / row['total']:.0f}" for n in (right, wrong, row["total"] - right - wrong)
+    )
     return [f"{row['title']}: {row['about']}", falls, f"{level(row, most)}: {shares} %"]
 
 
 def _examples(sweeps: Dataset) -> list[int]:
     """A sweep of each of the first materials: the middle one of its own."""
     labels = np.unique(sweeps.labels)[:MOST_SHOWN]
-    return [int(own[len(own) // 2]) for label in labels if len(own := np.flatnonzero(sweeps.labels == label))]
+    return [
+        int(own[len(own) // 2])
+        for label in labels
+        if len(own := np.flatnonzero(sweeps.labels == label))
+    ]
 
 
 def confusion(figures: Json) -> str:
@@ -147,7 +220,12 @@ def curve(points: Sequence[Json]) -> str:
     figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.15, bottom=0.5)
     each, share = [p["each"] for p in points], [p["share"] for p in points]
     axes.fill_between(
-        each, [p["low"] for p in points], [p["high"] for p in points], color=ACCENT, alpha=0.13, linewidth=0
+        each,
+        [p["low"] for p in points],
+        [p["high"] for p in points],
+        color=ACCENT,
+        alpha=0.13,
+        linewidth=0,
     )
     axes.plot(each, share, color=ACCENT, linewidth=2, marker="o", markersize=4)
     axes.set_xscale("log")

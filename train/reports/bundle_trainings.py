@@ -1,7 +1,9 @@
-"""What a report on a bundle needs trainings for: how accuracy grows with sweeps, and whether a material that was left out is
-noticed. In: the sweeps that the bundle was fitted to, those that it is tested on. Out: figures as JSON.
+"""What a report on a bundle needs trainings for: how accuracy grows with sweeps, and whether a
+material that was left out is noticed. In: the sweeps that the bundle was fitted to, those that it
+is tested on. Out: figures as JSON.
 
-Trained is the method of the bundle by its usual settings; finished trainings are kept, as those of evaluate are.
+Trained is the method of the bundle by its usual settings; finished trainings are kept, as those of
+evaluate are.
 """
 
 from __future__ import annotations
@@ -37,13 +39,21 @@ def run(
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
 ) -> Json:
-    """`trained`: what was trained; `curve`: points of the learning curve; `left_out`: of each material left out of training;
-    `why_not`: why there is no such figure. made: of the bundle's manifest. Raises FormatError where the sets do not fit."""
+    """`trained`: what was trained; `curve`: points of the learning curve; `left_out`: of each
+    material left out of training; `why_not`: why there is no such figure. made: of the bundle's
+    manifest. Raises FormatError where the sets do not fit."""
     method = made.get("method", SHIPPED if "chosen" in made else "")
     if not method:
         return {"why_not": "the bundle was fitted with settings of its own, which no method has"}
     test = aligned(test, train)
-    figures: Json = {"trained": {"method": method, "set": train.source, "sweeps": len(train), "effort": effort.share}}
+    figures: Json = {
+        "trained": {
+            "method": method,
+            "set": train.source,
+            "sweeps": len(train),
+            "effort": effort.share,
+        }
+    }
     figures["curve"] = curve(method, train, test, where, log, effort)
     if len(train.materials) > 2:
         try:
@@ -57,14 +67,20 @@ def run(
 def whole(fit: Fit) -> Dataset:
     """All sweeps of a fit, those that were held out behind those that were trained on."""
     parts = (fit.train, fit.held)
-    groups = {name: np.concatenate([part.groups[name] for part in parts]) for name in fit.train.groups}
-    samples, labels = (np.concatenate([getattr(part, name) for part in parts]) for name in ("samples", "labels"))
+    groups = {
+        name: np.concatenate([part.groups[name] for part in parts]) for name in fit.train.groups
+    }
+    samples, labels = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("samples", "labels")
+    )
     return replace(fit.train, samples=samples, labels=labels, groups=groups, unloaded=None)
 
 
-def curve(method: str, train: Dataset, test: Dataset, where: Where, log: Log, effort: Effort) -> list[Json]:
-    """Accuracy on `test` after training on some sweeps of each material: `each`, `share`, `low`, `high`, `n`; the last point
-    is of all of `train`, and its `each` the mean."""
+def curve(
+    method: str, train: Dataset, test: Dataset, where: Where, log: Log, effort: Effort
+) -> list[Json]:
+    """Accuracy on `test` after training on some sweeps of each material: `each`, `share`, `low`,
+    `high`, `n`; the last point is of all of `train`, and its `each` the mean."""
     both = sets.join([train, test])
     counts = np.bincount(train.labels, minlength=len(train.materials))
     points = []
@@ -74,10 +90,15 @@ def curve(method: str, train: Dataset, test: Dataset, where: Where, log: Log, ef
             if result.refused:
                 continue  # too few sweeps for it; with more there is a point
             found = result.json()
-            points.append({
-                "each": each or float(counts.mean()), "share": found["window"]["right"] / found["window"]["total"],
-                "low": found["interval"][0], "high": found["interval"][1], "n": found["window"]["total"],
-            })  # fmt: skip
+            points.append(
+                {
+                    "each": each or float(counts.mean()),
+                    "share": found["window"]["right"] / found["window"]["total"],
+                    "low": found["interval"][0],
+                    "high": found["interval"][1],
+                    "n": found["window"]["total"],
+                }
+            )
     return points
 
 
@@ -87,7 +108,11 @@ def aligned(test: Dataset, train: Dataset) -> Dataset:
     Raises FormatError where their formats differ.
     """
     if test.format != train.format:
-        raise FormatError(f"{train.source} is of {train.format}, {test.source} of {test.format}; name sets of one form")
-    numbers = np.array([train.materials.index(name) if name in train.materials else -1 for name in test.materials])
+        raise FormatError(
+            f"{train.source} is of {train.format}, {test.source} of {test.format}; name sets of one form"
+        )
+    numbers = np.array(
+        [train.materials.index(name) if name in train.materials else -1 for name in test.materials]
+    )
     known = test.take(numbers[test.labels] >= 0)
     return replace(known, labels=numbers[known.labels], materials=train.materials)

@@ -1,7 +1,8 @@
-"""The command `chart`: speed against accuracy. In: what to compare. Out: chart.json, a picture and a page.
+"""The command `chart`: speed against accuracy. In: what to compare. Out: chart.json, a picture and
+a page.
 
-Accuracy comes from evaluate and stress, whose finished work is kept; the costs of all dots are measured in one run. An
-interrupted command goes on where it was.
+Accuracy comes from evaluate and stress, whose finished work is kept; the costs of all dots are
+measured in one run. An interrupted command goes on where it was.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ SEVEN = ("direction=0", "force<=180")
 
 @dataclass(frozen=True)
 class ChartPart:
-    """An axis of accuracy. sets: are joined; real: they are files in the folder of real sweeps. only: of each set."""
+    """An axis of accuracy. sets: are joined; real: they are files in the folder of real sweeps.
+    only: of each set."""
 
     sets: tuple[str, ...]
     protocol: str
@@ -63,7 +65,8 @@ class ChartPart:
 class Chart:
     """What is compared. train, trial: of the stress; the bundles are trained on `train` too.
 
-    named: methods of the chart; others: those that join where an earlier run has left results. rounds: of timing.
+    named: methods of the chart; others: those that join where an earlier run has left results.
+    rounds: of timing.
     """
 
     parts: dict[str, ChartPart]
@@ -106,7 +109,9 @@ FULL = Chart(
 )
 QUICK = Chart(
     {
-        "hard": ChartPart(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)),
+        "hard": ChartPart(
+            ("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", ("position<=2",)
+        ),
         "lopo": ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
     },
     "sim:T-REAL:1001:3",
@@ -135,26 +140,40 @@ class Charting:
         """All of them, as chart.json lists them."""
         accuracy = self.accuracy()
         with tempfile.TemporaryDirectory() as work:
-            made = list(self.packed({method for method, _ in accuracy}, self.where.cache or Path(work)))
+            made = list(
+                self.packed({method for method, _ in accuracy}, self.where.cache or Path(work))
+            )
             self.log(f"{len(made)} models take turns")
             train = sets.load(self.chart.train).select(self.chart.only)
             costs = model_forms.measured(made, train.samples, self.chart.rounds)
         known = {"seeds": list(self.seeds), "set": train.source} | score.provenance()
-        return [self._dot(one, cost, accuracy.get((one.method, one.form), {})) | known
-                for one, cost in zip(made, costs, strict=True)]  # fmt: skip
+        return [
+            self._dot(one, cost, accuracy.get((one.method, one.form), {})) | known
+            for one, cost in zip(made, costs, strict=True)
+        ]
 
     def _dot(self, one: Packed, costs: Json, accuracy: Json) -> Json:
-        """Costs and accuracy of one; touch time is the mean part of the window that early exit needs, of the method itself."""
+        """Costs and accuracy of one; touch time is the mean part of the window that early exit
+        needs, of the method itself."""
         share = self.touch.get(one.method, 1.0) if not one.form else 1.0
-        return costs | {"touch_s": round(one.window_s * share, 3), "family": family(one.method), "accuracy": accuracy}
+        return costs | {
+            "touch_s": round(one.window_s * share, 3),
+            "family": family(one.method),
+            "accuracy": accuracy,
+        }
 
     def accuracy(self) -> Accuracy:
         """Of all methods and their forms, by protocol."""
         known = methods.every(self.effort)
         named = [name for name in self.chart.named if name in known]
-        self.left_out |= {name: "no such method here" for name in self.chart.named if name not in known}
+        self.left_out |= {
+            name: "no such method here" for name in self.chart.named if name not in known
+        }
         found: Accuracy = {}
-        for names, where in ((named, self.where), (self.chart.others, replace(self.where, kept=True))):
+        for names, where in (
+            (named, self.where),
+            (self.chart.others, replace(self.where, kept=True)),
+        ):
             if not names:
                 continue
             for protocol, part in self.chart.parts.items():
@@ -162,7 +181,9 @@ class Charting:
             self._stressed(found, [name for name in names if (name, "") in found], where)
         return found
 
-    def _evaluated(self, found: Accuracy, protocol: str, part: ChartPart, names: Sequence[str], where: Where) -> None:
+    def _evaluated(
+        self, found: Accuracy, protocol: str, part: ChartPart, names: Sequence[str], where: Where
+    ) -> None:
         """Add what methods and their forms reach under one protocol."""
         sweeps = part.load(self.data)
         if sweeps is None:
@@ -181,9 +202,15 @@ class Charting:
             found.setdefault(named, {})[protocol] = joined(results)
 
     def _stressed(self, found: Accuracy, names: Sequence[str], where: Where) -> None:
-        """Add accuracies under stress of the methods themselves; robustness does not test their other forms."""
-        train, trial = sets.load(self.chart.train).select(self.chart.only), EvaluationSweeps.simulated(self.chart.trial)
-        result = robustness.run(names, train, trial, where, seeds=self.seeds, effort=self.effort, log=self.log)
+        """Add accuracies under stress of the methods themselves; robustness does not test their
+        other forms."""
+        train, trial = (
+            sets.load(self.chart.train).select(self.chart.only),
+            EvaluationSweeps.simulated(self.chart.trial),
+        )
+        result = robustness.run(
+            names, train, trial, where, seeds=self.seeds, effort=self.effort, log=self.log
+        )
         for name, entry in result["methods"].items():
             if entry["curves"]:
                 found[name, ""] |= under_stress(entry)
@@ -213,21 +240,27 @@ def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
 
 
 def joined(results: Sequence[Json]) -> Json:
-    """Results of several seeds of one protocol as one: means of accuracies and of the ends of intervals."""
+    """Results of several seeds of one protocol as one: means of accuracies and of the ends of
+    intervals."""
     shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
     seeds = sorted(r["seed"] for r in results)
     return _entry(np.mean(shares, axis=0), results[0]["window"]["total"], seeds)
 
 
 def under_stress(entry: Json) -> dict[str, Json]:
-    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean over severities, and robustness.TARGETS."""
+    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean
+    over severities, and robustness.TARGETS."""
     curves, seeds = entry["curves"], entry["seeds"]
     n = next(iter(curves.values()))["total"] // len(seeds)
-    mean = {name: [float(np.mean(c[k][1:])) for k in ("accuracy", "low", "high")] for name, c in curves.items()}
+    mean = {
+        name: [float(np.mean(c[k][1:])) for k in ("accuracy", "low", "high")]
+        for name, c in curves.items()
+    }
     worst = min(mean, key=lambda name: (mean[name][0], name))
     entries = {"stress": _entry(mean[worst], n, seeds) | {"name": worst}}
     return entries | {
-        f"stress:{key}": _entry(shares, n, seeds) for key, shares in robustness.at_targets(curves).items()
+        f"stress:{key}": _entry(shares, n, seeds)
+        for key, shares in robustness.at_targets(curves).items()
     }
 
 
@@ -238,7 +271,8 @@ def _entry(shares: Iterable[float], n: int, seeds: Sequence[int]) -> Json:
 
 
 def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
-    """Mean share of the sweep that each method needs with early exit, from files of `palpate-train certainty`.
+    """Mean share of the sweep that each method needs with early exit, from files of `palpate-train
+    certainty`.
 
     Raises FormatError where a file has another content.
     """
@@ -253,7 +287,8 @@ def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
 
 
 def box_on_hard(file: Path) -> Json | None:
-    """What the packaged bundle answers to T-HARD's sweeps, as `palpate-train alignment` wrote it; None where it did not."""
+    """What the packaged bundle answers to T-HARD's sweeps, as `palpate-train alignment` wrote it;
+    None where it did not."""
     try:
         point: Json = json.loads(file.read_bytes())["T-HARD"]
     except (OSError, ValueError, KeyError):
@@ -262,18 +297,25 @@ def box_on_hard(file: Path) -> Json | None:
 
 
 def read(out: Path) -> list[Json]:
-    """The dots that `write` put into the folder `out`. Raises FormatError where they are not there."""
+    """The dots that `write` put into the folder `out`. Raises FormatError where they are not
+    there."""
     try:
         dots: list[Json] = json.loads((out / "chart.json").read_bytes())
     except (OSError, ValueError) as e:
-        raise FormatError(f"{out}/chart.json is not a chart: {e}; run the command without --draw") from e
+        raise FormatError(
+            f"{out}/chart.json is not a chart: {e}; run the command without --draw"
+        ) from e
     return dots
 
 
-def write(out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[str, str] | None = None) -> Path:
+def write(
+    out: Path, found: Sequence[Json], quick: bool = False, left_out: dict[str, str] | None = None
+) -> Path:
     """chart.json, chart.svg and index.html in the folder `out`; the page's path."""
     lines = ",\n".join(json.dumps(dot, allow_nan=False) for dot in found)
     put(out / "chart.json", f"[\n{lines}\n]\n".encode(), parents=True)
     picture = scatter.chart(found)
-    page = chart_page.html(found, picture, quick, left_out or {}, box_on_hard(out.parent / BOX_ON_HARD))
+    page = chart_page.html(
+        found, picture, quick, left_out or {}, box_on_hard(out.parent / BOX_ON_HARD)
+    )
     return html.publish(out, {"index": page}, {"chart": picture}, provenance.of(list(found)))

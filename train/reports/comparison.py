@@ -1,4 +1,5 @@
-"""Ours beside the best peer. In: accuracies with their intervals. Out: a line of a table, with what fell short said in words."""
+"""Ours beside the best peer. In: accuracies with their intervals. Out: a line of a table, with what
+fell short said in words."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ ROUNDING = 1e-9
 
 
 def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
-    """A line of the table: the best of `peers` by name (it is chosen after the fact), the difference, and a verdict.
+    """A line of the table: the best of `peers` by name (it is chosen after the fact), the
+    difference, and a verdict.
 
     Entries have `mean`, `low` and `high`. Without a peer there is no verdict.
     """

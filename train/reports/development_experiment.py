@@ -1,8 +1,10 @@
-"""All methods on all development sets. In: methods, seeds. Out: the figures of the command `development`, as JSON.
+"""All methods on all development sets. In: methods, seeds. Out: the figures of the command
+`development`, as JSON.
 
-One set is never enough to tune on: a recipe that was fitted to one shows here at once on the others. Accuracy comes from
-evaluate, whose finished folds are kept: an interrupted command goes on where it was, and `kept` reports what there is.
-The skin that was attached anew (T-HARD) is not among the sets: the simulator cannot be trusted with it, see decision 10.
+One set is never enough to tune on: a recipe that was fitted to one shows here at once on the
+others. Accuracy comes from evaluate, whose finished folds are kept: an interrupted command goes on
+where it was, and `kept` reports what there is. The skin that was attached anew (T-HARD) is not
+among the sets: the simulator cannot be trusted with it, see decision 10.
 """
 
 from __future__ import annotations
@@ -25,15 +27,23 @@ Json = dict[str, Any]
 Log = Callable[[str], None]
 OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
 """No peers; the first of them that is there is compared with the peers."""
-PEERS = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant", "ds-cnn", "lite", "edge-spectral")
+PEERS = (
+    "minirocket",
+    "minirocket-augmented",
+    "multirocket-hydra",
+    "quant",
+    "ds-cnn",
+    "lite",
+    "edge-spectral",
+)
 EACH = (5, 10, 20)
 """Points of a learning curve, as far as a set has more sweeps of each material than that."""
 
 
 @dataclass(frozen=True)
 class DevelopmentCase:
-    """One set under one protocol. means_removed: each taxel's mean over the window is taken away. curve: training sweeps of
-    each material along its learning curve, before all of them."""
+    """One set under one protocol. means_removed: each taxel's mean over the window is taken away.
+    curve: training sweeps of each material along its learning curve, before all of them."""
 
     name: str
     part: ChartPart
@@ -49,12 +59,16 @@ class DevelopmentCase:
 FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
 
 
-def _fabrics(name: str, protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> DevelopmentCase:
+def _fabrics(
+    name: str, protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()
+) -> DevelopmentCase:
     return DevelopmentCase(name, ChartPart((FABRICS,), protocol, only, real=True), curve=curve)
 
 
 def _published(name: str, curve: tuple[int, ...] = ()) -> DevelopmentCase:
-    return DevelopmentCase(f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"), curve=curve)
+    return DevelopmentCase(
+        f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"), curve=curve
+    )
 
 
 REAL = ChartPart(("sim:T-REAL:1",), "leave:position")
@@ -75,9 +89,13 @@ CASES = (
 """In the order of the page."""
 QUICK = (
     _published("GunPoint"),
-    DevelopmentCase("simulated tubes, a position out",
-         ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)), means_removed=False, curve=EACH),
-)  # fmt: skip
+    DevelopmentCase(
+        "simulated tubes, a position out",
+        ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
+        means_removed=False,
+        curve=EACH,
+    ),
+)
 QUICK_METHODS = ("compact-50k", "edge-spectral", "L-gauss")
 QUICK_EFFORT = Effort(share=0.02)
 
@@ -90,8 +108,8 @@ def usual_methods() -> tuple[str, ...]:
 
 @dataclass
 class Development:
-    """One run of the command. not_wanted: names of cases, or of points of their curves ("NAME, 5 each"), that are not run.
-    left_out: what is missing, and why."""
+    """One run of the command. not_wanted: names of cases, or of points of their curves ("NAME, 5
+    each"), that are not run. left_out: what is missing, and why."""
 
     cases: Sequence[DevelopmentCase]
     names: Sequence[str]
@@ -104,7 +122,8 @@ class Development:
     left_out: dict[str, str] = field(default_factory=dict)
 
     def results(self) -> Json:
-        """All figures: `cases` with what they were run on, and `results` by case, method and training sweeps.
+        """All figures: `cases` with what they were run on, and `results` by case, method and
+        training sweeps.
 
         Raises FormatError for an unknown method, and where what is not wanted does not exist.
         """
@@ -115,17 +134,31 @@ class Development:
         for number, case in enumerate(self.cases, 1):
             sweeps = case.part.load(self.data)
             if sweeps is None:
-                self.left_out[case.name] = "real sweeps; name their folder with --data or PALPATE_DATA"
+                self.left_out[case.name] = (
+                    "real sweeps; name their folder with --data or PALPATE_DATA"
+                )
                 continue
             cases.append(_about(case, sweeps))
             for each, name in _points(case):
                 if name in self.not_wanted or case.name in self.not_wanted:
                     self.left_out[name] = f"not wanted in the run of {', '.join(self.names)}"
                 else:
-                    found += self._evaluated(case, sweeps, each, f"{number}/{len(self.cases)} {name}")
-        known = {"methods": list(self.names), "seeds": list(self.seeds), "effort": self.effort.share}
+                    found += self._evaluated(
+                        case, sweeps, each, f"{number}/{len(self.cases)} {name}"
+                    )
+        known = {
+            "methods": list(self.names),
+            "seeds": list(self.seeds),
+            "effort": self.effort.share,
+        }
         runs = [known | score.provenance()]
-        return {"methods": list(self.names), "runs": runs, "cases": cases, "results": found, "left_out": self.left_out}
+        return {
+            "methods": list(self.names),
+            "runs": runs,
+            "cases": cases,
+            "results": found,
+            "left_out": self.left_out,
+        }
 
     def _require_known(self, names: Sequence[str]) -> None:
         known = [name for case in self.cases for _, name in _points(case)]
@@ -133,9 +166,14 @@ class Development:
             if name not in known:
                 raise FormatError(f"{name!r} is no case; leave out some of {'; '.join(known)}")
 
-    def _evaluated(self, case: DevelopmentCase, sweeps: Dataset, each: int, what: str) -> Iterator[Json]:
-        """One entry for each method that can take the set and is complete with all seeds that were found."""
-        plan = Plan(self.names, (case.part.protocol,), self.seeds, case.means_removed, self.effort, each)
+    def _evaluated(
+        self, case: DevelopmentCase, sweeps: Dataset, each: int, what: str
+    ) -> Iterator[Json]:
+        """One entry for each method that can take the set and is complete with all seeds that were
+        found."""
+        plan = Plan(
+            self.names, (case.part.protocol,), self.seeds, case.means_removed, self.effort, each
+        )
         by_method: dict[str, list[Json]] = {}
 
         def log(line: str) -> None:
@@ -145,13 +183,16 @@ class Development:
             if result.refused:
                 self.left_out[f"{result.method}, {case.name}"] = result.refused
             else:
-                by_method.setdefault(result.method, []).append(result.json() | {"seed": result.seed})
+                by_method.setdefault(result.method, []).append(
+                    result.json() | {"seed": result.seed}
+                )
         for method, results in by_method.items():
             yield {"case": case.name, "each": each, "method": method} | _entry(results)
 
 
 def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
-    """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and points of its curve."""
+    """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and
+    points of its curve."""
     return [(each, _name(case.name, each)) for each in (0, *case.curve)]
 
 
@@ -161,7 +202,8 @@ def _name(case: str, each: int) -> str:
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
-    """`run` with what it lacks of `earlier` runs: methods, their entries, what they left out, who ran when, and times.
+    """`run` with what it lacks of `earlier` runs: methods, their entries, what they left out, who
+    ran when, and times.
 
     Raises FormatError where an earlier run was of other sweeps.
     """
@@ -169,12 +211,17 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
     for one in earlier:
         _require_same_sweeps(made, one)
         there = {(entry["case"], entry["each"], entry["method"]) for entry in made["results"]}
-        more = [entry for entry in one["results"] if (entry["case"], entry["each"], entry["method"]) not in there]
+        more = [
+            entry
+            for entry in one["results"]
+            if (entry["case"], entry["each"], entry["method"]) not in there
+        ]
         names = dict.fromkeys([*made["methods"], *one["methods"]])
         made |= {
             "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
-            "results": [*made["results"], *more], "runs": [*made["runs"], *one["runs"]],
-        }  # fmt: skip
+            "results": [*made["results"], *more],
+            "runs": [*made["runs"], *one["runs"]],
+        }
         if one.get("times"):
             made.setdefault("times", one["times"])
         done = {
@@ -182,7 +229,9 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
             for entry in made["results"]
             for name in (f"{entry['method']}, {entry['case']}", _name(entry["case"], entry["each"]))
         }
-        made["left_out"] = {k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done}
+        made["left_out"] = {
+            k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done
+        }
     return made
 
 
@@ -190,23 +239,39 @@ def _require_same_sweeps(run: Json, earlier: Json) -> None:
     known = {case["case"]: case["digest"] for case in earlier["cases"]}
     for case in run["cases"]:
         if known.get(case["case"], case["digest"]) != case["digest"]:
-            raise FormatError(f"{case['case']!r} was of other sweeps in a run that is joined; run its methods again")
+            raise FormatError(
+                f"{case['case']!r} was of other sweeps in a run that is joined; run its methods again"
+            )
 
 
 def _about(case: DevelopmentCase, sweeps: Dataset) -> Json:
     """What a case was run on."""
     return {
-        "case": case.name, "set": sweeps.source, "only": list(case.part.only), "protocol": case.part.protocol,
-        "means_removed": case.means_removed, "simulated": case.simulated, "sweeps": len(sweeps), "materials": len(sweeps.materials),
-        "format": str(sweeps.format), "digest": digest(sweeps), "curve": list(case.curve),
-    }  # fmt: skip
+        "case": case.name,
+        "set": sweeps.source,
+        "only": list(case.part.only),
+        "protocol": case.part.protocol,
+        "means_removed": case.means_removed,
+        "simulated": case.simulated,
+        "sweeps": len(sweeps),
+        "materials": len(sweeps.materials),
+        "format": str(sweeps.format),
+        "digest": digest(sweeps),
+        "curve": list(case.curve),
+    }
 
 
 def _entry(results: Sequence[Json]) -> Json:
-    """Accuracy with its interval, and costs, of the results of all seeds; so too of each other precision."""
+    """Accuracy with its interval, and costs, of the results of all seeds; so too of each other
+    precision."""
     seeds = [result["seed"] for result in results]
     forms = {
-        name: joined([result["forms"][name] | {"seed": seed} for result, seed in zip(results, seeds, strict=True)])
+        name: joined(
+            [
+                result["forms"][name] | {"seed": seed}
+                for result, seed in zip(results, seeds, strict=True)
+            ]
+        )
         for name in results[0].get("forms", {})
     }
     costs = {name: max(float(result[name]) for result in results) for name in ("fit_s", "ms_p50")}

@@ -35,8 +35,11 @@ FEW = (0, 0.5, 0.8, 0.9, 0.95, 1)
 """Ticks of small plots."""
 
 
-def lines(cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]) -> str:
-    """A line for each case: every peer a grey dot, the best of them dark and named, ours in the accent colour with its interval."""
+def lines(
+    cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]
+) -> str:
+    """A line for each case: every peer a grey dot, the best of them dark and named, ours in the
+    accent colour with its interval."""
     figure, axes = single_axes(0.36 * len(cases) + 1.0, left=0.56, right=0.95, top=0.42, bottom=0.5)
     lows: list[float] = []
     for y, case in enumerate(cases):
@@ -49,24 +52,49 @@ def lines(cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, pee
         axes.plot(row[ours]["mean"], y, "o", color=ACCENT, markersize=6, clip_on=False)
         if best:
             axes.plot(there[best], y, "o", color=BLACK, markersize=4, clip_on=False)
-        for up, text, shade in ((6, plain_case(case), BLACK), (-6, plain_name(best) if best else "no peer", GREY)):
-            axes.annotate(text, (0, y), (-6, up), ("axes fraction", "data"), textcoords="offset points", ha="right",
-                          va="center", color=shade, size=SMALL)  # fmt: skip
+        for up, text, shade in (
+            (6, plain_case(case), BLACK),
+            (-6, plain_name(best) if best else "no peer", GREY),
+        ):
+            axes.annotate(
+                text,
+                (0, y),
+                (-6, up),
+                ("axes fraction", "data"),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                color=shade,
+                size=SMALL,
+            )
         lows += [row[ours]["low"], chance, *there.values()]
     axes.set_ylim(len(cases) - 0.5, -0.5)
     accuracy_axis.stretch(axes, "x", lows, FEW)
     axes.set_xlabel("sweeps named rightly", color=GREY, size=SMALL, labelpad=3)
     axes.grid(axis="x", color=FAINT, linewidth=0.6)
     set_ticks(axes.yaxis, [])
-    legend = ((22, -1.4, f"● {plain_name(ours)}, 95 % interval", ACCENT), (8, -1.4, "● best peer, named", BLACK),
-              (8, -0.4, "● other peers", GREY), (8, 0.35, "| guessing", GREY))  # fmt: skip
+    legend = (
+        (22, -1.4, f"● {plain_name(ours)}, 95 % interval", ACCENT),
+        (8, -1.4, "● best peer, named", BLACK),
+        (8, -0.4, "● other peers", GREY),
+        (8, 0.35, "| guessing", GREY),
+    )
     for up, x, text, shade in legend:
-        axes.annotate(text, (x, 1), (0, up), "axes fraction", textcoords="offset points", color=shade, size=SMALL)
+        axes.annotate(
+            text,
+            (x, 1),
+            (0, up),
+            "axes fraction",
+            textcoords="offset points",
+            color=shade,
+            size=SMALL,
+        )
     return to_svg(figure, f"accuracy of {plain_name(ours)} and its peers on each development set")
 
 
 def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> str:
-    """A plot for each case: accuracy over training sweeps of a material; ours stands out, and the peer that has most in the end.
+    """A plot for each case: accuracy over training sweeps of a material; ours stands out, and the
+    peer that has most in the end.
 
     found: {case: {method: {training sweeps, 0 for all: entry}}}.
     """
@@ -81,18 +109,41 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
         for name in sorted(those, key=lambda name: name in (ours, peer)):
             look = LOOKS[0] if name == ours else LOOKS[1] if name == peer else THIN
             line = sorted(those[name].items(), key=lambda item: at[item[0]])
-            axes.plot([at[n] for n, _ in line], [entry["mean"] for _, entry in line], clip_on=False, **look)
+            axes.plot(
+                [at[n] for n, _ in line],
+                [entry["mean"] for _, entry in line],
+                clip_on=False,
+                **look,
+            )
         chance = 1 / cases[case]["materials"]
         axes.set_ylabel(
-            f"Named rightly: {plain_case(cases[case])}", color=BLACK, size=MEDIUM, rotation=0, ha="left", va="bottom"
+            f"Named rightly: {plain_case(cases[case])}",
+            color=BLACK,
+            size=MEDIUM,
+            rotation=0,
+            ha="left",
+            va="bottom",
         )
         axes.yaxis.set_label_coords(-0.11, 1.19)
-        for x, text, shade in ((-0.11, f"━ {plain_name(ours)}", ACCENT), (0.3, f"╍ {plain_name(peer)}" if peer else "", BLACK),
-                               (0.72, "thin: other peers", GREY)):  # fmt: skip
-            axes.annotate(text, (x, 1), (0, 9), "axes fraction", textcoords="offset points", color=shade, size=SMALL)
+        for x, text, shade in (
+            (-0.11, f"━ {plain_name(ours)}", ACCENT),
+            (0.3, f"╍ {plain_name(peer)}" if peer else "", BLACK),
+            (0.72, "thin: other peers", GREY),
+        ):
+            axes.annotate(
+                text,
+                (x, 1),
+                (0, 9),
+                "axes fraction",
+                textcoords="offset points",
+                color=shade,
+                size=SMALL,
+            )
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         axes.set_xlim(-0.1, len(EACH) + 0.1)
-        accuracy_axis.stretch(axes, "y", [chance, *(e["mean"] for line in those.values() for e in line.values())], FEW)
+        accuracy_axis.stretch(
+            axes, "y", [chance, *(e["mean"] for line in those.values() for e in line.values())], FEW
+        )
         accuracy_axis.draw_chance(axes, chance)
         set_categories(axes.xaxis, range(len(EACH) + 1), [*map(str, EACH), "all"])
         axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL, labelpad=3)
@@ -100,7 +151,10 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
 
 
 def _leader(those: Mapping[str, Mapping[int, Json]], ours: str) -> str:
-    """The peer with the whole curve that is most accurate with all sweeps; "" where there is no peer."""
+    """The peer with the whole curve that is most accurate with all sweeps; "" where there is no
+    peer."""
     points = max(map(len, those.values()))
-    whole = [name for name, line in those.items() if name not in (ours, *OURS) and len(line) == points]
+    whole = [
+        name for name, line in those.items() if name not in (ours, *OURS) and len(line) == points
+    ]
     return max(whole, key=lambda name: float(those[name][0]["mean"]), default="")

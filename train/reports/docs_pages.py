@@ -1,7 +1,9 @@
-"""The project's pages: what makes each, and whether it is of today. In: docs/. Out: their states, and the pages again.
+"""The project's pages: what makes each, and whether it is of today. In: docs/. Out: their states,
+and the pages again.
 
-A page is made by one command, which is run as a process of its own: `python -m` and its words. What has finished stays:
-folds in evaluate's cache, and a page that is of today's default is not made twice.
+A page is made by one command, which is run as a process of its own: `python -m` and its words. What
+has finished stays: folds in evaluate's cache, and a page that is of today's default is not made
+twice.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ COMMANDS = {"train": "palpate-train", "appliance": "palpate"}
 class DocsPage:
     """One page. file, results: below docs/. words: what `python -m` runs. needs: keys of NEEDS.
 
-    folds: whether the command takes the options that say where folds run and are kept. drawn: whether it takes --draw, which
-    draws the page of the results that are there.
+    folds: whether the command takes the options that say where folds run and are kept. drawn:
+    whether it takes --draw, which draws the page of the results that are there.
     """
 
     name: str
@@ -56,7 +58,8 @@ class DocsPage:
         return [need for need in self.needs if not NEEDS[need]()]
 
     def stale(self) -> str:
-        """Why it has to be made again; "" where it is of today's default, and shows the results that lie beside it."""
+        """Why it has to be made again; "" where it is of today's default, and shows the results
+        that lie beside it."""
         try:
             shown, found = (provenance.read(DOCS / name) for name in (self.file, self.results))
         except FormatError as e:
@@ -67,21 +70,81 @@ class DocsPage:
 
 
 PAGES = (
-    DocsPage("development", "development/index.html", "development/results.json", ("train", "development"), (REAL,), True, True),
-    DocsPage("alignment", "alignment/README.md", "alignment/place.json", ("train", "alignment", "--out", "docs/alignment"),
-             drawn=True),
-    DocsPage("certainty", "certainty/index.html", "certainty/results.json",
-             ("train", "certainty", "--method", "default-reattached", "--set", "sim:T-REAL:1-3", "--test", "sim:T-REAL:4-6:20"), folds=True),
-    DocsPage("chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True, True),
-    DocsPage("fabrics", "fabricslide/README.md", "fabricslide/results.json", ("train", "fabrics"), (REAL,), True, True),
-    DocsPage("stress", "stress/index.html", "stress/results.json", ("train", "stress"), folds=True, drawn=True),
-    DocsPage("paper", "paper/index.html", "paper/results.json", ("train", "paper"), folds=True, drawn=True),
+    DocsPage(
+        "development",
+        "development/index.html",
+        "development/results.json",
+        ("train", "development"),
+        (REAL,),
+        True,
+        True,
+    ),
+    DocsPage(
+        "alignment",
+        "alignment/README.md",
+        "alignment/place.json",
+        ("train", "alignment", "--out", "docs/alignment"),
+        drawn=True,
+    ),
+    DocsPage(
+        "certainty",
+        "certainty/index.html",
+        "certainty/results.json",
+        (
+            "train",
+            "certainty",
+            "--method",
+            "default-reattached",
+            "--set",
+            "sim:T-REAL:1-3",
+            "--test",
+            "sim:T-REAL:4-6:20",
+        ),
+        folds=True,
+    ),
+    DocsPage(
+        "chart", "chart/index.html", "chart/chart.json", ("train", "chart"), (REAL,), True, True
+    ),
+    DocsPage(
+        "fabrics",
+        "fabricslide/README.md",
+        "fabricslide/results.json",
+        ("train", "fabrics"),
+        (REAL,),
+        True,
+        True,
+    ),
+    DocsPage(
+        "stress",
+        "stress/index.html",
+        "stress/results.json",
+        ("train", "stress"),
+        folds=True,
+        drawn=True,
+    ),
+    DocsPage(
+        "paper",
+        "paper/index.html",
+        "paper/results.json",
+        ("train", "paper"),
+        folds=True,
+        drawn=True,
+    ),
     DocsPage("overview", "overview.svg", "overview.svg", ("train", "overview")),
-    DocsPage("bench", "bench.json", "bench.json", ("appliance", "bench", "--json", "docs/bench.json")),
+    DocsPage(
+        "bench", "bench.json", "bench.json", ("appliance", "bench", "--json", "docs/bench.json")
+    ),
     DocsPage("skins", "skins.md", "skins.json", ("tests.skins",)),
-    DocsPage("soak", "soak/index.html", "soak/results.json", ("tests.rig.soak", "--out", "docs/soak"), (EMULATOR,)),
-)  # fmt: skip
-"""Those that tell most come first. The last three measure this machine, too: let it do nothing else meanwhile."""
+    DocsPage(
+        "soak",
+        "soak/index.html",
+        "soak/results.json",
+        ("tests.rig.soak", "--out", "docs/soak"),
+        (EMULATOR,),
+    ),
+)
+"""Those that tell most come first. The last three measure this machine, too: let it do nothing else
+meanwhile."""
 
 
 def names() -> list[str]:
@@ -99,13 +162,17 @@ def named(wanted: Sequence[str]) -> list[DocsPage]:
 def require_project() -> None:
     """Raises FormatError where the working folder is not the project's."""
     if not (DOCS.is_dir() and Path("README.md").is_file()):
-        raise FormatError(f"{Path.cwd()} has no docs/ and README.md; run this in the project's folder")
+        raise FormatError(
+            f"{Path.cwd()} has no docs/ and README.md; run this in the project's folder"
+        )
 
 
 def table(pages: Sequence[DocsPage]) -> str:
     """A line for each page: its name, its command, and why it would be made again or left out."""
     width = max(len(page.name) for page in pages)
-    lines = [f"{page.name:<{width}}  {_state(page)}\n{'':<{width}}  {page.command}" for page in pages]
+    lines = [
+        f"{page.name:<{width}}  {_state(page)}\n{'':<{width}}  {page.command}" for page in pages
+    ]
     return "\n".join(lines)
 
 
@@ -117,9 +184,11 @@ def _state(page: DocsPage) -> str:
 
 
 def draw(wanted: Sequence[str], log: Callable[[str], None], run: Run | None = None) -> None:
-    """Draw the pages that are named, or all that are stale, of the results that are there, in seconds.
+    """Draw the pages that are named, or all that are stale, of the results that are there, in
+    seconds.
 
-    Those whose command cannot do that are left out by name. Raises FormatError at the end where a page failed.
+    Those whose command cannot do that are left out by name. Raises FormatError at the end where a
+    page failed.
     """
     failed = []
     for page in [page for page in named(wanted) if wanted or page.stale()]:
@@ -131,11 +200,14 @@ def draw(wanted: Sequence[str], log: Callable[[str], None], run: Run | None = No
         raise FormatError(f"{', '.join(failed)} could not be drawn; see above")
 
 
-def make(wanted: Sequence[str], where: Sequence[str], log: Callable[[str], None], run: Run | None = None) -> None:
-    """Make the pages that are named, or all that are stale. where: options for commands that compute folds.
+def make(
+    wanted: Sequence[str], where: Sequence[str], log: Callable[[str], None], run: Run | None = None
+) -> None:
+    """Make the pages that are named, or all that are stale. where: options for commands that
+    compute folds.
 
-    What is lacking is left out by name; after a failure the others are still made. Raises FormatError at the end where a
-    page failed or one that was named is lacking something.
+    What is lacking is left out by name; after a failure the others are still made. Raises
+    FormatError at the end where a page failed or one that was named is lacking something.
     """
     pages = [page for page in named(wanted) if wanted or page.stale()]
     left: dict[str, str] = {}

@@ -1,6 +1,8 @@
-"""Figures of results in README, manual and pages. In: files of results. Out: documents, with each text between its markers.
+"""Figures of results in README, manual and pages. In: files of results. Out: documents, with each
+text between its markers.
 
-The one list of what stands where: `palpate-train figures` writes it all, and a test fails where a document differs.
+The one list of what stands where: `palpate-train figures` writes it all, and a test fails where a
+document differs.
 """
 
 from __future__ import annotations
@@ -16,10 +18,16 @@ from appliance.core.storage import put
 from train.reports import bench_table, contact_table, marked_text, provenance
 
 README, MANUAL = "README.md", "docs/manual.md"
-BENCH, ALIGNMENT, DEVELOPMENT = "docs/bench.json", "docs/alignment/place.json", "docs/development/results.json"
+BENCH, ALIGNMENT, DEVELOPMENT = (
+    "docs/bench.json",
+    "docs/alignment/place.json",
+    "docs/development/results.json",
+)
 MADE_BY = {
-    BENCH: "make bench", ALIGNMENT: "palpate-train alignment --out docs/alignment", DEVELOPMENT: "palpate-train development",
-}  # fmt: skip
+    BENCH: "make bench",
+    ALIGNMENT: "palpate-train alignment --out docs/alignment",
+    DEVELOPMENT: "palpate-train development",
+}
 
 
 def picture_note(figures: Any) -> str:
@@ -30,7 +38,8 @@ def picture_note(figures: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class DocumentFigure:
-    """What stands in a document between <!-- marker --> and <!-- /marker -->: `text` of a file of results."""
+    """What stands in a document between <!-- marker --> and <!-- /marker -->: `text` of a file of
+    results."""
 
     document: str
     marker: str
@@ -48,7 +57,8 @@ FIGURES = (
 
 
 def written(document: str, root: Path) -> str:
-    """A document with all its figures. Raises FormatError where results are missing or of another kind, or its markers are."""
+    """A document with all its figures. Raises FormatError where results are missing or of another
+    kind, or its markers are."""
     text = (root / document).read_text(encoding="utf-8")
     for figure in FIGURES:
         if figure.document == document:
@@ -57,9 +67,14 @@ def written(document: str, root: Path) -> str:
 
 
 def write(root: Path = Path()) -> list[str]:
-    """Put all figures into the documents below `root`; the documents that were not as they are now. Raises as `written`."""
-    texts = {name: written(name, root) for name in dict.fromkeys(figure.document for figure in FIGURES)}
-    changed = [name for name, text in texts.items() if text != (root / name).read_text(encoding="utf-8")]
+    """Put all figures into the documents below `root`; the documents that were not as they are now.
+    Raises as `written`."""
+    texts = {
+        name: written(name, root) for name in dict.fromkeys(figure.document for figure in FIGURES)
+    }
+    changed = [
+        name for name, text in texts.items() if text != (root / name).read_text(encoding="utf-8")
+    ]
     for name in changed:
         put(root / name, texts[name].encode())
     return changed

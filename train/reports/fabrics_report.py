@@ -1,6 +1,8 @@
-"""Methods on real fabrics, with and without means, a condition left out at a time. In: methods, FabricSlide. Out: its page.
+"""Methods on real fabrics, with and without means, a condition left out at a time. In: methods,
+FabricSlide. Out: its page.
 
-What the page says is written by hand around a table and two pictures; figures of methods that are not run stay as they are.
+What the page says is written by hand around a table and two pictures; figures of methods that are
+not run stay as they are.
 """
 
 from __future__ import annotations
@@ -25,16 +27,24 @@ PARTS = (
     (SEVEN, ("leave:force", "leave:speed", "leave:rep")),
     (FOUR, ("leave:force", "leave:speed", "leave:direction")),
 )
-"""Two parts of the set with all combinations of their conditions: what is selected, and what is left out of it in turn."""
+"""Two parts of the set with all combinations of their conditions: what is selected, and what is
+left out of it in turn."""
 SEED = 1
 
 
 def run(
-    out: Path, data: Path | None, names: Sequence[str], where: Where, log: Callable[[str], None], effort: Effort
+    out: Path,
+    data: Path | None,
+    names: Sequence[str],
+    where: Where,
+    log: Callable[[str], None],
+    effort: Effort,
 ) -> dict[str, str]:
-    """Put results.json into the folder `out`: of `names` anew, of all other methods as it lay there.
+    """Put results.json into the folder `out`: of `names` anew, of all other methods as it lay
+    there.
 
-    Returned: methods that cannot take these sweeps, and why. Raises FormatError where the real sweeps or the page are missing.
+    Returned: methods that cannot take these sweeps, and why. Raises FormatError where the real
+    sweeps or the page are missing.
     """
     if data is None:
         raise FormatError("fabrics are real sweeps; name their folder with --data or PALPATE_DATA")
@@ -65,7 +75,9 @@ def read(out: Path) -> list[Json]:
         results: list[Json] = json.loads((out / "results.json").read_bytes())
         list(map(_entry, results))
     except (OSError, ValueError, KeyError, TypeError) as e:
-        raise FormatError(f"{out}/results.json is not of the command fabrics: {e!r}; run it without --draw") from e
+        raise FormatError(
+            f"{out}/results.json is not of the command fabrics: {e!r}; run it without --draw"
+        ) from e
     return results
 
 

@@ -1,4 +1,5 @@
-"""Numbers as pages, pictures and the terminal show them. In: shares, differences and times. Out: text."""
+"""Numbers as pages, pictures and the terminal show them. In: shares, differences and times. Out:
+text."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def points(difference: float, sign: bool = False) -> str:
 
 
 def amount(value: float, unit: str = "") -> str:
-    """A cost in three significant digits with its unit: "0.401 ms", "104 ms"; thousands of KB are MB: "15.9 MB"."""
+    """A cost in three significant digits with its unit: "0.401 ms", "104 ms"; thousands of KB are
+    MB: "15.9 MB"."""
     if unit == "KB" and value >= 1000:
         value, unit = value / 1000, "MB"
     digits = float(f"{value:.3g}")
@@ -43,4 +45,10 @@ def amount(value: float, unit: str = "") -> str:
 
 def seconds(value: float) -> str:
     """A duration: "12 min", "31 s", "0.25 s"."""
-    return f"{value / 60:.0f} min" if value >= 600 else f"{value:.0f} s" if value >= 10 else f"{value:.2g} s"
+    return (
+        f"{value / 60:.0f} min"
+        if value >= 600
+        else f"{value:.0f} s"
+        if value >= 10
+        else f"{value:.2g} s"
+    )

@@ -1,8 +1,10 @@
-"""Pages from templates. In: a template's name and its data. Out: one HTML file that needs nothing else.
+"""Pages from templates. In: a template's name and its data. Out: one HTML file that needs nothing
+else.
 
-No font and no address outside: a page opens from a folder without a network and reads on a phone. Whatever a template
-prints is escaped, but for pictures, which `picture` marks as SVG. A page of the project itself has a way back to its
-README (`home`), a `header` and, where its figures are of an older default, a first line that says so.
+No font and no address outside: a page opens from a folder without a network and reads on a phone.
+Whatever a template prints is escaped, but for pictures, which `picture` marks as SVG. A page of the
+project itself has a way back to its README (`home`), a `header` and, where its figures are of an
+older default, a first line that says so.
 """
 
 from __future__ import annotations
@@ -27,9 +29,13 @@ MADE = "\n\n<!-- written with the page -->\n"
 """Ends a README.md that `publish` may write again."""
 FRAMES = (
     (r"<th(?=[ >])(?![^>]*\bscope=)", '<th scope="col"'),
-    (r'<div class="wide"(?![^>]*\btabindex)', '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways"'),
-)  # fmt: skip
-"""What every table has, whichever template wrote it: a screen reader knows what its head is of, and arrow keys scroll it."""
+    (
+        r'<div class="wide"(?![^>]*\btabindex)',
+        '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways"',
+    ),
+)
+"""What every table has, whichever template wrote it: a screen reader knows what its head is of, and
+arrow keys scroll it."""
 PERCENT: dict[str, Callable[..., str]] = {
     "percent": formatting.percent,
     "exact_percent": formatting.exact_percent,
@@ -42,20 +48,34 @@ FILTERS: dict[str, Callable[..., str]] = {
     "points": formatting.points,
     "seconds": formatting.seconds,
     "sentence": lambda text: text[:1].upper() + text[1:],
-    "unbroken": lambda text: type(text)(text.replace(" %", UNBROKEN)) if isinstance(text, str) else text,
-    "one_line": lambda text: type(text)(" ".join(text.split())),  # what is escaped stays so, and is not escaped twice
+    "unbroken": lambda text: (
+        type(text)(text.replace(" %", UNBROKEN)) if isinstance(text, str) else text
+    ),
+    "one_line": lambda text: type(text)(
+        " ".join(text.split())
+    ),  # what is escaped stays so, and is not escaped twice
 }
 """Of all templates; those of PERCENT keep number and sign in one line of a page."""
 
 
 def render(
-    template: str, folder: Path = TEMPLATES, *, header: Provenance | None = None, home: str = "", **data: Any
+    template: str,
+    folder: Path = TEMPLATES,
+    *,
+    header: Provenance | None = None,
+    home: str = "",
+    **data: Any,
 ) -> str:
-    """The page that a template of `folder` makes of `data`; templates/base.html.j2 has what all pages share.
+    """The page that a template of `folder` makes of `data`; templates/base.html.j2 has what all
+    pages share.
 
     header: where its figures are from. home: the address of README, of the project's pages.
     """
-    page = _environment(folder, True).get_template(template).render(provenance=header, home=home, **data)
+    page = (
+        _environment(folder, True)
+        .get_template(template)
+        .render(provenance=header, home=home, **data)
+    )
     for pattern, framed in FRAMES:
         page = re.sub(pattern, framed, page)
     return page
@@ -67,14 +87,19 @@ def render_text(template: str, **data: Any) -> str:
 
 
 def picture(svg: str) -> Markup:
-    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is; the colours are the page's."""
+    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is;
+    the colours are the page's."""
     return Markup(svg.replace(SCHEMES, "", 1))
 
 
-def publish(out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], about: Provenance) -> Path:
-    """Write the pictures, NAME.svg, each with its header, and the pages, NAME.html, into the folder `out`; the path of "index".
+def publish(
+    out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], about: Provenance
+) -> Path:
+    """Write the pictures, NAME.svg, each with its header, and the pages, NAME.html, into the folder
+    `out`; the path of "index".
 
-    For those who see no HTML, as on GitHub, README.md beside it shows the pictures; one that was written by hand stays.
+    For those who see no HTML, as on GitHub, README.md beside it shows the pictures; one that was
+    written by hand stays.
     """
     for name, svg in pictures.items():
         put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
@@ -82,7 +107,10 @@ def publish(out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], ab
         put(out / f"{name}.html", page.encode(), parents=True)
     readme = out / "README.md"
     if not readme.exists() or readme.read_text(encoding="utf-8").endswith(MADE):
-        put(readme, provenance.in_markdown(_pictures_alone(pages["index"], pictures), about).encode())
+        put(
+            readme,
+            provenance.in_markdown(_pictures_alone(pages["index"], pictures), about).encode(),
+        )
     return out / "index.html"
 
 
@@ -107,7 +135,9 @@ def _environment(folder: Path, escape: bool) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= FILTERS | ({name: _unbroken(show) for name, show in PERCENT.items()} if escape else PERCENT)
+    made.filters |= FILTERS | (
+        {name: _unbroken(show) for name, show in PERCENT.items()} if escape else PERCENT
+    )
     made.globals |= {
         "font": Markup(FONT),
         "light": Markup(LIGHT),

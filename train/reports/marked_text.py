@@ -1,4 +1,5 @@
-"""What a command writes into a document, between two markers. In: the document, a name, text. Out: the document."""
+"""What a command writes into a document, between two markers. In: the document, a name, text. Out:
+the document."""
 
 from __future__ import annotations
 
@@ -14,5 +15,7 @@ def insert(document: str, name: str, text: str, path: str) -> str:
     before, found, rest = document.partition(begin)
     _, closed, after = rest.partition(end)
     if not found or not closed or begin in after:
-        raise FormatError(f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs")
+        raise FormatError(
+            f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs"
+        )
     return f"{before}{begin}\n{text}\n{end}{after}"

@@ -1,5 +1,5 @@
-"""What was reached and what was missed in a matrix of methods by protocols. In: the list that evaluate writes. Out: a picture,
-a table in a page."""
+"""What was reached and what was missed in a matrix of methods by protocols. In: the list that
+evaluate writes. Out: a picture, a table in a page."""
 
 from __future__ import annotations
 
@@ -22,19 +22,23 @@ HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "
 
 
 def draw(results: Sequence[Json], out: Path, recordings: bool = False) -> None:
-    """The picture of all methods, an SVG file: of recordings instead of windows where `recordings`."""
+    """The picture of all methods, an SVG file: of recordings instead of windows where
+    `recordings`."""
     picture = plots.matrix(results, count="recording" if recordings else "window")
     put(out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
 
 
 def insert(results: Sequence[Json], page: Path) -> None:
     """The headline, between the markers of a page. Raises FormatError where it has none."""
-    text = marked_text.insert(page.read_text(encoding="utf-8"), "matrix", headline(results), str(page))
+    text = marked_text.insert(
+        page.read_text(encoding="utf-8"), "matrix", headline(results), str(page)
+    )
     put(page, provenance.in_markdown(text, provenance.of(results)).encode())
 
 
 def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
-    """A line for each test: `ours`, the best of the others (chosen after the fact), their difference, a verdict.
+    """A line for each test: `ours`, the best of the others (chosen after the fact), their
+    difference, a verdict.
 
     Sweeps without means come first. Each figure is the mean over seeds, with its 95 % interval.
     """
@@ -42,13 +46,19 @@ def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
     for result in results:
         test = (bool(result["means_removed"]), len(result["materials"]), result["protocol"])
         share = result["window"]["right"] / result["window"]["total"]
-        tests.setdefault(test, {}).setdefault(result["method"], []).append([share, *result["interval"]])
+        tests.setdefault(test, {}).setdefault(result["method"], []).append(
+            [share, *result["interval"]]
+        )
     rows = [[cell.format(ours=plain_name(ours)) for cell in HEAD], ["---"] * len(HEAD)]
     for removed, classes, protocol in sorted(tests, key=lambda test: (not test[0], -test[1])):
-        found = {name: dict(zip(("mean", "low", "high"), np.mean(seeds, axis=0).tolist(), strict=True))
-                 for name, seeds in tests[removed, classes, protocol].items()}  # fmt: skip
+        found = {
+            name: dict(zip(("mean", "low", "high"), np.mean(seeds, axis=0).tolist(), strict=True))
+            for name, seeds in tests[removed, classes, protocol].items()
+        }
         if ours in found:
-            line = comparison.line("", found[ours], {name: one for name, one in found.items() if name != ours})
+            line = comparison.line(
+                "", found[ours], {name: one for name, one in found.items() if name != ours}
+            )
             what = f"{classes} classes: {PROTOCOLS.get(protocol, (protocol,))[0]}"
             rows.append([what, "removed" if removed else "kept", *_cells(line)])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -1,4 +1,5 @@
-"""Methods as people call them. In: the name that a command takes. Out: a name for pictures and pages, and what it is in a line."""
+"""Methods as people call them. In: the name that a command takes. Out: a name for pictures and
+pages, and what it is in a line."""
 
 from __future__ import annotations
 
@@ -7,29 +8,69 @@ from train.models.methods import SHIPPED
 
 OURS = "Palpate"
 TRAINED = "compact"
-"""Our trained networks: the command's name of each says a bound of its weights, so people are told the weights."""
+"""Our trained networks: the command's name of each says a bound of its weights, so people are told
+the weights."""
 NAMES = {
-    SHIPPED: (f"{OURS}, as shipped", "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; int8"),
-    "default-reattached": (f"{OURS}, for a skin put back", "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, filters only where they are better; int8"),
-    "filter-bank": (f"{OURS}, filters alone", "a part of what is shipped: random filters and a head in closed form, nothing trained"),
-    "compact-bands": (f"{OURS}, spectrum alone", "a part of what is shipped: the spectrum that all taxels share"),
-    "minirocket": ("MiniRocket", "10,000 features of fixed small filters and ridge regression: the usual quick choice for time series"),
-    "minirocket-augmented": ("MiniRocket, augmented", "the same, trained on altered copies of each sweep too, as ours is"),
-    "multirocket-hydra": ("MultiRocket-Hydra", "among the most accurate methods for time series on public archives"),
+    SHIPPED: (
+        f"{OURS}, as shipped",
+        "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; int8",
+    ),
+    "default-reattached": (
+        f"{OURS}, for a skin put back",
+        "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, filters only where they are better; int8",
+    ),
+    "filter-bank": (
+        f"{OURS}, filters alone",
+        "a part of what is shipped: random filters and a head in closed form, nothing trained",
+    ),
+    "compact-bands": (
+        f"{OURS}, spectrum alone",
+        "a part of what is shipped: the spectrum that all taxels share",
+    ),
+    "minirocket": (
+        "MiniRocket",
+        "10,000 features of fixed small filters and ridge regression: the usual quick choice for time series",
+    ),
+    "minirocket-augmented": (
+        "MiniRocket, augmented",
+        "the same, trained on altered copies of each sweep too, as ours is",
+    ),
+    "multirocket-hydra": (
+        "MultiRocket-Hydra",
+        "among the most accurate methods for time series on public archives",
+    ),
     "quant": ("QUANT", "quantiles of intervals and extremely randomised trees"),
-    "ds-cnn": ("DS-CNN", "a small network of separable convolutions, as deployed on microcontrollers"),
+    "ds-cnn": (
+        "DS-CNN",
+        "a small network of separable convolutions, as deployed on microcontrollers",
+    ),
     "lite": ("LITE", "a small network with some filters made by hand"),
-    "edge-spectral": ("spectra + small net", "spectra, statistics and two small dense layers: the recipe of edge-computing tools"),
+    "edge-spectral": (
+        "spectra + small net",
+        "spectra, statistics and two small dense layers: the recipe of edge-computing tools",
+    ),
     "paper-cnn": ("paper’s CNN, raw", "the convolutional network of the paper, on raw counts"),
-    "paper-cnn-centred": ("paper’s CNN", "the convolutional network of the paper, behind a layer that removes each taxel’s mean"),
+    "paper-cnn-centred": (
+        "paper’s CNN",
+        "the convolutional network of the paper, behind a layer that removes each taxel’s mean",
+    ),
     "tactnet2": ("TactNet-II", "a later network of the paper’s group, as far as it is published"),
-    "L-gauss": ("L, Gauss", "the paper’s features of whole sweeps, a normal distribution for each material"),
+    "L-gauss": (
+        "L, Gauss",
+        "the paper’s features of whole sweeps, a normal distribution for each material",
+    ),
     "L-knn": ("L, neighbours", "the paper’s features of whole sweeps, four nearest neighbours"),
     "L-svm": ("L, SVM", "the paper’s features of whole sweeps, a support vector machine"),
-    "H-knn": ("H, neighbours", "the paper’s features of short pieces of a sweep, four nearest neighbours"),
-    "H-svm": ("H, SVM", "the paper’s features of short pieces of a sweep, a support vector machine"),
+    "H-knn": (
+        "H, neighbours",
+        "the paper’s features of short pieces of a sweep, four nearest neighbours",
+    ),
+    "H-svm": (
+        "H, SVM",
+        "the paper’s features of short pieces of a sweep, a support vector machine",
+    ),
     "st-hmp": ("ST-HMP", "codes of learned dictionaries, pooled"),
-}  # fmt: skip
+}
 
 
 FAMILIES = {
@@ -50,7 +91,8 @@ OTHERS = "related work"
 
 
 def plain_name(method: str, weights: int | None = None) -> str:
-    """What people call a method; of our trained networks with their number of `weights` where that is known."""
+    """What people call a method; of our trained networks with their number of `weights` where that
+    is known."""
     if method in NAMES:
         return NAMES[method][0]
     if method.partition("-")[0] == TRAINED:
@@ -62,7 +104,11 @@ def about(method: str) -> str:
     """What a method is, in a line; "" where nobody has said it."""
     if method in NAMES:
         return NAMES[method][1]
-    return "trained layers and a spectrum, without the filters" if method.partition("-")[0] == TRAINED else ""
+    return (
+        "trained layers and a spectrum, without the filters"
+        if method.partition("-")[0] == TRAINED
+        else ""
+    )
 
 
 def size(weights: int) -> str:

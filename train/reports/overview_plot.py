@@ -1,4 +1,5 @@
-"""The README's picture: finger, signal, answer. In: one simulated sweep and the packaged bundle. Out: SVG text."""
+"""The README's picture: finger, signal, answer. In: one simulated sweep and the packaged bundle.
+Out: SVG text."""
 
 from __future__ import annotations
 
@@ -17,7 +18,17 @@ from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
 from train.data import sets
-from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, MEDIUM, SMALL, add_axes, to_svg, write
+from train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    MEDIUM,
+    SMALL,
+    add_axes,
+    to_svg,
+    write,
+)
 
 WIDE, HIGH = 10.0, 3.5
 SEED = 7
@@ -27,14 +38,17 @@ SHOWN_S = 0.4
 
 
 def draw(material: str, seed: int = SEED) -> str:
-    """Three panels from left to right: the finger on a tube of `material`, the signal of its taxels, the verdict.
+    """Three panels from left to right: the finger on a tube of `material`, the signal of its
+    taxels, the verdict.
 
-    The sweep is simulated, from a skin position that the bundle was not trained on. Raises FormatError for a material that is
-    not simulated.
+    The sweep is simulated, from a skin position that the bundle was not trained on. Raises
+    FormatError for a material that is not simulated.
     """
     sweeps = sets.load(f"sim:T-REAL:{seed}")
     if material not in sweeps.materials:
-        raise FormatError(f"material {material!r} is not simulated; use one of {', '.join(sweeps.materials)}")
+        raise FormatError(
+            f"material {material!r} is not simulated; use one of {', '.join(sweeps.materials)}"
+        )
     samples = sweeps.samples[sweeps.labels == sweeps.materials.index(material)][0]
     loaded = bundle.load(bundle.DEFAULT)
     verdict = _verdict(loaded, samples)
@@ -65,11 +79,21 @@ def _verdict(loaded: bundle.Bundle, samples: NDArray[Any]) -> Verdict:
 def _finger(page: Axes, samples: NDArray[Any]) -> None:
     """Tube, finger, and the skin's taxels, darker where the sweep pressed more."""
     page.add_patch(
-        FancyBboxPatch((0.2, 0.62), 2.9, 0.62, boxstyle="round,pad=0,rounding_size=0.12", fc=FAINT, ec="none")
+        FancyBboxPatch(
+            (0.2, 0.62), 2.9, 0.62, boxstyle="round,pad=0,rounding_size=0.12", fc=FAINT, ec="none"
+        )
     )
     page.add_patch(Ellipse((3.02, 0.93), 0.22, 0.62, fc=GREY, ec="none"))
     page.add_patch(
-        FancyBboxPatch((1.05, 1.24), 1.1, 1.55, boxstyle="round,pad=0,rounding_size=0.5", fc="#f3e3d3", ec=GREY, lw=1.5)
+        FancyBboxPatch(
+            (1.05, 1.24),
+            1.1,
+            1.55,
+            boxstyle="round,pad=0,rounding_size=0.5",
+            fc="#f3e3d3",
+            ec=GREY,
+            lw=1.5,
+        )
     )
     mean = samples.mean(axis=0)
     shade = (mean - mean.min()) / max(float(np.ptp(mean)), 1.0)
@@ -77,10 +101,19 @@ def _finger(page: Axes, samples: NDArray[Any]) -> None:
     for row, column in np.ndindex(*shade.shape):
         at = (1.2 + column * side, 1.42 + (shade.shape[0] - 1 - row) * side)
         page.add_patch(
-            Rectangle(at, side * 0.88, side * 0.88, fc=ACCENT, alpha=0.15 + 0.85 * float(shade[row, column]), ec="none")
+            Rectangle(
+                at,
+                side * 0.88,
+                side * 0.88,
+                fc=ACCENT,
+                alpha=0.15 + 0.85 * float(shade[row, column]),
+                ec="none",
+            )
         )
     page.add_patch(
-        FancyArrowPatch((0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5)
+        FancyArrowPatch(
+            (0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5
+        )
     )
     write(page, 1.6, 0.16, "two seconds along a tube", GREY, SMALL)
 
@@ -117,7 +150,11 @@ def _answer(page: Axes, verdict: Verdict, labels: tuple[str, ...]) -> None:
         y = 2.1 - 0.27 * i
         write(page, left, y, label, BLACK if i == 0 else GREY, SMALL, ha="left")
         page.add_patch(Rectangle((left + 1.05, y - 0.07), width, 0.14, fc=FAINT, ec="none"))
-        page.add_patch(Rectangle((left + 1.05, y - 0.07), width * float(probability), 0.14, fc=ACCENT, ec="none"))
+        page.add_patch(
+            Rectangle(
+                (left + 1.05, y - 0.07), width * float(probability), 0.14, fc=ACCENT, ec="none"
+            )
+        )
         write(
             page,
             left + 1.05 + width + 0.08,

@@ -1,6 +1,8 @@
-"""The paper's experiment on the simulated sets, with more methods. In: a plan. Out: a folder with results.json, pictures, page.
+"""The paper's experiment on the simulated sets, with more methods. In: a plan. Out: a folder with
+results.json, pictures, page.
 
-The page is made by paper_report. Folds are kept by evaluate, so that an interrupted run goes on where it was.
+The page is made by paper_report. Folds are kept by evaluate, so that an interrupted run goes on
+where it was.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ OWN = ("default", "default-reattached")
 BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
 """Tables of results.json by method."""
 CURVE = "cnn-curve.json"
-"""Beside results.json: what `palpate-train cnn-curve --size whole` wrote, the paper's CNN as printed."""
+"""Beside results.json: what `palpate-train cnn-curve --size whole` wrote, the paper's CNN as
+printed."""
 CURVE_PARTS = {"lopo": "new", "hard": "hard"}
 """Its sets by the part that they stand for."""
 SURE = (0.9, 0.95, 0.99)
@@ -56,7 +59,8 @@ COST_POINTS = 160
 class PaperPart:
     """A column of the paper's results: the sets to train and test on.
 
-    sets: joined; {w} stands for the simulated world, {a} and {b} for its first and last seed of T-HARD. only: of each set.
+    sets: joined; {w} stands for the simulated world, {a} and {b} for its first and last seed of
+    T-HARD. only: of each set.
     """
 
     sets: tuple[str, ...]
@@ -73,9 +77,11 @@ class PaperPart:
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, to estimate the time left.
+    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, to
+    estimate the time left.
 
-    means_removed: from each taxel of each sweep; the methods' names then end in paper_values.CENTRED.
+    means_removed: from each taxel of each sweep; the methods' names then end in
+    paper_values.CENTRED.
     """
 
     methods: tuple[str, ...]
@@ -107,16 +113,24 @@ FULL_STEPS = (
     Step(NETWORKS, EASY, (1,), 30),
     Step(("paper-cnn",), ("lopo",), (1,), 170),
 )
-"""Hard parts come first, so that a run that was interrupted has the most important results: see `kept`."""
+"""Hard parts come first, so that a run that was interrupted has the most important results: see
+`kept`."""
 QUICK = {
     "lopo": PaperPart(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
-    "hard": PaperPart(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)),
+    "hard": PaperPart(
+        ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)
+    ),
     "lab": PaperPart(("sim:T-LAB:{w}:10",), "random:3", 3),
     "random": PaperPart(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
-    Step((*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS), ("lopo", "hard"), (1,), 1),
+    Step(
+        (*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS),
+        ("lopo", "hard"),
+        (1,),
+        1,
+    ),
     Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
     Step(("paper-cnn",), ("hard",), (1,), 15),
 )
@@ -125,10 +139,11 @@ QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a method in a part of a simulated world, without the sweeps: labels [n], logits [n, K] of those tested.
+    """The result of a method in a part of a simulated world, without the sweeps: labels [n], logits
+    [n, K] of those tested.
 
-    place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that has them, [iterations, 2].
-    about: what results.json holds of it.
+    place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that
+    has them, [iterations, 2]. about: what results.json holds of it.
     """
 
     part: str
@@ -169,10 +184,12 @@ def run(
     effort: Effort = FULL_EFFORT,
     only: Sequence[str] = (),
 ) -> Path:
-    """Train and test all of the plan, write results.json, the pictures and the page into `out`; the page's path.
+    """Train and test all of the plan, write results.json, the pictures and the page into `out`; the
+    page's path.
 
-    quick: a few sweeps and iterations of everything, whatever `effort` says. only: methods that are run; all others stay as
-    an earlier run left them in `out`. Raises FormatError as evaluate, and where `only` has none of the plan's methods.
+    quick: a few sweeps and iterations of everything, whatever `effort` says. only: methods that are
+    run; all others stay as an earlier run left them in `out`. Raises FormatError as evaluate, and
+    where `only` has none of the plan's methods.
     """
     parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
     effort = QUICK_EFFORT if quick else effort
@@ -189,7 +206,9 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
     known = dict.fromkeys(m for step in steps for m in step.methods)
     for name in only:
         if name not in known:
-            raise FormatError(f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}")
+            raise FormatError(
+                f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}"
+            )
     kept = [replace(step, methods=tuple(m for m in step.methods if m in only)) for step in steps]
     return [step for step in kept if step.methods]
 
@@ -197,19 +216,37 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
 def planned(found: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
     """What `found` has of methods that are still in the plan."""
     known = {m for step in steps for m in step.methods}
-    lists = {key: [one for one in found[key] if one["method"].removesuffix(paper_values.CENTRED) in known]
-             for key in ("table", "results")}  # fmt: skip
-    tables = {key: {name: value for name, value in found[key].items() if name.removesuffix(paper_values.CENTRED) in known}
-              for key in BY_METHOD}  # fmt: skip
+    lists = {
+        key: [
+            one for one in found[key] if one["method"].removesuffix(paper_values.CENTRED) in known
+        ]
+        for key in ("table", "results")
+    }
+    tables = {
+        key: {
+            name: value
+            for name, value in found[key].items()
+            if name.removesuffix(paper_values.CENTRED) in known
+        }
+        for key in BY_METHOD
+    }
     return found | lists | tables
 
 
 def joined(found: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """Two results.json as one: of what both have, `found` counts. Raises FormatError where one of them is a quick run."""
+    """Two results.json as one: of what both have, `found` counts. Raises FormatError where one of
+    them is a quick run."""
     if found["quick"] != earlier["quick"]:
-        raise FormatError("a quick run and a whole one cannot be joined; write the quick one to another --out")
-    lists = {key: [*(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))), *found[key]]
-             for key in ("table", "results")}  # fmt: skip
+        raise FormatError(
+            "a quick run and a whole one cannot be joined; write the quick one to another --out"
+        )
+    lists = {
+        key: [
+            *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
+            *found[key],
+        ]
+        for key in ("table", "results")
+    }
     tables = {k: earlier[k] | found[k] for k in BY_METHOD}
     return earlier | found | tables | lists
 
@@ -224,28 +261,57 @@ def _results(out: Path) -> dict[str, Any]:
     try:
         results: dict[str, Any] = json.loads((out / "results.json").read_bytes())
     except (OSError, ValueError) as e:
-        raise FormatError(f"{out}/results.json is not of the paper's experiment: {e}; run all of it first") from e
+        raise FormatError(
+            f"{out}/results.json is not of the paper's experiment: {e}; run all of it first"
+        ) from e
     return results
 
 
 def as_printed(curve: dict[str, Any], parts: dict[str, PaperPart]) -> dict[str, Any]:
     """A summary of the paper's CNN from what cnn_curve has followed so far, as its newest point."""
-    point, ran = curve["points"][-1], f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50"
+    point, ran = (
+        curve["points"][-1],
+        f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50",
+    )
     outcomes = []
     for part, name in CURVE_PARTS.items():
         newest = {k: np.array(v) for k, v in curve["newest"][name].items()}
-        about = {"part": part, "method": paper_values.CNNS[0], "world": curve["about"][1], "means_removed": False, "ran": ran,
-                 "confusion": point[f"{name} confusion"], "fit_s": None, "ms_p50": None, "agreement": None,
-                 "materials": list(skin.MATERIALS), "commit": curve["commit"], "machine": curve["machine"]}  # fmt: skip
-        costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])] if part == "lopo" else []
-        outcomes.append(Outcome(part, paper_values.CNNS[0], curve["about"][1], newest["labels"],
-                                newest["logits"], newest["position"], costs, about))  # fmt: skip
+        about = {
+            "part": part,
+            "method": paper_values.CNNS[0],
+            "world": curve["about"][1],
+            "means_removed": False,
+            "ran": ran,
+            "confusion": point[f"{name} confusion"],
+            "fit_s": None,
+            "ms_p50": None,
+            "agreement": None,
+            "materials": list(skin.MATERIALS),
+            "commit": curve["commit"],
+            "machine": curve["machine"],
+        }
+        costs = (
+            [np.array([[p["step"], p["cost"]] for p in curve["points"]])] if part == "lopo" else []
+        )
+        outcomes.append(
+            Outcome(
+                part,
+                paper_values.CNNS[0],
+                curve["about"][1],
+                newest["labels"],
+                newest["logits"],
+                newest["position"],
+                costs,
+                about,
+            )
+        )
     reached = {"step": point["step"], "steps": curve["steps"], "commit": curve["commit"]}
     return summary(outcomes, parts, Effort(paper_steps=curve["steps"])) | {"curve": reached}
 
 
 def draw(out: Path) -> Path:
-    """The pictures and the page of results.json in `out`, which takes up CURVE where it lies there; the page's path.
+    """The pictures and the page of results.json in `out`, which takes up CURVE where it lies there;
+    the page's path.
 
     Raises FormatError where results.json is not there, or CURVE is of another training.
     """
@@ -253,7 +319,9 @@ def draw(out: Path) -> Path:
     if (out / CURVE).exists():
         curve = json.loads((out / CURVE).read_bytes())
         if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
-            raise FormatError(f"{out / CURVE} is not the CNN as printed; run palpate-train cnn-curve --size whole")
+            raise FormatError(
+                f"{out / CURVE} is not the CNN as printed; run palpate-train cnn-curve --size whole"
+            )
         results = joined(as_printed(curve, FULL) | {"quick": results["quick"]}, results)
         put(out / "results.json", _lines(results).encode())
     page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
@@ -285,36 +353,59 @@ def _outcomes(
             pace = took / expected[i]
 
 
-def summary(outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT) -> dict[str, Any]:
+def summary(
+    outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT
+) -> dict[str, Any]:
     """All that paper_report needs, as plain numbers."""
     groups: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in outcomes:
         groups.setdefault((outcome.part, outcome.method), []).append(outcome)
     lopo = {method: those for (part, method), those in groups.items() if part == "lopo"}
     return {
-        "parts": {k: {"sets": part.sets, "only": part.only, "protocol": part.protocol} for k, part in parts.items()},
+        "parts": {
+            k: {"sets": part.sets, "only": part.only, "protocol": part.protocol}
+            for k, part in parts.items()
+        },
         "table": [_row(*key, those) for key, those in groups.items()],
-        "costs": {m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in paper_values.CNNS if m in lopo},
-        "confusion": {m: np.sum([o.about["confusion"] for o in those], 0).tolist() for m, those in lopo.items()},
+        "costs": {
+            m: [cost.tolist() for o in lopo[m] for cost in o.costs]
+            for m in paper_values.CNNS
+            if m in lopo
+        },
+        "confusion": {
+            m: np.sum([o.about["confusion"] for o in those], 0).tolist()
+            for m, those in lopo.items()
+        },
         "several": {m: several(those) for m, those in lopo.items()},
         "explored": {m: explored(those) for m, those in lopo.items()},
         "methods": {
-            name: method.about for name, method in methods.every(effort).items() if name in {m for _, m in groups}
+            name: method.about
+            for name, method in methods.every(effort).items()
+            if name in {m for _, m in groups}
         },
         "results": [outcome.about for outcome in outcomes],
     }
 
 
 def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
-    """One line of the table. attachments: how many there are, and the accuracy of the worst and the best of them."""
-    right, place = (np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place"))
+    """One line of the table. attachments: how many there are, and the accuracy of the worst and the
+    best of them."""
+    right, place = (
+        np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place")
+    )
     each = [float(right[place == p].mean()) for p in np.unique(place)]
     return {
-        "part": part, "method": method, "worlds": [o.world for o in those], "right": int(right.sum()),
-        "total": len(right), "share": estimate(right, place), "printed": paper_values.ACCURACY[part].get(method),
-        "attachments": [len(each), round(min(each), 4), round(max(each), 4)], "ran": those[0].about["ran"],
+        "part": part,
+        "method": method,
+        "worlds": [o.world for o in those],
+        "right": int(right.sum()),
+        "total": len(right),
+        "share": estimate(right, place),
+        "printed": paper_values.ACCURACY[part].get(method),
+        "attachments": [len(each), round(min(each), 4), round(max(each), 4)],
+        "ran": those[0].about["ran"],
         **{k: _median([o.about[k] for o in those]) for k in ("fit_s", "ms_p50")},
-    }  # fmt: skip
+    }
 
 
 def _median(values: Sequence[float | None]) -> float | None:
@@ -329,9 +420,11 @@ def estimate(right: Array, place: Array) -> list[float]:
 
 
 def objects(labels: Array, place: Array, seed: int) -> Array:
-    """Explorations of one object each, indices of sweeps [n, S]: sec. V.D, sweeps of one material from the test set.
+    """Explorations of one object each, indices of sweeps [n, S]: sec. V.D, sweeps of one material
+    from the test set.
 
-    Every sweep comes first once; others of its material and place follow in random order, as many as every group has.
+    Every sweep comes first once; others of its material and place follow in random order, as many
+    as every group has.
     """
     rng = np.random.default_rng(seed)
     alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
@@ -343,12 +436,15 @@ def objects(labels: Array, place: Array, seed: int) -> Array:
 
 
 def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
-    """Estimates after one, two, three sweeps of an object, by "vote" and by "product", as the box fuses."""
+    """Estimates after one, two, three sweeps of an object, by "vote" and by "product", as the box
+    fuses."""
     estimates: dict[str, list[list[float]]] = {}
     for rule in ("vote", "product"):
         for n in range(1, SEVERAL + 1):
             right = np.concatenate([_fused(o, n, rule) for o in those])
-            estimates.setdefault(rule, []).append(estimate(right, np.concatenate([o.place for o in those])))
+            estimates.setdefault(rule, []).append(
+                estimate(right, np.concatenate([o.place for o in those]))
+            )
     return estimates
 
 
@@ -361,7 +457,8 @@ def _fused(outcome: Outcome, n: int, rule: str) -> Array:
 
 
 def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of sweeps."""
+    """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of
+    sweeps."""
     points = []
     for sure in SURE:
         right, used = [], []
@@ -372,12 +469,15 @@ def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
             right.append(labels == o.labels)
             used.append(counts)
         share = estimate(np.concatenate(right), np.concatenate([o.place for o in those]))
-        points.append({"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)})
+        points.append(
+            {"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)}
+        )
     return points
 
 
 def _thinned(cost: Array) -> Array:
-    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic axis."""
+    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic
+    axis."""
     ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
     return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)
 

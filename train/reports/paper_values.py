@@ -1,6 +1,8 @@
-"""Values printed in the paper: accuracies by part and method, training cost, confusion, several sweeps.
+"""Values printed in the paper: accuracies by part and method, training cost, confusion, several
+sweeps.
 
-Its figures did not survive as text; these are the values printed in them. Parts are named as in paper_experiment.
+Its figures did not survive as text; these are the values printed in them. Parts are named as in
+paper_experiment.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ ACCURACY: dict[str, dict[str, float]] = {
 CENTRED = ", means out"
 """Ends the name of a method, in results.json, that got sweeps without each taxel's mean."""
 CNNS = ("paper-cnn", "paper-cnn" + CENTRED)
-"""The paper's network, and the same on sweeps without each taxel's mean, which needs far fewer iterations: the printed
-numbers are those of the first, and the second is compared with them."""
+"""The paper's network, and the same on sweeps without each taxel's mean, which needs far fewer
+iterations: the printed numbers are those of the first, and the second is compared with them."""
 for _cnn in CNNS:
     ACCURACY["lopo"][_cnn], ACCURACY["hard"][_cnn] = 0.923, 0.917  # Fig. 10
 COST = ((500, 0.08), (2500, 0.002))
@@ -36,7 +38,8 @@ CONFUSION = np.array(
         [0.01, 0.00, 0.00, 0.00, 0.00, 0.99],
     ]
 )
-"""Fig. 11, the CNN on T-REAL with a position left out: rows are the truth, in the order of skin.MATERIALS."""
+"""Fig. 11, the CNN on T-REAL with a position left out: rows are the truth, in the order of
+skin.MATERIALS."""
 SEVERAL: dict[str, tuple[float | None, ...]] = {
     "H-svm": (0.86, None, 0.92),
     **dict.fromkeys(CNNS, (0.923, 0.973, 0.975)),

@@ -1,7 +1,9 @@
-"""The Pareto front of the chart, and its axes. In: dots, as chart.json lists them. Out: a spot for each network.
+"""The Pareto front of the chart, and its axes. In: dots, as chart.json lists them. Out: a spot for
+each network.
 
-A network may have been measured in several forms: in float and in int8, by the box's runtime and by a library of its own.
-It is shown once, where it costs least. scatter draws the spots, chart_page lets a reader choose among them.
+A network may have been measured in several forms: in float and in int8, by the box's runtime and by
+a library of its own. It is shown once, where it costs least. scatter draws the spots, chart_page
+lets a reader choose among them.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ from train.reports.method_names import OURS, plain_name
 
 Dot = Mapping[str, Any]
 ONCE_SHIPPED = "compact"
-"""What was shipped before methods.SHIPPED: the one of ours that stands out in charts that are older than it."""
+"""What was shipped before methods.SHIPPED: the one of ours that stands out in charts that are older
+than it."""
 
 
 @dataclass(frozen=True)
 class ChartAxis:
-    """A figure that can be on an axis. short: its name; about: what it is, in a sentence; unit: "" for shares and counts.
+    """A figure that can be on an axis. short: its name; about: what it is, in a sentence; unit: ""
+    for shares and counts.
 
     chance: of an accuracy, the share that guessing names rightly.
     """
@@ -34,23 +38,31 @@ class ChartAxis:
 
 
 COSTS = {
-    "ms_p50": ChartAxis("time per sweep, one core", "processor time, checks and features included; the median sweep", "ms"),
+    "ms_p50": ChartAxis(
+        "time per sweep, one core",
+        "processor time, checks and features included; the median sweep",
+        "ms",
+    ),
     "ms_p99": ChartAxis("longest time", "processor time that 99 of 100 sweeps stay within", "ms"),
     "macs": ChartAxis(
-        "multiply-adds", "multiplications of a sweep, each with its addition: the graph's, and the Fourier transforms of features"
+        "multiply-adds",
+        "multiplications of a sweep, each with its addition: the graph's, and the Fourier transforms of features",
     ),
     "file_kb": ChartAxis("model file", "the model alone, 1000 bytes each", "KB"),
-    "rss_mb": ChartAxis("memory", "resident memory of a process that only names sweeps, 2^20 bytes each", "MB"),
+    "rss_mb": ChartAxis(
+        "memory", "resident memory of a process that only names sweeps, 2^20 bytes each", "MB"
+    ),
     "touch_s": ChartAxis(
         "how long it must touch",
         "the part of a sweep that it needs: all of it, or less where it may answer early at a loss of half a point",
         "s",
     ),
     "weights": ChartAxis("weights", "numbers found by training"),
-}  # fmt: skip
+}
 """Less is better."""
 TUBES, FABRICS = 1 / len(MATERIALS), 1 / 7
-"""What guessing reaches on the simulated tubes, and on the fabrics of FabricSlide that the chart shows."""
+"""What guessing reaches on the simulated tubes, and on the fabrics of FabricSlide that the chart
+shows."""
 ACCURACIES = {
     "speed": ChartAxis(
         "a speed it never felt",
@@ -78,28 +90,37 @@ ACCURACIES = {
         chance=TUBES,
     ),
 } | {
-    f"stress:{key}": ChartAxis(f"{short} (simulated)", f"six simulated tubes, new positions: {about}", chance=TUBES)
+    f"stress:{key}": ChartAxis(
+        f"{short} (simulated)", f"six simulated tubes, new positions: {about}", chance=TUBES
+    )
     for key, (short, about) in {
         "none": ("no disturbance", "the same sweeps as in the next lines, undisturbed"),
         "noise": ("noise", "white noise of 0.3 of each taxel's standard deviation"),
         "dead": ("a dead taxel", "one taxel reads 0"),
-        "noisy": ("a noisy taxel", "white noise on one taxel, four times the standard deviation of the set"),
-        "gain": ("20 % more or less gain", "all signals 20 % weaker or stronger, the worse of both"),
+        "noisy": (
+            "a noisy taxel",
+            "white noise on one taxel, four times the standard deviation of the set",
+        ),
+        "gain": (
+            "20 % more or less gain",
+            "all signals 20 % weaker or stronger, the worse of both",
+        ),
         "lost": ("lost frames", "5 % of the frames are lost"),
         "drift": ("drift", "the offset drifts by a tenth of full load within a sweep"),
         "hum": ("mains hum", "50 Hz on all taxels, as strong as the signal's standard deviation"),
         "shift": ("skin shifted by a row", "the skin sits one row of taxels further along"),
     }.items()
-}  # fmt: skip
+}
 """More is better; real ones first. A taxel is one sensing element of the skin."""
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A network on the chart. dot: the form that costs least; x: its cost; y: its accuracy; best: whether it is on the front.
+    """A network on the chart. dot: the form that costs least; x: its cost; y: its accuracy; best:
+    whether it is on the front.
 
-    methods: all that are this network. on_box: whether the box can run any form of it. other: cost and accuracy in the other
-    precision, float or int8, where it was measured so.
+    methods: all that are this network. on_box: whether the box can run any form of it. other: cost
+    and accuracy in the other precision, float or int8, where it was measured so.
     """
 
     dot: Dot
@@ -112,12 +133,15 @@ class Spot:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which of `points` (cost, accuracy) no other dominates, that is, costs no more, is no less accurate, and better in one.
+    """Which of `points` (cost, accuracy) no other dominates, that is, costs no more, is no less
+    accurate, and better in one.
 
     Equal points are all on the front or all behind it.
     """
-    return [not any(c <= cost and a >= accuracy and (c, a) != (cost, accuracy) for c, a in points)
-            for cost, accuracy in points]  # fmt: skip
+    return [
+        not any(c <= cost and a >= accuracy and (c, a) != (cost, accuracy) for c, a in points)
+        for cost, accuracy in points
+    ]
 
 
 def placed(dots: Sequence[Dot], x: str, y: str) -> list[Spot]:
@@ -137,9 +161,12 @@ def _spot(forms: Sequence[Dot], x: str, y: str) -> Spot:
     by_cost = sorted(forms, key=lambda dot: (dot[x], dot["precision"] != "int8"))
     other = next((dot for dot in by_cost if dot["precision"] != by_cost[0]["precision"]), None)
     return Spot(
-        by_cost[0], *_at(by_cost[0], x, y), frozenset(dot["method"] for dot in forms), any(dot["runs_on_box"] for dot in forms),
+        by_cost[0],
+        *_at(by_cost[0], x, y),
+        frozenset(dot["method"] for dot in forms),
+        any(dot["runs_on_box"] for dot in forms),
         _at(other, x, y) if other else None,
-    )  # fmt: skip
+    )
 
 
 def _at(dot: Dot, x: str, y: str) -> tuple[float, float]:
@@ -149,8 +176,8 @@ def _at(dot: Dot, x: str, y: str) -> tuple[float, float]:
 def networks(dots: Sequence[Dot]) -> list[int]:
     """Of each dot the number of the first one that is the same network.
 
-    Forms of a method are one network; so are two methods of ours with the same weights and operations that were right equally
-    often under every protocol that both were run under.
+    Forms of a method are one network; so are two methods of ours with the same weights and
+    operations that were right equally often under every protocol that both were run under.
     """
     first: dict[str, int] = {}
     of = [first.setdefault(dot["method"], i) for i, dot in enumerate(dots)]
@@ -164,23 +191,32 @@ def _same(one: Dot, other: Dot) -> bool:
     both = one["accuracy"].keys() & other["accuracy"].keys()
     return (
         one["family"] == other["family"] == OURS
-        and all(one.get(key) is not None and one[key] == other.get(key) for key in ("weights", "macs", "precision"))
+        and all(
+            one.get(key) is not None and one[key] == other.get(key)
+            for key in ("weights", "macs", "precision")
+        )
         and bool(both)
         and all(one["accuracy"][key]["mean"] == other["accuracy"][key]["mean"] for key in both)
     )
 
 
 def subject(dots: Sequence[Dot]) -> str:
-    """The method that stands out: what the box ships, or shipped when the dots were measured; "" where neither is there."""
-    return next((name for name in (SHIPPED, ONCE_SHIPPED) if any(dot["method"] == name for dot in dots)), "")
+    """The method that stands out: what the box ships, or shipped when the dots were measured; ""
+    where neither is there."""
+    return next(
+        (name for name in (SHIPPED, ONCE_SHIPPED) if any(dot["method"] == name for dot in dots)), ""
+    )
 
 
 def name(dot: Dot) -> str:
     """A dot's name, unique in a chart, as commands take it."""
-    return f"{dot['method']} {dot['precision']}" + ("" if dot["runtime"] == "onnx" else f" in {dot['runtime']}")
+    return f"{dot['method']} {dot['precision']}" + (
+        "" if dot["runtime"] == "onnx" else f" in {dot['runtime']}"
+    )
 
 
 def label(dot: Dot, short: bool = False) -> str:
-    """A network's name for people. short: without saying that it is ours, for a picture whose colour says so."""
+    """A network's name for people. short: without saying that it is ours, for a picture whose
+    colour says so."""
     full = plain_name(str(dot["method"]), dot.get("weights"))
     return full.removeprefix(f"{OURS}, ").removesuffix(" weights") if short else full

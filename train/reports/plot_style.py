@@ -1,7 +1,9 @@
-"""The style that all pictures share. In: what was drawn with matplotlib. Out: SVG text, the same in every run.
+"""The style that all pictures share. In: what was drawn with matplotlib. Out: SVG text, the same in
+every run.
 
-A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …) that a page sets for light
-and dark, and that a picture by itself sets, too: in Markdown it is as dark as its reader has chosen.
+A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …) that a
+page sets for light and dark, and that a picture by itself sets, too: in Markdown it is as dark as
+its reader has chosen.
 """
 
 from __future__ import annotations
@@ -20,17 +22,30 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, Formatter, NullForma
 
 ACCENT, BLACK, GREY, FAINT, WHITE = "#0b66c3", "#1f2328", "#59636e", "#d1d9e0", "#fefefe"
 ORANGE, GREEN, PURPLE = "#b04a00", "#007a5e", "#8b3fb8"
-"""Where pictures need more colours than one; each has a contrast of 5 and more on the background."""
+"""Where pictures need more colours than one; each has a contrast of 5 and more on the
+background."""
 ROLES = {
-    "accent": ACCENT, "text": BLACK, "grey": GREY, "faint": FAINT, "background": WHITE, "orange": ORANGE, "green": GREEN,
+    "accent": ACCENT,
+    "text": BLACK,
+    "grey": GREY,
+    "faint": FAINT,
+    "background": WHITE,
+    "orange": ORANGE,
+    "green": GREEN,
     "purple": PURPLE,
-}  # fmt: skip
+}
 COLOURS = {colour: f"var(--{role}, {colour})" for role, colour in ROLES.items()}
 """What stands in an SVG for each of them."""
 DARK_ROLES = {
-    "accent": "#58a6ff", "text": "#e6edf3", "grey": "#9ea7b3", "faint": "#343b44", "background": "#0d1117",
-    "orange": "#f0883e", "green": "#3fb68b", "purple": "#c297ff",
-}  # fmt: skip
+    "accent": "#58a6ff",
+    "text": "#e6edf3",
+    "grey": "#9ea7b3",
+    "faint": "#343b44",
+    "background": "#0d1117",
+    "orange": "#f0883e",
+    "green": "#3fb68b",
+    "purple": "#c297ff",
+}
 """Colours of the same roles for readers who chose dark."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 WIDTH = 5.0
@@ -49,7 +64,8 @@ def _variables(roles: Mapping[str, str]) -> str:
 
 LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
 SCHEMES = f"<style>:root {{ {LIGHT} }} @media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}</style>"
-"""What makes a picture light or dark by itself. A page has the same rules: there it changes nothing."""
+"""What makes a picture light or dark by itself. A page has the same rules: there it changes
+nothing."""
 AXIS = "axis:"
 """Begins the id of an axis with numbers while it is drawn; its title follows."""
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
@@ -60,7 +76,8 @@ ElementTree.register_namespace("xlink", XLINK)
 
 
 class TickFormatter(Formatter):
-    """Labels that show each tick's value in full: as many decimals as it needs, up to DIGITS significant digits.
+    """Labels that show each tick's value in full: as many decimals as it needs, up to DIGITS
+    significant digits.
 
     factor: a label is the tick's value times this. unit: follows the last label.
     """
@@ -81,8 +98,11 @@ class TickFormatter(Formatter):
         return labels
 
 
-def single_axes(height: float, left: float, right: float, top: float, bottom: float) -> tuple[Figure, Axes]:
-    """A picture `height` inches high with one plot; left, right: its ends as shares; top, bottom: inches around it."""
+def single_axes(
+    height: float, left: float, right: float, top: float, bottom: float
+) -> tuple[Figure, Axes]:
+    """A picture `height` inches high with one plot; left, right: its ends as shares; top, bottom:
+    inches around it."""
     figure = Figure((WIDTH, height))
     return figure, add_axes(figure, left, right, 1 - top / height, bottom / height)
 
@@ -98,7 +118,8 @@ def add_axes(figure: Figure, left: float, right: float, top: float, bottom: floa
 
 
 def set_titles(axes: Axes, x: str = "", y: str = "") -> None:
-    """What an axis shows, with its unit: below the horizontal one, and level above the upper end of the vertical one."""
+    """What an axis shows, with its unit: below the horizontal one, and level above the upper end of
+    the vertical one."""
     axes.set_xlabel(x, color=GREY, size=SMALL)
     axes.set_ylabel(y, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
     axes.yaxis.set_label_coords(0, 1.02)
@@ -125,7 +146,8 @@ def set_ticks(
 ) -> None:
     """Ticks without strokes, labelled with their values times `factor`, the last one with the unit.
 
-    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside one that has them.
+    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside one
+    that has them.
     """
     unit, factor = ("%", 100.0) if percent else (unit, factor)
     _place_ticks(axis, ticks, NullFormatter() if bare else TickFormatter(factor, unit))
@@ -150,20 +172,37 @@ def _place_ticks(axis: Axis, ticks: Iterable[float], formatter: Formatter) -> No
     axis.set_tick_params(length=0, labelcolor=GREY, labelsize=SMALL)
 
 
-def write(axes: Axes, x: float, y: float, text: str, colour: str = BLACK, size: float = MEDIUM, **style: Any) -> None:
-    """Text at a point in the plot's units, also outside of it; centred there unless `style` says otherwise.
+def write(
+    axes: Axes,
+    x: float,
+    y: float,
+    text: str,
+    colour: str = BLACK,
+    size: float = MEDIUM,
+    **style: Any,
+) -> None:
+    """Text at a point in the plot's units, also outside of it; centred there unless `style` says
+    otherwise.
 
-    Of several lines the last one is there and the others stand above it, each a text of its own, so that they stay in
-    line in a reader's own font.
+    Of several lines the last one is there and the others stand above it, each a text of its own, so
+    that they stay in line in a reader's own font.
     """
-    given: dict[str, Any] = {"color": colour, "size": size, "va": "center", "ha": "center", "annotation_clip": False}
+    given: dict[str, Any] = {
+        "color": colour,
+        "size": size,
+        "va": "center",
+        "ha": "center",
+        "annotation_clip": False,
+    }
     for up, line in enumerate(reversed(text.split("\n"))):
-        axes.annotate(line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **given | style)
+        axes.annotate(
+            line, (x, y), (0, 1.2 * size * up), textcoords="offset points", **given | style
+        )
 
 
 def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
-    """The picture as SVG text. about: its title, for those who cannot see it. plain: with colours in place of roles, for
-    programs that know no style sheets.
+    """The picture as SVG text. about: its title, for those who cannot see it. plain: with colours
+    in place of roles, for programs that know no style sheets.
 
     Each axis with numbers has its title as the attribute data-axis, "" where it has none.
     """
@@ -173,7 +212,9 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
         axes.yaxis.set_gid(_named(axes.yaxis, figure.get_supylabel()))
     file = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": about}):
-        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        figure.savefig(
+            file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
     root = ElementTree.fromstring(file.getvalue())
     for style in root.findall(f"{{{SVG}}}defs[{{{SVG}}}style]"):
         root.remove(style)  # a style sheet would be that of the whole page
@@ -192,8 +233,11 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
 
 
 def _named(axis: Axis, shared: str) -> str | None:
-    """The id under which an axis with numbers is drawn: its title, or the one that all of the picture share."""
-    if not isinstance(axis.get_major_formatter(), TickFormatter) or not len(axis.get_majorticklocs()):
+    """The id under which an axis with numbers is drawn: its title, or the one that all of the
+    picture share."""
+    if not isinstance(axis.get_major_formatter(), TickFormatter) or not len(
+        axis.get_majorticklocs()
+    ):
         return None
     return AXIS + (axis.get_label_text() or shared)
 
@@ -207,7 +251,8 @@ def _drop_empty_groups(parent: ElementTree.Element) -> None:
 
 
 def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
-    """Colours as `colours` says, no font of matplotlib's, no names of groups, coordinates no finer than can be seen."""
+    """Colours as `colours` says, no font of matplotlib's, no names of groups, coordinates no finer
+    than can be seen."""
     attributes = element.attrib
     if element.tag == f"{{{SVG}}}g":
         name = attributes.pop("id", "")  # two pictures of a page would share them
@@ -215,12 +260,18 @@ def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
             attributes["data-axis"] = name.removeprefix(AXIS)
     if "style" in attributes:
         parts = (part.partition(":") for part in attributes["style"].split(";"))
-        pairs = {name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"}
-        attributes["style"] = "; ".join(f"{name}: {colours.get(value, value)}" for name, value in pairs.items() if name)
+        pairs = {
+            name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"
+        }
+        attributes["style"] = "; ".join(
+            f"{name}: {colours.get(value, value)}" for name, value in pairs.items() if name
+        )
     for name in NUMBERS & attributes.keys():
         attributes[name] = _short(attributes[name])
     if "d" in attributes:
-        attributes["d"] = " ".join(part if part.isalpha() else _short(part) for part in attributes["d"].split())
+        attributes["d"] = " ".join(
+            part if part.isalpha() else _short(part) for part in attributes["d"].split()
+        )
     if attributes.get("transform", "").startswith(("rotate(-0 ", "rotate(0 ")):
         del attributes["transform"]
 

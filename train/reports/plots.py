@@ -1,6 +1,7 @@
 """Pictures of results. In: numbers, as evaluate and paper give them. Out: SVG text.
 
-Our results are in the accent colour, values printed in the paper are hollow diamonds; all else is grey.
+Our results are in the accent colour, values printed in the paper are hollow diamonds; all else is
+grey.
 """
 
 from __future__ import annotations
@@ -40,12 +41,18 @@ Estimate = tuple[float, float, float]
 """Share, lower and upper end of its 95 % interval."""
 Grid = Mapping[tuple[str, str], Estimate]
 """By row and column."""
-STRONGEST = 0.6  # of the accent colour behind a number: text stays readable on it, in light and in dark
+STRONGEST = (
+    0.6  # of the accent colour behind a number: text stays readable on it, in light and in dark
+)
 MEANS = {True: "without each taxel’s mean over the window", False: "as recorded, means and all"}
 """Titles of the panels of `matrix`."""
 PRINTED: dict[str, Any] = {
-    "marker": "D", "markersize": 5.5, "markerfacecolor": WHITE, "markeredgecolor": BLACK, "linestyle": "none",
-}  # fmt: skip
+    "marker": "D",
+    "markersize": 5.5,
+    "markerfacecolor": WHITE,
+    "markeredgecolor": BLACK,
+    "linestyle": "none",
+}
 STRONG: tuple[dict[str, Any], ...] = (
     {"color": ACCENT, "linewidth": 2.0},
     {"color": BLACK, "linewidth": 1.6, "linestyle": (0, (3, 1.5))},
@@ -67,8 +74,14 @@ def bars(groups: Mapping[str, Sequence[Bar]], about: str, chance: float = 0.0) -
 
     groups: rows by heading ("" for none). chance: share right of a random guess, drawn as a line.
     """
-    lines = [line for heading, rows in groups.items() for line in ([heading] if heading else []) + list(rows)]
-    figure, axes = single_axes(len(lines) * 0.29 + 0.75, left=0.21, right=0.63, top=0.32, bottom=0.43)
+    lines = [
+        line
+        for heading, rows in groups.items()
+        for line in ([heading] if heading else []) + list(rows)
+    ]
+    figure, axes = single_axes(
+        len(lines) * 0.29 + 0.75, left=0.21, right=0.63, top=0.32, bottom=0.43
+    )
     for y, line in enumerate(lines):
         if isinstance(line, str):
             write(axes, -0.48, y, line, ha="left", weight="bold")
@@ -101,7 +114,8 @@ def _bar(axes: Axes, y: float, bar: Bar) -> None:
 
 
 def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: str) -> str:
-    """Cost over iterations, both logarithmic: each fold thin, the median strong. costs: [n, 2] each, as Fold.cost.
+    """Cost over iterations, both logarithmic: each fold thin, the median strong. costs: [n, 2]
+    each, as Fold.cost.
 
     printed: marks (iteration, cost).
     """
@@ -114,24 +128,44 @@ def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: s
         median = np.median([cost[:n] for cost in folds], axis=0)
         axes.plot(*median.T, **STRONG[0])
         late = median[-1, 0] > 1500
-        axes.annotate("ours", median[-1], (0, 7) if late else (0, -7), textcoords="offset points", color=ACCENT,
-                      size=MEDIUM, va="bottom" if late else "top", ha="right" if late else "center")  # fmt: skip
+        axes.annotate(
+            "ours",
+            median[-1],
+            (0, 7) if late else (0, -7),
+            textcoords="offset points",
+            color=ACCENT,
+            size=MEDIUM,
+            va="bottom" if late else "top",
+            ha="right" if late else "center",
+        )
     for at in printed:
         axes.plot(*at, zorder=3, **PRINTED)
-        axes.annotate(f"{at[1]:g}", at, (0, 7), textcoords="offset points", color=BLACK, size=SMALL, ha="center")
+        axes.annotate(
+            f"{at[1]:g}",
+            at,
+            (0, 7),
+            textcoords="offset points",
+            color=BLACK,
+            size=SMALL,
+            ha="center",
+        )
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(1, 6000)
     axes.set_ylim(min([1e-3, *(cost[:, 1].min() / 2 for cost in folds)]), 6)
     axes.grid(color=FAINT, linewidth=0.6)
     set_ticks(axes.xaxis, [1, 10, 100, 1000, 4000])
-    set_ticks(axes.yaxis, [tick for tick in (1e-5, 1e-4, 1e-3, 0.01, 0.1, 1) if tick >= axes.get_ylim()[0]])
+    set_ticks(
+        axes.yaxis,
+        [tick for tick in (1e-5, 1e-4, 1e-3, 0.01, 0.1, 1) if tick >= axes.get_ylim()[0]],
+    )
     set_titles(axes, "iteration", "cross entropy   ◇ printed")
     return to_svg(figure, about)
 
 
 def confusion(matrix: Array, names: Sequence[str], about: str, printed: Array | None = None) -> str:
-    """Counts or shares [K, K], rows the truth: each row in per cent, and below in small the values printed."""
+    """Counts or shares [K, K], rows the truth: each row in per cent, and below in small the values
+    printed."""
     k = len(names)
     rows = np.asarray(matrix, float) / np.maximum(np.sum(matrix, 1, keepdims=True), 1e-9)
     figure, axes = single_axes(
@@ -140,8 +174,14 @@ def confusion(matrix: Array, names: Sequence[str], about: str, printed: Array | 
     for i, j in np.ndindex(k, k):
         _shade(axes, i, j, rows[i, j])
         there = rows[i, j] >= 0.005
-        write(axes, j + 0.5, i + (0.5 if printed is None else 0.36), f"{100 * rows[i, j]:.0f}" if there else "·",
-              BLACK if there else GREY, weight="bold" if i == j else "normal")  # fmt: skip
+        write(
+            axes,
+            j + 0.5,
+            i + (0.5 if printed is None else 0.36),
+            f"{100 * rows[i, j]:.0f}" if there else "·",
+            BLACK if there else GREY,
+            weight="bold" if i == j else "normal",
+        )
         if printed is not None and printed[i][j] > 0:
             write(axes, j + 0.5, i + 0.76, f"◇ {100 * printed[i][j]:.0f}", size=SMALL - 1)
     for i, name in enumerate(names):
@@ -153,9 +193,12 @@ def confusion(matrix: Array, names: Sequence[str], about: str, printed: Array | 
 
 
 def sweeps(
-    ours: Mapping[str, Mapping[str, Sequence[Estimate]]], printed: Mapping[str, Sequence[float | None]], about: str
+    ours: Mapping[str, Mapping[str, Sequence[Estimate]]],
+    printed: Mapping[str, Sequence[float | None]],
+    about: str,
 ) -> str:
-    """A panel for each method: share right after one, two, three … sweeps, by "product" and by "vote"."""
+    """A panel for each method: share right after one, two, three … sweeps, by "product" and by
+    "vote"."""
     lowest = min(e[1] for rules in ours.values() for line in rules.values() for e in line)
     bottom, figure = max(np.floor(lowest * 10) / 10, 0), Figure((WIDTH, 2.7))
     for i, (name, rules) in enumerate(ours.items()):
@@ -167,7 +210,12 @@ def sweeps(
         axes.set_ylim(bottom, 1.04)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         set_ticks(axes.xaxis, range(1, count + 1))
-        set_ticks(axes.yaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.3 else 0.2), percent=True, bare=i > 0)
+        set_ticks(
+            axes.yaxis,
+            np.arange(bottom, 1.01, 0.1 if bottom > 0.3 else 0.2),
+            percent=True,
+            bare=i > 0,
+        )
     line: dict[str, Any] = {"y": 0.1, "va": "center", "ha": "left", "color": GREY, "size": SMALL}
     figure.supxlabel("sweeps of one tube to the right,", x=0.09, **line)
     figure.supylabel("share named rightly upwards", x=0.51, rotation=0, **line)
@@ -180,8 +228,11 @@ def sweeps(
     return to_svg(figure, about)
 
 
-def _fusion_panel(axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: Sequence[float | None]) -> int:
-    """Both rules of one method, and marks of what was printed; how many sweeps there are at most."""
+def _fusion_panel(
+    axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: Sequence[float | None]
+) -> int:
+    """Both rules of one method, and marks of what was printed; how many sweeps there are at
+    most."""
     looks: dict[str, tuple[dict[str, Any], int]] = {
         "vote": ({"color": GREY, "linewidth": 1.4}, -12),
         "product": (STRONG[0], 7),
@@ -191,28 +242,45 @@ def _fusion_panel(axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: 
         n = np.arange(1, len(mean) + 1)
         axes.fill_between(n, low, high, color=look["color"], alpha=0.07, linewidth=0)
         axes.plot(n, mean, marker="o", markersize=3, **look)
-        for at in list(zip(n, mean, strict=True))[rule == "vote" :]:  # one sweep is the same by both
-            axes.annotate(f"{100 * at[1]:.0f}", at, (0, away), textcoords="offset points", color=look["color"], size=SMALL,
-                          ha="center")  # fmt: skip
+        for at in list(zip(n, mean, strict=True))[
+            rule == "vote" :
+        ]:  # one sweep is the same by both
+            axes.annotate(
+                f"{100 * at[1]:.0f}",
+                at,
+                (0, away),
+                textcoords="offset points",
+                color=look["color"],
+                size=SMALL,
+                ha="center",
+            )
     for count, value in enumerate(printed, 1):
         if value is not None:
             axes.plot(count, value, zorder=3, **PRINTED)
     return len(rules["product"])
 
 
-def matrix(results: Sequence[Mapping[str, Any]], about: str = "methods by protocols", count: str = "window") -> str:
-    """Methods x protocols from the list that `evaluate` writes: a panel without each window's means, one with them.
+def matrix(
+    results: Sequence[Mapping[str, Any]], about: str = "methods by protocols", count: str = "window"
+) -> str:
+    """Methods x protocols from the list that `evaluate` writes: a panel without each window's
+    means, one with them.
 
-    Each cell is the mean over seeds. count: "window" or "recording". Sets differ by their number of materials.
+    Each cell is the mean over seeds. count: "window" or "recording". Sets differ by their number of
+    materials.
     """
     panels: dict[str, dict[tuple[str, str], list[Estimate]]] = {}
-    for result in sorted(results, key=lambda r: (not r["means_removed"], _ease(r["protocol"]), -len(r["materials"]))):
+    for result in sorted(
+        results, key=lambda r: (not r["means_removed"], _ease(r["protocol"]), -len(r["materials"]))
+    ):
         ends = result["interval" if count == "window" else "recording_interval"]
         column = f"{_left_out(result['protocol'])}\n{len(result['materials'])} classes"
         panel = panels.setdefault(MEANS[result["means_removed"]], {})
         share = result[count]["right"] / result[count]["total"]
         panel.setdefault((plain_name(result["method"]), column), []).append((share, *ends))
-    means = {title: {at: _mean(seeds) for at, seeds in cells.items()} for title, cells in panels.items()}
+    means = {
+        title: {at: _mean(seeds) for at, seeds in cells.items()} for title, cells in panels.items()
+    }
     return grid(means, about)
 
 
@@ -220,7 +288,9 @@ def _left_out(protocol: str) -> str:
     """What a protocol leaves out, in two lines."""
     kind, _, name = protocol.partition(":")
     name = {"rep": "repetition"}.get(name, name.split("=")[0])
-    return {"leave": f"{name}\nleft out", "split": f"split by\n{name}", "random": "random\nparts"}[kind]
+    return {"leave": f"{name}\nleft out", "split": f"split by\n{name}", "random": "random\nparts"}[
+        kind
+    ]
 
 
 def _mean(seeds: Sequence[Estimate]) -> Estimate:
@@ -229,13 +299,18 @@ def _mean(seeds: Sequence[Estimate]) -> Estimate:
 
 
 def grid(panels: Mapping[str, Grid], about: str) -> str:
-    """Per cent with intervals in a table of rows x columns for each panel; a deeper colour for more.
+    """Per cent with intervals in a table of rows x columns for each panel; a deeper colour for
+    more.
 
-    Columns are in the given order, so put the hard ones first; rows with the best of the first panel on top.
+    Columns are in the given order, so put the hard ones first; rows with the best of the first
+    panel on top.
     """
     first = next(iter(panels.values()))
     names = list(dict.fromkeys(row for panel in panels.values() for row, _ in panel))
-    means = {name: np.mean([e[0] for (row, _), e in first.items() if row == name] or [0]) for name in names}
+    means = {
+        name: np.mean([e[0] for (row, _), e in first.items() if row == name] or [0])
+        for name in names
+    }
     names.sort(key=lambda name: -means[name])
     above, below = 0.75, 0.34 * len(names)
     figure = Figure((WIDTH, (above + below) * len(panels) + 0.05))
@@ -243,7 +318,9 @@ def grid(panels: Mapping[str, Grid], about: str) -> str:
     for p, (title, panel) in enumerate(panels.items()):
         top = 1 - inch * ((above + below) * p + above)
         axes = add_axes(figure, 0.31, 0.995, top, top - inch * below)
-        figure.text(0.01, top + inch * (above - 0.22), title, color=BLACK, size=MEDIUM, weight="bold")
+        figure.text(
+            0.01, top + inch * (above - 0.22), title, color=BLACK, size=MEDIUM, weight="bold"
+        )
         _table(axes, panel, names)
     return to_svg(figure, about)
 
@@ -266,7 +343,11 @@ def _ease(protocol: str) -> int:
 
 
 def _shade(axes: Axes, i: int, j: int, strength: float) -> None:
-    axes.add_patch(Rectangle((j, i), 1, 1, facecolor=ACCENT, alpha=STRONGEST * float(strength), edgecolor="none"))
+    axes.add_patch(
+        Rectangle(
+            (j, i), 1, 1, facecolor=ACCENT, alpha=STRONGEST * float(strength), edgecolor="none"
+        )
+    )
 
 
 def _cell(axes: Axes, i: int, j: int, estimate: Estimate) -> None:

@@ -1,7 +1,9 @@
-"""The header of pages, pictures and results: of which commit, bundle, sets, seeds and date they are.
+"""The header of pages, pictures and results: of which commit, bundle, sets, seeds and date they
+are.
 
-In: figures, as a results.json holds them, whose parts name their origin (metrics.score.provenance). Out: a Provenance; it
-stands in HTML as JSON of a script, in SVG as metadata, in Markdown as a comment, and `read` finds it in each of them.
+In: figures, as a results.json holds them, whose parts name their origin (metrics.score.provenance).
+Out: a Provenance; it stands in HTML as JSON of a script, in SVG as metadata, in Markdown as a
+comment, and `read` finds it in each of them.
 """
 
 from __future__ import annotations
@@ -27,15 +29,17 @@ FOUND = {
 }
 """Where the header stands, by the file's suffix."""
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "--": "\\u002d\\u002d"}
-"""What no header holds as it is, so that the same text can stand in HTML, in SVG and in a comment."""
+"""What no header holds as it is, so that the same text can stand in HTML, in SVG and in a
+comment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """Where figures are from. Several runs may be joined in them.
 
-    bundle: ids of the bundles that were measured, or that were packaged when the default recipe was run; empty where the
-    figures do not say, or where the default is not among their methods. date: of the last run, YYYY-MM-DD or "".
+    bundle: ids of the bundles that were measured, or that were packaged when the default recipe was
+    run; empty where the figures do not say, or where the default is not among their methods. date:
+    of the last run, YYYY-MM-DD or "".
     """
 
     commit: tuple[str, ...] = ()
@@ -54,35 +58,54 @@ class Provenance:
 
     @property
     def older(self) -> str:
-        """Why these figures are not of the default that is packaged now, as the first line of a page; "" where they are."""
+        """Why these figures are not of the default that is packaged now, as the first line of a
+        page; "" where they are."""
         now = score.shipped()
         others = [name for name in self.bundle if name != now]
         if others:
             part = "in part " if now in self.bundle else ""
             return f"Made {part}with an older default, bundle {' and '.join(others)}; the box ships bundle {now} now."
-        return "" if self.bundle else f"Made without the default that the box ships now, bundle {now}."
+        return (
+            "" if self.bundle else f"Made without the default that the box ships now, bundle {now}."
+        )
 
 
 def of(figures: Any) -> Provenance:
-    """What `figures` say of their origin, wherever they say it. Methods other than the default have no bundle."""
+    """What `figures` say of their origin, wherever they say it. Methods other than the default have
+    no bundle."""
     found: dict[str, list[Any]] = {field.name: [] for field in fields(Provenance)}
     for part in _parts(figures):
         found["commit"] += _texts(part.get("commit"))
-        found["seeds"] += [seed for key in ("seed", "seeds") for seed in _list(part.get(key)) if type(seed) is int]
-        found["sets"] += [name for key in SETS for name in _texts(part.get(key)) if TEMPLATE not in name]
-        found["date"] += [text[:10] for key in ("date", "started") for text in _texts(part.get(key))]
-        found["bundle"] += _bundle(part.get("bundle")) or (_texts(part.get("shipped")) if _has_default(part) else [])
-    commits, bundles, sets = (tuple(dict.fromkeys(found[name])) for name in ("commit", "bundle", "sets"))
-    return Provenance(commits, bundles, sets, tuple(sorted(set(found["seeds"]))), max(found["date"], default=""))
+        found["seeds"] += [
+            seed for key in ("seed", "seeds") for seed in _list(part.get(key)) if type(seed) is int
+        ]
+        found["sets"] += [
+            name for key in SETS for name in _texts(part.get(key)) if TEMPLATE not in name
+        ]
+        found["date"] += [
+            text[:10] for key in ("date", "started") for text in _texts(part.get(key))
+        ]
+        found["bundle"] += _bundle(part.get("bundle")) or (
+            _texts(part.get("shipped")) if _has_default(part) else []
+        )
+    commits, bundles, sets = (
+        tuple(dict.fromkeys(found[name])) for name in ("commit", "bundle", "sets")
+    )
+    return Provenance(
+        commits, bundles, sets, tuple(sorted(set(found["seeds"]))), max(found["date"], default="")
+    )
 
 
 def in_svg(svg: str, about: Provenance) -> str:
     """The picture with its header, in place of one that it may have."""
-    return without(svg).replace("</title>", f'</title><metadata id="{NAME}">{about.json}</metadata>', 1)
+    return without(svg).replace(
+        "</title>", f'</title><metadata id="{NAME}">{about.json}</metadata>', 1
+    )
 
 
 def in_markdown(text: str, about: Provenance) -> str:
-    """The page with its header behind the title, and with a first line that says so where its figures are older."""
+    """The page with its header behind the title, and with a first line that says so where its
+    figures are older."""
     title, _, rest = without(text).partition("\n")
     first = f"\n> **{about.older}**\n" if about.older else ""
     return f"{title}\n\n<!-- {NAME} {about.json} -->{first}<!-- /{NAME} -->\n\n{rest.lstrip()}"
@@ -96,14 +119,17 @@ def without(text: str) -> str:
 
 
 def read(path: Path) -> Provenance:
-    """The header of a page, of a picture or of a file of results. Raises FormatError where it has none."""
+    """The header of a page, of a picture or of a file of results. Raises FormatError where it has
+    none."""
     try:
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".json":
             return of(json.loads(text))
         header = re.search(FOUND[path.suffix], text, flags=re.DOTALL)
         held: dict[str, Any] = json.loads(header[1] if header else "nothing")
-        known: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in held.items()}
+        known: dict[str, Any] = {
+            name: tuple(v) if isinstance(v, list) else v for name, v in held.items()
+        }
         return Provenance(**known)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
         why = e.strerror if isinstance(e, OSError) else "no header that says where it is from"
@@ -111,10 +137,13 @@ def read(path: Path) -> Provenance:
 
 
 def _parts(figures: Any) -> Iterator[dict[str, Any]]:
-    """All objects in what was read from JSON, the outer ones first; not how a bundle was made, which is another run."""
+    """All objects in what was read from JSON, the outer ones first; not how a bundle was made,
+    which is another run."""
     if isinstance(figures, dict):
         yield figures
-    values = [v for k, v in figures.items() if k != "made"] if isinstance(figures, dict) else figures
+    values = (
+        [v for k, v in figures.items() if k != "made"] if isinstance(figures, dict) else figures
+    )
     for value in values if isinstance(values, list) else ():
         yield from _parts(value)
 
@@ -125,7 +154,8 @@ def _bundle(value: Any) -> list[str]:
 
 
 def _has_default(part: dict[str, Any]) -> bool:
-    """Whether the default recipe, or that of the packaged bundle, is among the methods of a part; True where it names none."""
+    """Whether the default recipe, or that of the packaged bundle, is among the methods of a part;
+    True where it names none."""
     methods = [name for key in ("method", "methods") for name in _list(part.get(key))]
     return not methods or SHIPPED in methods or PACKAGED in methods
 

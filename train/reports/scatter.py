@@ -1,8 +1,8 @@
 """The chart without scripts: accuracy over cost. In: dots, as chart.json lists them. Out: SVG text.
 
-Each network is one mark: ours in the accent colour, what the box ships in a ring; of the others dark where none is both
-cheaper and more accurate, else grey. Squares are int8, circles float, and an arrow leads from the one to the other; what
-cannot run on the box is hollow.
+Each network is one mark: ours in the accent colour, what the box ships in a ring; of the others
+dark where none is both cheaper and more accurate, else grey. Squares are int8, circles float, and
+an arrow leads from the one to the other; what cannot run on the box is hollow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,17 @@ from train.models.methods import SHIPPED
 from train.reports import accuracy_axis
 from train.reports.formatting import amount, percent
 from train.reports.method_names import OURS
-from train.reports.pareto import ACCURACIES, COSTS, ChartAxis, Dot, Spot, label, networks, placed, subject
+from train.reports.pareto import (
+    ACCURACIES,
+    COSTS,
+    ChartAxis,
+    Dot,
+    Spot,
+    label,
+    networks,
+    placed,
+    subject,
+)
 from train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -44,10 +54,24 @@ LETTER = 0.56
 MARK = 3.2
 """Half of a mark, points."""
 RING, FARTHER, GUESSED = 13.5, 1.5, 6.0
-"""Around what is shipped, points across; how much farther its name is; what is kept free above the floor, where guessing is."""
-PLACES = [(6, 0, "left"), (0, 10, "center"), (-6, 0, "right"), (0, -10, "center"), (-4, 8, "right"), (5, -8, "left"),
-          (5, 8, "left"), (-5, -8, "right"), (0, 20, "center"), (0, -20, "center"), (8, 16, "left"), (8, -16, "left"),
-          (-8, 16, "right"), (-8, -16, "right")]  # fmt: skip
+"""Around what is shipped, points across; how much farther its name is; what is kept free above the
+floor, where guessing is."""
+PLACES = [
+    (6, 0, "left"),
+    (0, 10, "center"),
+    (-6, 0, "right"),
+    (0, -10, "center"),
+    (-4, 8, "right"),
+    (5, -8, "left"),
+    (5, 8, "left"),
+    (-5, -8, "right"),
+    (0, 20, "center"),
+    (0, -20, "center"),
+    (8, 16, "left"),
+    (8, -16, "left"),
+    (-8, 16, "right"),
+    (-8, -16, "right"),
+]
 """Where a name may stand, points from its dot, and its alignment; the best first."""
 SIDES = {"left": 0.0, "center": 0.5, "right": 1.0}
 """Where along a name its dot is."""
@@ -76,10 +100,14 @@ def chart(
         (0.66, 1, f"■ {OURS}   ◯ shipped{'' if chosen == SHIPPED else ' then'}", ACCENT),
     ):
         figure.text(x, (0.06 + 0.19 * row) / height, text, color=shade, size=SMALL)
-    return to_svg(figure, f"accuracy over {COSTS[cost].short}, of {len(set(networks(dots)))} models")
+    return to_svg(
+        figure, f"accuracy over {COSTS[cost].short}, of {len(set(networks(dots)))} models"
+    )
 
 
-def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost: ChartAxis, chosen: str) -> None:
+def _panel(
+    axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost: ChartAxis, chosen: str
+) -> None:
     ends = [x for spot in spots for x, _ in ((spot.x, spot.y), spot.other or (spot.x, 0))]
     axes.set_xscale("log")
     axes.set_xlim(min(ends) / 1.6, max(ends) * 1.6)
@@ -87,8 +115,16 @@ def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost:
     accuracy_axis.stretch(axes, "y", [*lows, *([accuracy.chance] if accuracy.chance else [])])
     if accuracy.chance:
         accuracy_axis.draw_chance(axes, accuracy.chance)
-        axes.annotate(f"guessing: {percent(accuracy.chance)}", (1, accuracy.chance), (0, 3), ("axes fraction", "data"),
-                      textcoords="offset points", color=GREY, size=SMALL, ha="right")  # fmt: skip
+        axes.annotate(
+            f"guessing: {percent(accuracy.chance)}",
+            (1, accuracy.chance),
+            (0, 3),
+            ("axes fraction", "data"),
+            textcoords="offset points",
+            color=GREY,
+            size=SMALL,
+            ha="right",
+        )
     axes.grid(color=FAINT, linewidth=0.6)
     tens = 10.0 ** np.arange(np.floor(np.log10(min(ends))), np.ceil(np.log10(max(ends))) + 1)
     ticks = [float(t) for t in tens if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]]
@@ -107,16 +143,29 @@ def _panel(axes: Axes, spots: Sequence[Spot], accuracy: ChartAxis, y: str, cost:
 
 
 def _head(axes: Axes, spots: Sequence[Spot], title: str, cost: ChartAxis, chosen: str) -> None:
-    """What is upwards, and what one is to read first: what the box ships, and the most accurate other method."""
+    """What is upwards, and what one is to read first: what the box ships, and the most accurate
+    other method."""
     shipped = next((spot for spot in spots if chosen in spot.methods), None)
-    peer = max((spot for spot in spots if spot.dot["family"] != OURS), key=lambda spot: spot.y, default=None)
-    axes.set_ylabel(title, color=BLACK, size=MEDIUM, weight="bold", rotation=0, ha="left", va="bottom")
+    peer = max(
+        (spot for spot in spots if spot.dot["family"] != OURS),
+        key=lambda spot: spot.y,
+        default=None,
+    )
+    axes.set_ylabel(
+        title, color=BLACK, size=MEDIUM, weight="bold", rotation=0, ha="left", va="bottom"
+    )
     axes.yaxis.set_label_coords(-0.1, 1 + HEAD / axes.get_window_extent().height)
     for up, before, spot in ((21, "", shipped), (9, "best peer, ", peer)):
         if spot:
             text = f"{before}{label(spot.dot)}: {percent(spot.y)} in {amount(spot.x, cost.unit)}"
             axes.annotate(
-                text, (-0.1, 1), (0, up), "axes fraction", textcoords="offset points", color=colour(spot), size=SMALL
+                text,
+                (-0.1, 1),
+                (0, up),
+                "axes fraction",
+                textcoords="offset points",
+                color=colour(spot),
+                size=SMALL,
             )
 
 
@@ -128,20 +177,51 @@ def colour(spot: Spot) -> str:
 def _mark(axes: Axes, spot: Spot, y: str, chosen: str) -> None:
     shade, ends, mine = colour(spot), spot.dot["accuracy"][y], chosen in spot.methods
     strength, int8 = 1.0 if spot.best or mine else 0.6, spot.dot["precision"] == "int8"
-    axes.plot([spot.x] * 2, [ends["low"], ends["high"]], color=shade, linewidth=0.9, alpha=0.5 * strength)
+    axes.plot(
+        [spot.x] * 2, [ends["low"], ends["high"]], color=shade, linewidth=0.9, alpha=0.5 * strength
+    )
     if spot.other:
         tail, head = (spot.other, (spot.x, spot.y)) if int8 else ((spot.x, spot.y), spot.other)
-        axes.annotate("", head, tail, arrowprops={"arrowstyle": "->", "color": shade, "linewidth": 1, "alpha": strength,
-                      "shrinkA": 0, "shrinkB": MARK if int8 else 0})  # fmt: skip
+        axes.annotate(
+            "",
+            head,
+            tail,
+            arrowprops={
+                "arrowstyle": "->",
+                "color": shade,
+                "linewidth": 1,
+                "alpha": strength,
+                "shrinkA": 0,
+                "shrinkB": MARK if int8 else 0,
+            },
+        )
     look: dict[str, Any] = {"color": shade, "clip_on": False}
-    axes.plot(spot.x, spot.y, "s" if int8 else "o", markersize=2 * MARK, markeredgewidth=1.2, alpha=strength,
-              markerfacecolor=shade if spot.on_box else WHITE, zorder=3 + spot.best, **look)  # fmt: skip
+    axes.plot(
+        spot.x,
+        spot.y,
+        "s" if int8 else "o",
+        markersize=2 * MARK,
+        markeredgewidth=1.2,
+        alpha=strength,
+        markerfacecolor=shade if spot.on_box else WHITE,
+        zorder=3 + spot.best,
+        **look,
+    )
     if mine:
-        axes.plot(spot.x, spot.y, "o", markersize=RING, markeredgewidth=1.4, markerfacecolor="none", **look)
+        axes.plot(
+            spot.x,
+            spot.y,
+            "o",
+            markersize=RING,
+            markeredgewidth=1.4,
+            markerfacecolor="none",
+            **look,
+        )
 
 
 def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any], chosen: str) -> None:
-    """Names beside the dots, each once, what the box ships first; a name that fits nowhere is left out.
+    """Names beside the dots, each once, what the box ships first; a name that fits nowhere is left
+    out.
 
     stairs [n, 2]: the front's corners, in points.
     """
@@ -155,30 +235,47 @@ def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any], chosen: str
             taken.append((min(x, to_x), min(y, to_y) - 2, max(x, to_x), max(y, to_y) + 2))
     left, bottom, right, top = map(float, axes.get_window_extent().extents)
     frame: Box = (left, bottom + GUESSED, right, top)
-    taken.append((right - 80, bottom, right, bottom + GUESSED + 12))  # where it says what guessing reaches
+    taken.append(
+        (right - 80, bottom, right, bottom + GUESSED + 12)
+    )  # where it says what guessing reaches
     for i in _important(spots, chosen):
         _name(axes, spots[i], at[i], taken, i, frame, chosen)
 
 
 def _name(
     axes: Axes, spot: Spot, at: NDArray[Any], taken: list[Box], own: int, frame: Box, chosen: str
-) -> None:  # fmt: skip
-    """The name of a spot at the first of PLACES that is free; it is then taken. own: its mark's number in `taken`."""
+) -> None:
+    """The name of a spot at the first of PLACES that is free; it is then taken. own: its mark's
+    number in `taken`."""
     mine = chosen in spot.methods
     text, far = label(spot.dot, short=not mine), FARTHER if mine else 1.0
     width = LETTER * SMALL * len(text) * (1.12 if mine else 1.0)
     for dx, dy, side in PLACES:
         box = _box(at[0], at[1], far * dx, far * dy, side, width, SMALL)
-        if _inside(box, frame) and not any(_meet(box, other) for k, other in enumerate(taken) if k != own):
+        if _inside(box, frame) and not any(
+            _meet(box, other) for k, other in enumerate(taken) if k != own
+        ):
             taken.append(box)
-            axes.annotate(text, (spot.x, spot.y), (far * dx, far * dy), textcoords="offset points", size=SMALL, va="center", ha=side,
-                          color=colour(spot), weight="bold" if mine else "normal", annotation_clip=False, zorder=6,
-                          arrowprops=LEADER | {"relpos": (SIDES[side], 0.5)} if mine else None)  # fmt: skip
+            axes.annotate(
+                text,
+                (spot.x, spot.y),
+                (far * dx, far * dy),
+                textcoords="offset points",
+                size=SMALL,
+                va="center",
+                ha=side,
+                color=colour(spot),
+                weight="bold" if mine else "normal",
+                annotation_clip=False,
+                zorder=6,
+                arrowprops=LEADER | {"relpos": (SIDES[side], 0.5)} if mine else None,
+            )
             return
 
 
 def _important(spots: Sequence[Spot], chosen: str) -> Iterator[int]:
-    """Indices of the spots in the order in which they get names: what ships, the front, the best of each family, the rest."""
+    """Indices of the spots in the order in which they get names: what ships, the front, the best of
+    each family, the rest."""
     families: dict[str, int] = {}
     for i, spot in enumerate(spots):
         if spot.y > spots[families.setdefault(spot.dot["family"], i)].y:
@@ -186,7 +283,12 @@ def _important(spots: Sequence[Spot], chosen: str) -> Iterator[int]:
     shipped = [i for i, spot in enumerate(spots) if chosen in spot.methods]
     leading = [i for i, spot in enumerate(spots) if spot.best]
     yield from dict.fromkeys(
-        [*shipped, *leading, *families.values(), *sorted(range(len(spots)), key=lambda i: -spots[i].y)]
+        [
+            *shipped,
+            *leading,
+            *families.values(),
+            *sorted(range(len(spots)), key=lambda i: -spots[i].y),
+        ]
     )
 
 
@@ -196,7 +298,12 @@ def _box(x: float, y: float, dx: float, dy: float, side: str, width: float, size
 
 
 def _inside(box: Box, frame: Box) -> bool:
-    return box[0] >= frame[0] and box[2] <= frame[2] + 4 and box[1] >= frame[1] and box[3] <= frame[3] + 4
+    return (
+        box[0] >= frame[0]
+        and box[2] <= frame[2] + 4
+        and box[1] >= frame[1]
+        and box[3] <= frame[3] + 4
+    )
 
 
 def _meet(a: Box, b: Box) -> bool:

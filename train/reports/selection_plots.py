@@ -27,14 +27,20 @@ from train.reports.plot_style import (
 )
 
 Json = Mapping[str, Any]
-TITLES = {"window": "length of the window", "rate": "frames a second", "taxels": "taxels", "bits": "bits",
-          "classes": "materials distinguished"}  # fmt: skip
+TITLES = {
+    "window": "length of the window",
+    "rate": "frames a second",
+    "taxels": "taxels",
+    "bits": "bits",
+    "classes": "materials distinguished",
+}
 COLUMNS = (1.42, 1.75, 2.05)
 """Right ends of the columns of numbers beside `sizes`, in widths of the plot."""
 
 
 def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> str:
-    """Accuracy with its interval of each model that was tried, cheapest on top; the chosen one in the accent colour."""
+    """Accuracy with its interval of each model that was tried, cheapest on top; the chosen one in
+    the accent colour."""
     tried = [entry for entry in entries if entry["accuracy"]]
     figure, axes = single_axes(len(tried) * 0.29 + 0.6, left=0.27, right=0.62, top=0.3, bottom=0.28)
     lows = [entry["accuracy"]["low"] for entry in tried]
@@ -42,8 +48,16 @@ def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> st
     for y, entry in enumerate(tried):
         _model(axes, y, entry, entry["method"] == chosen)
     for text, x in zip(("right", "ms", "kB"), COLUMNS, strict=True):
-        axes.annotate(text, (x, -0.85), xycoords=axes.get_yaxis_transform(), ha="right", va="center", color=GREY,
-                      size=SMALL, annotation_clip=False)  # fmt: skip
+        axes.annotate(
+            text,
+            (x, -0.85),
+            xycoords=axes.get_yaxis_transform(),
+            ha="right",
+            va="center",
+            color=GREY,
+            size=SMALL,
+            annotation_clip=False,
+        )
     if wanted:
         axes.axvline(wanted, color=BLACK, linewidth=1, linestyle=(0, (2, 2)))
         write(axes, wanted, -0.85, "wanted", GREY, SMALL)
@@ -58,18 +72,30 @@ def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> st
 def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
     """One row: the interval with its mean, and name, accuracy, ms and kB as text."""
     accuracy, colour = entry["accuracy"], ACCENT if chosen else GREY
-    axes.plot([accuracy["low"], accuracy["high"]], [y, y], color=colour, linewidth=2.2 if chosen else 1.4)
+    axes.plot(
+        [accuracy["low"], accuracy["high"]], [y, y], color=colour, linewidth=2.2 if chosen else 1.4
+    )
     axes.plot(accuracy["mean"], y, "o", color=colour, markersize=6.5 if chosen else 5)
     texts = (entry["method"], percent(accuracy["mean"]), f"{entry['ms']:.2f}", f"{entry['kb']:.0f}")
     for text, x in zip(texts, (-0.03, *COLUMNS), strict=True):
-        axes.annotate(text, (x, y), xycoords=axes.get_yaxis_transform(), ha="right", va="center", size=MEDIUM,
-                      annotation_clip=False, color=ACCENT if chosen else BLACK, weight="bold" if chosen else "normal")  # fmt: skip
+        axes.annotate(
+            text,
+            (x, y),
+            xycoords=axes.get_yaxis_transform(),
+            ha="right",
+            va="center",
+            size=MEDIUM,
+            annotation_clip=False,
+            color=ACCENT if chosen else BLACK,
+            weight="bold" if chosen else "normal",
+        )
 
 
 def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
     """A panel for each curve: accuracy over what is kept, from everything to little.
 
-    A dot is filled where it loses no more than one standard error; the least that is enough is in the accent colour.
+    A dot is filled where it loses no more than one standard error; the least that is enough is in
+    the accent colour.
     """
     rows, above, each = -(-len(curves) // columns), 0.1, 1.35
     figure = Figure((WIDTH, above + rows * each))
@@ -83,21 +109,34 @@ def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
         axes = add_axes(figure, left, left + 0.91 / columns - 0.04, low + 0.78 * inch, low)
         _panel(axes, curve)
         axes.set_ylim(bottom, 1.02)
-        set_ticks(axes.yaxis, np.arange(bottom, 1.01, 0.1 if bottom > 0.55 else 0.2), percent=True, bare=column > 0)
+        set_ticks(
+            axes.yaxis,
+            np.arange(bottom, 1.01, 0.1 if bottom > 0.55 else 0.2),
+            percent=True,
+            bare=column > 0,
+        )
     return to_svg(figure, about)
 
 
 def _panel(axes: Axes, curve: Json) -> None:
     points = [p for p in curve["points"] if "accuracy" in p]
-    mean, low, high = np.array([[p["accuracy"][k] for k in ("mean", "low", "high")] for p in points]).T
+    mean, low, high = np.array(
+        [[p["accuracy"][k] for k in ("mean", "low", "high")] for p in points]
+    ).T
     x = np.arange(len(points))
     axes.fill_between(x, low, high, color=ACCENT, alpha=0.13, linewidth=0)
     axes.plot(x, mean, color=GREY, linewidth=1.2)
     for at, point in enumerate(points):
         kept = point["name"] == curve["kept"]
         fine = point.get("fine", True)
-        axes.plot(at, mean[at], "o", markersize=7 if kept else 5, color=ACCENT if kept else GREY,
-                  markerfacecolor=(ACCENT if kept else GREY) if fine else "none")  # fmt: skip
+        axes.plot(
+            at,
+            mean[at],
+            "o",
+            markersize=7 if kept else 5,
+            color=ACCENT if kept else GREY,
+            markerfacecolor=(ACCENT if kept else GREY) if fine else "none",
+        )
     axes.set_title(TITLES[curve["kind"]], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_xlim(-0.35, len(points) - 0.65 if len(points) > 1 else 0.35)

@@ -1,4 +1,5 @@
-"""Why a model was chosen. In: choice.json as a dict. Out: the same sentences for a terminal and for a page.
+"""Why a model was chosen. In: choice.json as a dict. Out: the same sentences for a terminal and for
+a page.
 
 Nothing is computed here but shares and points; every number is in choice.json.
 """
@@ -12,7 +13,13 @@ from train.reports import formatting, html, provenance, selection_plots
 
 Json = Mapping[str, Any]
 UNITS = {"ms": "ms", "kb": "kB", "mb": "MB"}
-NAMES = {"window": "window", "rate": "rate", "taxels": "taxels", "bits": "bits", "classes": "materials"}
+NAMES = {
+    "window": "window",
+    "rate": "rate",
+    "taxels": "taxels",
+    "bits": "bits",
+    "classes": "materials",
+}
 HEAD = ["model", "ms", "kB", "MB", "of the budget", "right", "behind the best, in points"]
 
 
@@ -23,26 +30,40 @@ def text(choice: Json) -> str:
 
 def page(choice: Json) -> str:
     """The page (HTML)."""
-    sizes = selection_plots.sizes(choice["rungs"], choice["chosen"], choice["wanted"], "accuracy of each model")
+    sizes = selection_plots.sizes(
+        choice["rungs"], choice["chosen"], choice["wanted"], "accuracy of each model"
+    )
     pictures = {"sizes": html.picture(sizes)}
     if choice["less"]:
         reductions = selection_plots.reductions(choice["less"], "accuracy with less of each thing")
         pictures["reductions"] = html.picture(reductions)
     header = provenance.of({key: choice.get(key) for key in ("commit", "set", "seeds", "date")})
-    return html.render("selection.html.j2", header=header, choice=choice, pictures=pictures, **_facts(choice))
+    return html.render(
+        "selection.html.j2", header=header, choice=choice, pictures=pictures, **_facts(choice)
+    )
 
 
 def _facts(choice: Json) -> dict[str, Any]:
     """What the sentences need beside the choice itself."""
     models, smaller = choice["rungs"], choice["smaller"]
-    right = [model for model in models if model["accuracy"] and model["accuracy"]["mean"] >= choice["wanted"]]
+    right = [
+        model
+        for model in models
+        if model["accuracy"] and model["accuracy"]["mean"] >= choice["wanted"]
+    ]
     curves = list(_curves(choice))
     return {
         "missed": choice["wanted"] > 0 and choice["honest"]["mean"] < choice["wanted"],
-        "cut": [c["kept"] + " of each sweep" * (c["kind"] == "window") for c in choice["less"] if c["applied"]],
+        "cut": [
+            c["kept"] + " of each sweep" * (c["kind"] == "window")
+            for c in choice["less"]
+            if c["applied"]
+        ],
         "applied": any(c["applied"] for c in choice["less"]),
         "cheaper": right[0] if right and right[0]["method"] != choice["chosen"] else None,
-        "smaller_behind": next(m["behind"] for m in models if m["method"] == smaller["method"]) if smaller else None,
+        "smaller_behind": next(m["behind"] for m in models if m["method"] == smaller["method"])
+        if smaller
+        else None,
         "following": next((model for model in models if model["method"] == choice["next"]), None),
         "curves": curves,
         "merged": _merged(choice),
@@ -56,7 +77,11 @@ def _facts(choice: Json) -> dict[str, Any]:
 
 def _row(model: Json, best: str) -> list[str]:
     """One line of the table of models."""
-    costs = ["–"] * 3 if model["ms"] is None else [f"{model['ms']:.3f}", f"{model['kb']:.1f}", f"{model['mb']:.0f}"]
+    costs = (
+        ["–"] * 3
+        if model["ms"] is None
+        else [f"{model['ms']:.3f}", f"{model['kb']:.1f}", f"{model['mb']:.0f}"]
+    )
     used = formatting.percent(max(model["used"].values()), 0) if model["used"] else "–"
     accuracy = model["accuracy"]
     right = formatting.estimate([accuracy[k] for k in ("mean", "low", "high")]) if accuracy else "–"
@@ -70,16 +95,23 @@ def _row(model: Json, best: str) -> list[str]:
 
 
 def _curves(choice: Json) -> Iterator[dict[str, Any]]:
-    """What is enough of each thing: of the window, the rate …; whole: nothing may be left out of it."""
+    """What is enough of each thing: of the window, the rate …; whole: nothing may be left out of
+    it."""
     for curve in choice["less"]:
         tried = [point for point in curve["points"] if "accuracy" in point]
         kept = next(point for point in tried if point["name"] == curve["kept"])
         yield {
-            "kind": curve["kind"], "name": NAMES[curve["kind"]], "kept": curve["kept"], "whole": kept is tried[0],
-            "fails": next((point for point in tried if not point.get("fine", True)), None), "set": curve["set"],
-            "accuracy": kept["accuracy"]["mean"], "of": tried[0]["accuracy"]["mean"], "applied": curve["applied"],
+            "kind": curve["kind"],
+            "name": NAMES[curve["kind"]],
+            "kept": curve["kept"],
+            "whole": kept is tried[0],
+            "fails": next((point for point in tried if not point.get("fine", True)), None),
+            "set": curve["set"],
+            "accuracy": kept["accuracy"]["mean"],
+            "of": tried[0]["accuracy"]["mean"],
+            "applied": curve["applied"],
             "taxels": curve.get("taxels"),
-        }  # fmt: skip
+        }
 
 
 def _merged(choice: Json) -> dict[str, Any] | None:
@@ -88,7 +120,9 @@ def _merged(choice: Json) -> dict[str, Any] | None:
     if curve is None or not curve["proposed"]:
         return None
     names = len(choice["materials"]) - sum(len(those) - 1 for those in curve["proposed"])
-    accuracy = next(point["accuracy"]["mean"] for point in curve["points"] if point["name"] == str(names))
+    accuracy = next(
+        point["accuracy"]["mean"] for point in curve["points"] if point["name"] == str(names)
+    )
     return {"proposed": curve["proposed"], "names": names, "accuracy": accuracy}
 
 

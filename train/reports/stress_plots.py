@@ -1,4 +1,5 @@
-"""Pictures of corrupted sweeps, a small one for each corruption. In: curves of robustness and bundle_stress. Out: SVG."""
+"""Pictures of corrupted sweeps, a small one for each corruption. In: curves of robustness and
+bundle_stress. Out: SVG."""
 
 from __future__ import annotations
 
@@ -51,10 +52,11 @@ LINE, LONGEST = 0.2, 16
 
 
 def methods(curves: Mapping[str, Json]) -> str:
-    """Share named rightly over severity: a small picture for each corruption that costs a drawn method five points.
+    """Share named rightly over severity: a small picture for each corruption that costs a drawn
+    method five points.
 
-    curves: by method and corruption, the first method ours, whose band is shown and whose first loss comes first; methods
-    beyond the first of LOOKS are not drawn.
+    curves: by method and corruption, the first method ours, whose band is shown and whose first
+    loss comes first; methods beyond the first of LOOKS are not drawn.
     """
     looks = dict(zip(curves, LOOKS, strict=False))
 
@@ -63,27 +65,38 @@ def methods(curves: Mapping[str, Json]) -> str:
             if curve := curves[method].get(name):
                 axes.plot(curve["severities"], curve["accuracy"], **looks[method])
         band = next(iter(curves.values()))[name]
-        axes.fill_between(band["severities"], band["low"], band["high"], color=ACCENT, alpha=0.13, linewidth=0)
+        axes.fill_between(
+            band["severities"], band["low"], band["high"], color=ACCENT, alpha=0.13, linewidth=0
+        )
 
     legend = list(looks.items())
     any_curves = {name: curve for those in curves.values() for name, curve in those.items()}
-    return _panels({name: any_curves[name] for name in shown(curves)}, draw, legend,
-                   "share of corrupted sweeps that each method names rightly")  # fmt: skip
+    return _panels(
+        {name: any_curves[name] for name in shown(curves)},
+        draw,
+        legend,
+        "share of corrupted sweeps that each method names rightly",
+    )
 
 
 def shown(curves: Mapping[str, Json]) -> list[str]:
-    """Corruptions that cost a method with a colour five points: those that break ours, the first of them first, and others."""
+    """Corruptions that cost a method with a colour five points: those that break ours, the first of
+    them first, and others."""
     coloured = list(curves.values())[: len(LOOKS)]
     return list(dict.fromkeys(name for those in coloured for name in breaks_first(those)))
 
 
 def box(curves: Mapping[str, Json]) -> str:
-    """What the box answers over severity, stacked: rightly, unsure or unknown, refused, wrongly; and its network alone.
+    """What the box answers over severity, stacked: rightly, unsure or unknown, refused, wrongly;
+    and its network alone.
 
     A small picture for each corruption that costs five points or makes so many wrong names.
     """
     right, wrong = curves["rightly"], curves["wrongly"]
-    named = [*breaks_first(right), *(name for name in wrong if max(wrong[name]["accuracy"]) >= POINTS)]
+    named = [
+        *breaks_first(right),
+        *(name for name in wrong if max(wrong[name]["accuracy"]) >= POINTS),
+    ]
 
     def draw(axes: Axes, name: str) -> None:
         x, below = right[name]["severities"], np.zeros(len(right[name]["severities"]))
@@ -93,9 +106,15 @@ def box(curves: Mapping[str, Json]) -> str:
             below = above
         axes.plot(x, curves["network"][name]["accuracy"], **NETWORK)
 
-    legend = [(text, look | {"linewidth": AREA}) for text, (_, look) in AREAS.items()] + [("by label alone", NETWORK)]
-    return _panels({name: right[name] for name in dict.fromkeys(named)}, draw, legend,
-                   "what the box answers to corrupted sweeps")  # fmt: skip
+    legend = [(text, look | {"linewidth": AREA}) for text, (_, look) in AREAS.items()] + [
+        ("by label alone", NETWORK)
+    ]
+    return _panels(
+        {name: right[name] for name in dict.fromkeys(named)},
+        draw,
+        legend,
+        "what the box answers to corrupted sweeps",
+    )
 
 
 def _panels(
@@ -130,7 +149,8 @@ def _panels(
 
 
 def _frame(axes: Axes, curve: Json, bare: bool) -> None:
-    """Title, ticks and grid of one small picture. bare: without labels of shares, beside one that has them."""
+    """Title, ticks and grid of one small picture. bare: without labels of shares, beside one that
+    has them."""
     x, unit = curve["severities"], curve["unit"]
     axes.set_title(curve["title"], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
     axes.set_xlim(x[0], x[-1])

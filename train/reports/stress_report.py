@@ -1,6 +1,8 @@
-"""The page of the command stress: what breaks each method first. In: what it measured. Out: results.json, pictures, a page.
+"""The page of the command stress: what breaks each method first. In: what it measured. Out:
+results.json, pictures, a page.
 
-Nothing is computed here but differences and orders. The first method is ours; five at most are drawn.
+Nothing is computed here but differences and orders. The first method is ours; five at most are
+drawn.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from train.reports.method_names import about, plain_name
 
 Json = Mapping[str, Any]
 EARLIER = plain_name("compact")
-"""The recipe that `fit` used before the default of today: nowhere may ours be more than NEAR below it."""
+"""The recipe that `fit` used before the default of today: nowhere may ours be more than NEAR below
+it."""
 NEAR = 0.01
 ROUNDING = 1e-9
 PACKAGED = "the packaged bundle, as the box answers"
@@ -30,7 +33,8 @@ SHOWN = 3
 
 
 def write(result: Json, out: Path) -> Path:
-    """results.json, the pictures and the page in the folder `out`; the page's path. Raises FormatError as `render`."""
+    """results.json, the pictures and the page in the folder `out`; the page's path. Raises
+    FormatError as `render`."""
     page, pictures = render(result)
     put(out / "results.json", (json.dumps(result, allow_nan=False) + "\n").encode(), parents=True)
     return html.publish(out, {"index": page}, pictures, provenance.of(result))
@@ -41,35 +45,62 @@ def read(out: Path) -> Json:
     try:
         result: Json = json.loads((out / "results.json").read_bytes())
     except (OSError, ValueError) as e:
-        raise FormatError(f"{out}/results.json is not of the command stress: {e}; run it without --draw") from e
+        raise FormatError(
+            f"{out}/results.json is not of the command stress: {e}; run it without --draw"
+        ) from e
     return result
 
 
 def render(result: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. Raises FormatError where no method has a result."""
-    entries = {plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]}
+    """The page (HTML) and its pictures (SVG) by name. Raises FormatError where no method has a
+    result."""
+    entries = {
+        plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
+    }
     if not entries:
-        raise FormatError("no method has a result; run the command without --kept, or with other methods")
+        raise FormatError(
+            "no method has a result; run the command without --kept, or with other methods"
+        )
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]
-    pictures = {"curves": stress_plots.methods(curves)} | ({"box": stress_plots.box(box)} if box else {})
+    pictures = {"curves": stress_plots.methods(curves)} | (
+        {"box": stress_plots.box(box)} if box else {}
+    )
     page = html.render(
-        "stress.html.j2", header=provenance.of(result), home=html.HOME, r=result, ours=ours, points=exact_percent(POINTS).removesuffix(" %"),
-        earlier=EARLIER, near=NEAR, clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
+        "stress.html.j2",
+        header=provenance.of(result),
+        home=html.HOME,
+        r=result,
+        ours=ours,
+        points=exact_percent(POINTS).removesuffix(" %"),
+        earlier=EARLIER,
+        near=NEAR,
+        clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
-        headline=headline(curves[ours]), targets=targets(curves, ours),
-        first=[[name, *first(those)] for name, those in (curves | ({PACKAGED: box["rightly"]} if box else {})).items()],
+        headline=headline(curves[ours]),
+        targets=targets(curves, ours),
+        first=[
+            [name, *first(those)]
+            for name, those in (curves | ({PACKAGED: box["rightly"]} if box else {})).items()
+        ],
         most_wrong=most_wrong(box["wrongly"]) if box else None,
-        lines=list(target_lines(curves, ours, box)), falls=fall_lines(curves, box), missing=missing(curves, ours),
+        lines=list(target_lines(curves, ours, box)),
+        falls=fall_lines(curves, box),
+        missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
-        refused={plain_name(name): entry["refused"] for name, entry in result["methods"].items() if entry["refused"]},
+        refused={
+            plain_name(name): entry["refused"]
+            for name, entry in result["methods"].items()
+            if entry["refused"]
+        },
         trouble=trouble(entries, result["box"]["uninformative"]),
-    )  # fmt: skip
+    )
     return page, pictures
 
 
 def level(curve: Json, severity: float) -> str:
-    """A severity for readers: "35 %", "3 % of full load", "1 taxel", "0.7 rows". A part of a taxel counts as one."""
+    """A severity for readers: "35 %", "3 % of full load", "1 taxel", "0.7 rows". A part of a taxel
+    counts as one."""
     unit = curve["unit"]
     if unit.startswith(("share", "of ")):
         return f"{100 * severity:.2g} % {unit.removeprefix('share')}".rstrip()
@@ -101,56 +132,91 @@ def _of(curve: Json, i: int) -> tuple[float, float, float]:
 
 def most_wrong(curves: Json) -> Json:
     """Where the box gives most wrong names: the corruption, its severity, the share."""
-    name, i = max(((name, i) for name, curve in curves.items() for i in range(len(curve["accuracy"]))),
-                  key=lambda at: curves[at[0]]["accuracy"][at[1]])  # fmt: skip
+    name, i = max(
+        ((name, i) for name, curve in curves.items() for i in range(len(curve["accuracy"]))),
+        key=lambda at: curves[at[0]]["accuracy"][at[1]],
+    )
     curve = curves[name]
-    return {"title": curve["title"], "level": level(curve, curve["severities"][i]), "share": _of(curve, i)}
+    return {
+        "title": curve["title"],
+        "level": level(curve, curve["severities"][i]),
+        "share": _of(curve, i),
+    }
 
 
 def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
-    """What was wanted of ours: nowhere more than NEAR below the recipe before it. Empty where that was not tested."""
+    """What was wanted of ours: nowhere more than NEAR below the recipe before it. Empty where that
+    was not tested."""
     if EARLIER not in curves or ours == EARLIER:
         return []
-    differences = [at[0] - earlier[0] for at, earlier in
-                   zip(at_targets(curves[ours]).values(), at_targets(curves[EARLIER]).values(), strict=True)]  # fmt: skip
+    differences = [
+        at[0] - earlier[0]
+        for at, earlier in zip(
+            at_targets(curves[ours]).values(), at_targets(curves[EARLIER]).values(), strict=True
+        )
+    ]
     near = sum(difference >= -NEAR - ROUNDING for difference in differences)
-    return [{
-        "what": f"lines of the table below in which {ours} is at most one point below {EARLIER}, the recipe before it",
-        "target": f"{len(differences)} of {len(differences)}", "here": f"{near} of {len(differences)}",
-        "met": near == len(differences),
-    }]  # fmt: skip
+    return [
+        {
+            "what": f"lines of the table below in which {ours} is at most one point below {EARLIER}, the recipe before it",
+            "target": f"{len(differences)} of {len(differences)}",
+            "here": f"{near} of {len(differences)}",
+            "met": near == len(differences),
+        }
+    ]
 
 
 def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
-    """A line for each of TARGETS. cells: by method; difference: of ours less EARLIER; box: rightly, wrongly, network."""
+    """A line for each of TARGETS. cells: by method; difference: of ours less EARLIER; box: rightly,
+    wrongly, network."""
     found = {name: at_targets(those) for name, those in curves.items()}
-    answered = {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")} if box else {}
+    answered = (
+        {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")}
+        if box
+        else {}
+    )
     lines: list[Json] = []
     for key in found[ours]:
-        those = [(curves[ours][name], severity) for name, severity in TARGETS[key] if name in curves[ours]]
+        those = [
+            (curves[ours][name], severity)
+            for name, severity in TARGETS[key]
+            if name in curves[ours]
+        ]
         what = " or ".join(dict.fromkeys(curve["title"] for curve, _ in those))
         pair = [found[name][key][0] for name in (ours, EARLIER) if name in found]
-        lines.append({
-            "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
-            "cells": [found[name].get(key) for name in curves], "box": [at[key] for at in answered.values()],
-            "difference": points(pair[0] - pair[1], sign=True) if len(pair) == 2 and ours != EARLIER else "–",
-            "missed": len(pair) == 2 and pair[0] - pair[1] < -NEAR - ROUNDING,
-        })  # fmt: skip
+        lines.append(
+            {
+                "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
+                "cells": [found[name].get(key) for name in curves],
+                "box": [at[key] for at in answered.values()],
+                "difference": points(pair[0] - pair[1], sign=True)
+                if len(pair) == 2 and ours != EARLIER
+                else "–",
+                "missed": len(pair) == 2 and pair[0] - pair[1] < -NEAR - ROUNDING,
+            }
+        )
     return lines
 
 
 def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
-    """Of each corruption what it does, and the severity at which each method, and the box, has lost five points."""
+    """Of each corruption what it does, and the severity at which each method, and the box, has lost
+    five points."""
     columns = [*curves.values(), *([box["rightly"]] if box else [])]
     about = {name: curve for those in columns for name, curve in those.items()}
-    return [[f"{curve['title']}: {curve['about']}", *(_cell(those.get(name)) for those in columns)]
-            for name, curve in about.items()]  # fmt: skip
+    return [
+        [f"{curve['title']}: {curve['about']}", *(_cell(those.get(name)) for those in columns)]
+        for name, curve in about.items()
+    ]
 
 
 def _cell(curve: Json | None) -> str:
     if curve is None:
         return ""
-    return f"> {level(curve, curve['severities'][-1])}" if curve["falls"] is None else level(curve, curve["falls"])
+    return (
+        f"> {level(curve, curve['severities'][-1])}"
+        if curve["falls"] is None
+        else level(curve, curve["falls"])
+    )
 
 
 def missing(curves: Mapping[str, Json], ours: str) -> list[str]:
@@ -163,7 +229,11 @@ def trouble(entries: Mapping[str, Json], box: Mapping[str, str]) -> list[list[st
     """Of each uninformative sweep what methods make of it, and the box."""
     rows = []
     for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
-        answers: Counter[str] = Counter(entry["trouble"][name].split(":")[0] for entry in entries.values())
-        desktop = ", ".join(f"{n} {'answer' if answer == 'finite' else answer}" for answer, n in answers.items())
+        answers: Counter[str] = Counter(
+            entry["trouble"][name].split(":")[0] for entry in entries.values()
+        )
+        desktop = ", ".join(
+            f"{n} {'answer' if answer == 'finite' else answer}" for answer, n in answers.items()
+        )
         rows.append([name, desktop, box.get(name, "–")])
     return rows

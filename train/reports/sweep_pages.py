@@ -1,6 +1,8 @@
-"""A page to leaf through a set. In: the sweeps to show. Out: one HTML file, a picture of each, the arrow keys turn it.
+"""A page to leaf through a set. In: the sweeps to show. Out: one HTML file, a picture of each, the
+arrow keys turn it.
 
-A page is no larger than about MOST_BYTES, so that a browser opens it at once; of larger sets sweeps from all over it are shown.
+A page is no larger than about MOST_BYTES, so that a browser opens it at once; of larger sets sweeps
+from all over it are shown.
 """
 
 from __future__ import annotations
@@ -19,12 +21,15 @@ MOST, MOST_BYTES = 100, 20_000_000
 
 
 def chosen(found: SweepSource, numbers: range | None) -> list[int]:
-    """The numbers of the sweeps that a page shows: those named by `numbers`, else MOST at most from all over the set.
+    """The numbers of the sweeps that a page shows: those named by `numbers`, else MOST at most from
+    all over the set.
 
     Raises FormatError where the set has no such sweeps, or where more are named than a page holds.
     """
     if not found.count:
-        raise FormatError(f"{found.name} holds no sweep that could be shown; palpate-train sets describe says why")
+        raise FormatError(
+            f"{found.name} holds no sweep that could be shown; palpate-train sets describe says why"
+        )
     held = max(1, MOST_BYTES // len(sweep_plot.draw(found.get(0), plain=False)))
     if numbers is None:
         return [round(at) for at in np.linspace(0, found.count - 1, min(found.count, MOST, held))]

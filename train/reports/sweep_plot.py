@@ -1,7 +1,9 @@
-"""The picture of one sweep. In: a recording or a sweep of a set. Out: SVG text, twice as wide as a phone.
+"""The picture of one sweep. In: a recording or a sweep of a set. Out: SVG text, twice as wide as a
+phone.
 
-Each taxel over time where it lies on the skin, all on one scale of raw counts; below, spectrum and spectrogram of all. A skin
-of more than MOST rows or columns is one image, a line for each taxel, row after row. Several axes of a taxel share its plot.
+Each taxel over time where it lies on the skin, all on one scale of raw counts; below, spectrum and
+spectrogram of all. A skin of more than MOST rows or columns is one image, a line for each taxel,
+row after row. Several axes of a taxel share its plot.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ from train.reports.plot_style import (
 )
 
 WIDE, SKIN, SPECTRUM, SPECTROGRAM, HIGH = 2 * WIDTH, (0.95, 4.55), (5.6, 7.2), (8.1, 9.7), 10.25
-"""Inches: the picture's width, from where to where skin, spectrum and spectrogram are, and the height of all."""
+"""Inches: the picture's width, from where to where skin, spectrum and spectrogram are, and the
+height of all."""
 LEFT, RIGHT = 0.08, 0.985
 """Ends of what is drawn, as shares of the width."""
 NUMBER = 0.14
@@ -48,7 +51,8 @@ NUMBER = 0.14
 MOST = 8
 """Rows and columns up to which each taxel has a plot of its own."""
 FINEST = 160
-"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no peak is lost."""
+"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no
+peak is lost."""
 PIXELS = (640, 480)
 """Of the image, at most: steps in time, and taxels; where there are more, means of neighbours."""
 LINE = 130
@@ -58,7 +62,8 @@ VERDICT = ("status", "label", "probability", "detail")
 LEAST = 8
 """Frames that a spectrum needs."""
 LEAST_PIECES, PIECE, RANGE_DB = 64, 128, 40
-"""Of a spectrogram: the frames that it needs, those of a piece at most, and the power that is shown below the largest."""
+"""Of a spectrogram: the frames that it needs, those of a piece at most, and the power that is shown
+below the largest."""
 LONGEST = 256
 """Frames of a segment of the spectrum, or those of one second where they are more (Welch 1967)."""
 SHADES = LinearSegmentedColormap.from_list("shades", [to_rgba(ACCENT, 0.0), to_rgba(ACCENT)])
@@ -69,8 +74,9 @@ SHADES = LinearSegmentedColormap.from_list("shades", [to_rgba(ACCENT, 0.0), to_r
 class ShownSweep:
     """One sweep with its title and notes.
 
-    taxels: raw counts [T, R, C] or [T, R, C, A]. time_s: float [T], since what `since` says. tare: raw counts [R, C] or
-    [R, C, A] of the skin at rest, where known. gaps: int [n], the frames after which some are missing.
+    taxels: raw counts [T, R, C] or [T, R, C, A]. time_s: float [T], since what `since` says. tare:
+    raw counts [R, C] or [R, C, A] of the skin at rest, where known. gaps: int [n], the frames after
+    which some are missing.
     """
 
     taxels: Array
@@ -91,7 +97,8 @@ class ShownSweep:
 
 @dataclass(frozen=True)
 class SweepSource:
-    """Sweeps that can be shown one by one. name: as it was given; get: the sweep of a number, from 0 to `count` - 1."""
+    """Sweeps that can be shown one by one. name: as it was given; get: the sweep of a number, from
+    0 to `count` - 1."""
 
     name: str
     count: int
@@ -99,7 +106,8 @@ class SweepSource:
 
 
 def source(what: str) -> SweepSource:
-    """The sweeps of a recording (.npy), a folder of recordings or a set. Raises FormatError where there are none."""
+    """The sweeps of a recording (.npy), a folder of recordings or a set. Raises FormatError where
+    there are none."""
     path = Path(what)
     if path.suffix == ".npy":
         one = _recorded(readers.RecordedSweep.load(path))
@@ -112,7 +120,8 @@ def source(what: str) -> SweepSource:
 
 
 def load(what: str, number: int | None = None) -> ShownSweep:
-    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError where there is no such sweep."""
+    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError where there
+    is no such sweep."""
     found = source(what)
     if Path(what).suffix == ".npy":
         if number is not None:
@@ -120,7 +129,9 @@ def load(what: str, number: int | None = None) -> ShownSweep:
         number = 0
     if number is None or not 0 <= number < found.count:
         wanted = "" if number is None else f" and none of number {number}"
-        raise FormatError(f"{what} holds {found.count} sweeps{wanted}; choose one with --number, from 0 on")
+        raise FormatError(
+            f"{what} holds {found.count} sweeps{wanted}; choose one with --number, from 0 on"
+        )
     return found.get(number)
 
 
@@ -128,7 +139,9 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
     """A recording with what its sidecar holds."""
     sweep, about = one.sweep, one.about
     if not len(sweep.frames):
-        raise FormatError(f"{one.path}: has no frames, its status is {sweep.status}; choose one that is ok")
+        raise FormatError(
+            f"{one.path}: has no frames, its status is {sweep.status}; choose one that is ok"
+        )
     named = [f"{by} {name}" for by in readers.NAMED if (name := getattr(sweep, by))]
     notes = [f"{one.path.name}, sweep {sweep.id}: {sweep.status}", str(one.format)]
     if sweep.lost:
@@ -141,14 +154,23 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
     for name in ("verdict", "bundle", "source", "trigger", "device", "clock"):
         value = about.get(name)
         if name == "verdict" and isinstance(value, dict):
-            value = {key: value.get(key) for key in VERDICT if value.get("label") or key in ("status", "detail")}
+            value = {
+                key: value.get(key)
+                for key in VERDICT
+                if value.get("label") or key in ("status", "detail")
+            }
         if text := _plain(value):
             notes.append(f"{name}: {text}")
     return ShownSweep(
-        sweep.frames.taxels, (sweep.frames.t_ns - sweep.start_ns) / 1e9, one.format,
-        ", ".join([sweep.material or "no material", *named]), tuple(notes),
-        "seconds after the start edge", tare, np.flatnonzero(np.diff(sweep.frames.seq) > 1),
-    )  # fmt: skip
+        sweep.frames.taxels,
+        (sweep.frames.t_ns - sweep.start_ns) / 1e9,
+        one.format,
+        ", ".join([sweep.material or "no material", *named]),
+        tuple(notes),
+        "seconds after the start edge",
+        tare,
+        np.flatnonzero(np.diff(sweep.frames.seq) > 1),
+    )
 
 
 def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
@@ -160,24 +182,31 @@ def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
     taxels = labelled.samples[number]
     notes = (f"{labelled.source}, sweep {number} of {len(labelled)}", str(labelled.format))
     time_s = np.arange(len(taxels)) / labelled.rate_hz
-    return ShownSweep(taxels, time_s, labelled.format, ", ".join(named), notes, "seconds", None, np.empty(0, int))
+    return ShownSweep(
+        taxels, time_s, labelled.format, ", ".join(named), notes, "seconds", None, np.empty(0, int)
+    )
 
 
 def _grid(path: Path, tare: Any, grid: tuple[int, ...]) -> Array:
-    """The tare as float [R, C] or [R, C, A]. Raises FormatError where the sidecar's has another shape."""
+    """The tare as float [R, C] or [R, C, A]. Raises FormatError where the sidecar's has another
+    shape."""
     try:
         made = np.array(tare, float)
     except (ValueError, TypeError):
         made = np.empty(0)
     if made.shape != grid or not np.isfinite(made).all():
-        raise FormatError(f"{path}: the tare in its .json is no {' x '.join(map(str, grid))} numbers; write null there")
+        raise FormatError(
+            f"{path}: the tare in its .json is no {' x '.join(map(str, grid))} numbers; write null there"
+        )
     return made
 
 
 def _plain(value: Any) -> str:
     """A value of a sidecar as text; a list is a version."""
     if isinstance(value, dict):
-        return ", ".join(f"{name.replace('_', ' ')} {text}" for name, of in value.items() if (text := _plain(of)))
+        return ", ".join(
+            f"{name.replace('_', ' ')} {text}" for name, of in value.items() if (text := _plain(of))
+        )
     if isinstance(value, list):
         return ".".join(map(_plain, value))
     return "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -198,7 +227,9 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
     missing = "; grey bars: frames are missing" if len(sweep.gaps) else ""
     _caption(page, SKIN[1] + 0.52, f"raw counts over {sweep.since}{shades}{missing}")
     first, longest = max(_runs(sweep, taxels), key=lambda run: len(run[1]))
-    moving = longest[:, np.ptp(longest, axis=0) > 0]  # the others have no place on a logarithmic axis
+    moving = longest[
+        :, np.ptp(longest, axis=0) > 0
+    ]  # the others have no place on a logarithmic axis
     still = taxels.shape[1] - moving.shape[1]
     text = f"no spectrum: less than {LEAST} frames, or nothing moves"
     if len(moving) >= LEAST and moving.size:
@@ -207,21 +238,26 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
     _caption(page, SPECTRUM[0] - 0.13, text)
     text = f"no spectrogram: less than {LEAST_PIECES} frames, or nothing moves"
     if len(moving) >= LEAST_PIECES and moving.size:
-        _spectrogram(add_axes(figure, LEFT, RIGHT, *_ends(SPECTROGRAM)), sweep, moving, sweep.time_s[first])
+        _spectrogram(
+            add_axes(figure, LEFT, RIGHT, *_ends(SPECTROGRAM)), sweep, moving, sweep.time_s[first]
+        )
         text = f"Hz over {sweep.since}: the taxels' mean power; the stronger the colour the more, over {RANGE_DB} dB"
     _caption(page, SPECTROGRAM[0] - 0.13, text)
     return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=plain)
 
 
 def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
-    """The parts [n, taxels] between which frames are missing, each with the number of its first frame."""
+    """The parts [n, taxels] between which frames are missing, each with the number of its first
+    frame."""
     starts = [0, *(int(frame) + 1 for frame in sweep.gaps)]
     return list(zip(starts, np.split(taxels, sweep.gaps + 1), strict=True))
 
 
 def _about_spectrum(form: SweepFormat, still: int) -> str:
     """What the caption says of a spectrum; still: taxels that are not in it."""
-    rounding = "" if form.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
+    rounding = (
+        "" if form.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
+    )
     left_out = f"; without {still} that stand still" if still else ""
     return f"raw counts per √Hz over Hz: the taxels' mean power; light: their range{rounding}{left_out}"
 
@@ -239,7 +275,9 @@ def _caption(page: Axes, y: float, text: str) -> None:
 def _head(page: Axes, sweep: ShownSweep) -> None:
     """Title and notes, as many as fit into three lines."""
     style: dict[str, Any] = {"ha": "left", "parse_math": False}
-    write(page, 0.12, 0.2, _cut(_printable(sweep.title), 80), size=MEDIUM + 3, weight="bold", **style)
+    write(
+        page, 0.12, 0.2, _cut(_printable(sweep.title), 80), size=MEDIUM + 3, weight="bold", **style
+    )
     lines = [""]
     for note in map(_printable, sweep.notes):
         together = f"{lines[-1]} · {note}" if lines[-1] else note
@@ -249,7 +287,8 @@ def _head(page: Axes, sweep: ShownSweep) -> None:
 
 
 def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
-    """A plot for each taxel where it lies on the skin; what the caption adds. taxels: float [T, R * C * A]."""
+    """A plot for each taxel where it lies on the skin; what the caption adds. taxels: float [T, R *
+    C * A]."""
     rows, columns = sweep.taxels.shape[1:3]
     lines = taxels.reshape(len(taxels), rows, columns, -1)
     tare = None if sweep.tare is None else sweep.tare.reshape(lines.shape[1:])
@@ -257,7 +296,9 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
     high, wide = (top - bottom) / rows, (RIGHT - LEFT) / columns
     shown = taxels if sweep.tare is None else np.append(taxels, sweep.tare)
     low, up = shown.min(), shown.max()
-    head = NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))  # share of a plot that is free for its taxel's number
+    head = (
+        NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))
+    )  # share of a plot that is free for its taxel's number
     margins = max(up - low, 1) * np.array([0.08, 1.08 * head / (1 - head)])
     times, counts = round_ticks(sweep.time_s[0], sweep.time_s[-1], 4), round_ticks(low, up, 3)
     for row, column in np.ndindex(rows, columns):
@@ -268,10 +309,22 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
         for k in range(sweep.format.axes):
             if tare is not None:
                 axes.axhline(float(tare[row, column, k]), color=GREY, linewidth=0.8)
-            normal, line = k == sweep.format.axes - 1, _thinned(sweep.time_s, lines[:, row, column, k])
+            normal, line = (
+                k == sweep.format.axes - 1,
+                _thinned(sweep.time_s, lines[:, row, column, k]),
+            )
             axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
         axes.grid(color=FAINT, linewidth=0.6)
-        write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, ha="right", xycoords="axes fraction")
+        write(
+            axes,
+            1,
+            1 - head / 2,
+            f"{row + 1},{column + 1}",
+            GREY,
+            SMALL - 1,
+            ha="right",
+            xycoords="axes fraction",
+        )
         lowest, leftmost = row == rows - 1, column == 0
         for axis, ticks, outer in ((axes.xaxis, times, lowest), (axes.yaxis, counts, leftmost)):
             set_ticks(axis, ticks, bare=not outer)
@@ -281,7 +334,8 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
 
 
 def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
-    """All taxels as lines of one image, darker where the counts are higher; what the caption adds."""
+    """All taxels as lines of one image, darker where the counts are higher; what the caption
+    adds."""
     rows, columns = sweep.taxels.shape[1:3]
     each = f", of each its {sweep.format.axes} axes" if sweep.format.axes > 1 else ""
     times, lines = (_edges(n, most) for n, most in zip(taxels.shape, PIXELS, strict=True))
@@ -289,7 +343,9 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
         *map(np.diff, (times, lines))
     )
     ends_s = np.append(sweep.time_s[times[:-1]], sweep.time_s[-1] + 1 / sweep.format.rate_hz)
-    axes.pcolormesh(ends_s, lines / (columns * sweep.format.axes), means.T, cmap=SHADES, rasterized=True)
+    axes.pcolormesh(
+        ends_s, lines / (columns * sweep.format.axes), means.T, cmap=SHADES, rasterized=True
+    )
     sweep.span(axes)
     axes.set_ylim(rows, 0)
     set_ticks(axes.xaxis, round_ticks(ends_s[0], ends_s[-1], 8))
@@ -300,34 +356,55 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
 
 
 def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:
-    """Mean power of all taxels and their range as amplitudes per root hertz, with the noise of rounding. taxels: [T, n]."""
-    hz, power = welch(taxels, form.rate_hz, nperseg=min(len(taxels), max(LONGEST, round(form.rate_hz))), axis=0)
+    """Mean power of all taxels and their range as amplitudes per root hertz, with the noise of
+    rounding. taxels: [T, n]."""
+    hz, power = welch(
+        taxels, form.rate_hz, nperseg=min(len(taxels), max(LONGEST, round(form.rate_hz))), axis=0
+    )
     hz, power = hz[1:], np.maximum(power[1:], 1e-12 * power.max())
     low, mean, high = (np.sqrt(of(axis=1)) for of in (power.min, power.mean, power.max))
     axes.fill_between(hz, low, high, color=ACCENT, alpha=0.15, linewidth=0)
     axes.plot(hz, mean, color=ACCENT, linewidth=1.1)
     axes.set(xscale="log", yscale="log", xlim=(hz[0], hz[-1]))
     if form.numpy_type.kind != "f":
-        axes.axhline(np.sqrt(1 / 6 / form.rate_hz), color=BLACK, linewidth=0.8, linestyle=(0, (2, 2)))
+        axes.axhline(
+            np.sqrt(1 / 6 / form.rate_hz), color=BLACK, linewidth=0.8, linestyle=(0, (2, 2))
+        )
     axes.grid(color=FAINT, linewidth=0.6)
     for axis, (first, last) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         steps = (1, 2, 5) if last / first < 2000 else (1,)
-        ticks = [step * 10.0**k for k in range(-9, 9) for step in steps if first <= step * 10.0**k <= last]
+        ticks = [
+            step * 10.0**k
+            for k in range(-9, 9)
+            for step in steps
+            if first <= step * 10.0**k <= last
+        ]
         set_ticks(axis, ticks)
     axes.set_xlabel("Hz", color=GREY, size=SMALL, labelpad=1)
     axes.set_ylabel("counts/√Hz", color=GREY, size=SMALL)
 
 
 def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
-    """Mean power of all taxels [T, n] in decibels over time and frequency, on the time axis of the signals."""
+    """Mean power of all taxels [T, n] in decibels over time and frequency, on the time axis of the
+    signals."""
     rate = sweep.format.rate_hz
     piece = min(len(taxels) // 4, PIECE)
-    hz, s, power = spectrogram(taxels, rate, nperseg=piece, noverlap=3 * piece // 4, axis=0, detrend="constant")
+    hz, s, power = spectrogram(
+        taxels, rate, nperseg=piece, noverlap=3 * piece // 4, axis=0, detrend="constant"
+    )
     db = 10 * np.log10(np.maximum(power.mean(axis=1), 1e-12))  # [frequencies, pieces]
     half_s, half_hz = (s[1] - s[0]) / 2, (hz[1] - hz[0]) / 2
     ends = (start_s + s[0] - half_s, start_s + s[-1] + half_s, hz[0] - half_hz, hz[-1] + half_hz)
-    axes.imshow(db, origin="lower", aspect="auto", cmap=SHADES, vmin=db.max() - RANGE_DB, vmax=db.max(), extent=ends,
-                interpolation="none")  # fmt: skip
+    axes.imshow(
+        db,
+        origin="lower",
+        aspect="auto",
+        cmap=SHADES,
+        vmin=db.max() - RANGE_DB,
+        vmax=db.max(),
+        extent=ends,
+        interpolation="none",
+    )
     axes.set_xlim(sweep.time_s[0], sweep.time_s[-1])
     axes.set_ylim(0, hz[-1])
     set_ticks(axes.xaxis, round_ticks(sweep.time_s[0], sweep.time_s[-1], 8))
@@ -337,11 +414,15 @@ def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -
 
 
 def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
-    """A line [n] of at most FINEST steps, of each the least and the highest count in the order of time."""
+    """A line [n] of at most FINEST steps, of each the least and the highest count in the order of
+    time."""
     if len(counts) <= 2 * FINEST:
         return time_s, counts
     edges = _edges(len(counts), FINEST)
-    pairs = [sorted((a + int(counts[a:b].argmin()), a + int(counts[a:b].argmax()))) for a, b in pairwise(edges)]
+    pairs = [
+        sorted((a + int(counts[a:b].argmin()), a + int(counts[a:b].argmax())))
+        for a, b in pairwise(edges)
+    ]
     keep = np.unique(pairs)
     return time_s[keep], counts[keep]
 

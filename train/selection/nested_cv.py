@@ -1,8 +1,9 @@
-"""Nested cross-validation. In: a scene's sweeps, and the groups that vary there. Out: what a method gets right.
+"""Nested cross-validation. In: a scene's sweeps, and the groups that vary there. Out: what a method
+gets right.
 
-The values of every group that varies are distributed over a few parts. A method is trained without one part, or without
-two, and tested on them. One training without the parts p and q is used twice: as the inner fold that tests on q while p
-is held out, and the other way round.
+The values of every group that varies are distributed over a few parts. A method is trained without
+one part, or without two, and tested on them. One training without the parts p and q is used twice:
+as the inner fold that tests on q while p is held out, and the other way round.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from train.selection.scene import Scene
 
 Array = NDArray[Any]
 FOLDS = {0: 5, 1: 5, 2: 4}
-"""Parts of each group by the number of groups; MANY_GROUPS for more. Five parts make fifteen trainings of a method, two
-times four parts thirty-six."""
+"""Parts of each group by the number of groups; MANY_GROUPS for more. Five parts make fifteen
+trainings of a method, two times four parts thirty-six."""
 MANY_GROUPS = 3
 Unseen = tuple[int, ...]
 """Numbers of the one or two parts that are left out of a training."""
@@ -53,10 +54,11 @@ class HeldOutPart:
 
 
 def parts(sweeps: Dataset, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
-    """The parts of all groups `varies`; of recordings, with materials spread evenly, where nothing varies.
+    """The parts of all groups `varies`; of recordings, with materials spread evenly, where nothing
+    varies.
 
-    Raises FormatError where a group has a single value, divides recordings, or where leaving out a part leaves a material
-    without training sweeps.
+    Raises FormatError where a group has a single value, divides recordings, or where leaving out a
+    part leaves a material without training sweeps.
     """
     most = folds or FOLDS.get(len(varies), MANY_GROUPS)
     if not varies:
@@ -67,9 +69,13 @@ def parts(sweeps: Dataset, varies: Sequence[str], folds: int = 0) -> list[HeldOu
     for name in varies:
         values = np.unique(sweeps.group(name))
         if len(values) < 2:
-            raise FormatError(f"{sweeps.source}: group {name!r} has one value, {values[0]}; take it out of varies")
+            raise FormatError(
+                f"{sweeps.source}: group {name!r} has one value, {values[0]}; take it out of varies"
+            )
         shuffled = np.random.default_rng(0).permutation(values)
-        found += [_part(sweeps, name, some) for some in np.array_split(shuffled, min(most, len(values)))]
+        found += [
+            _part(sweeps, name, some) for some in np.array_split(shuffled, min(most, len(values)))
+        ]
     return found
 
 
@@ -78,16 +84,21 @@ def _part(sweeps: Dataset, name: str, values: Array) -> HeldOutPart:
     out = np.isin(sweeps.group(name), values)
     recording = sweeps.group("recording")
     if set(recording[out]) & set(recording[~out]):
-        raise FormatError(f"{sweeps.source}: group {name!r} cuts recordings in two; take it out of varies")
+        raise FormatError(
+            f"{sweeps.source}: group {name!r} cuts recordings in two; take it out of varies"
+        )
     for label in np.setdiff1d(sweeps.labels[out], sweeps.labels[~out]):
-        raise FormatError(f"{sweeps.source}: without {name} {first} there is no {sweeps.materials[label]!r} to train on; "
-                          f"record it elsewhere too, or take {name!r} out of varies")  # fmt: skip
+        raise FormatError(
+            f"{sweeps.source}: without {name} {first} there is no {sweeps.materials[label]!r} to train on; "
+            f"record it elsewhere too, or take {name!r} out of varies"
+        )
     return HeldOutPart(name, tuple(sorted(values.tolist())), out)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far one method is behind another: the mean share of sweeps, its standard error and its 95 % interval."""
+    """How far one method is behind another: the mean share of sweeps, its standard error and its 95
+    % interval."""
 
     mean: float
     se: float
@@ -105,26 +116,39 @@ class Difference:
 
 
 class Trials:
-    """Trains and tests on a scene's sweeps, each training once. sweeps: as recorded; asked: with the corrupted ones too.
+    """Trains and tests on a scene's sweeps, each training once. sweeps: as recorded; asked: with
+    the corrupted ones too.
 
-    conditions: names of the corruptions of the test sweeps, of which each counts the same; the first is none. progress:
-    counts the trainings.
+    conditions: names of the corruptions of the test sweeps, of which each counts the same; the
+    first is none. progress: counts the trainings.
     """
 
-    def __init__(self, sweeps: Dataset, scene: Scene, effort: methods.Effort, where: Where, progress: Progress) -> None:
+    def __init__(
+        self,
+        sweeps: Dataset,
+        scene: Scene,
+        effort: methods.Effort,
+        where: Where,
+        progress: Progress,
+    ) -> None:
         self.sweeps, self._effort, self._where, self.progress = sweeps, effort, where, progress
         self.seeds = range(1, scene.seeds + 1)
         self.parts = parts(sweeps, scene.varies, scene.folds)
         self.groups = list(dict.fromkeys(part.group for part in self.parts))
         self.clusters = np.stack([sweeps.group(name) for name in self.groups])
         found = corruptions.find(list(scene.stress))
-        self.conditions = ["as recorded", *(f"{s.name} {scene.stress[s.name]:g} {s.unit}" for s in found)]
+        self.conditions = [
+            "as recorded",
+            *(f"{s.name} {scene.stress[s.name]:g} {s.unit}" for s in found),
+        ]
         corrupted = [s.apply(EvaluationSweeps(sweeps), scene.stress[s.name], 1) for s in found]
         count = len(self.conditions)
         self.asked = replace(
-            sweeps, samples=np.concatenate([sweeps.samples, *corrupted]), labels=np.tile(sweeps.labels, count),
+            sweeps,
+            samples=np.concatenate([sweeps.samples, *corrupted]),
+            labels=np.tile(sweeps.labels, count),
             groups={k: np.tile(v, count) for k, v in sweeps.groups.items()},
-        )  # fmt: skip
+        )
         self._done: dict[Any, Fold] = {}
 
     @property
@@ -138,11 +162,15 @@ class Trials:
         return [u for u in every if len(np.unique(self.sweeps.labels[self._kept(u)])) > 1]
 
     def run(self, method: str, what: Sequence[Unseen], changes: Sequence[Change] = ()) -> None:
-        """Train `method` without each of `what`; changes: of the sweeps, one for each of `what`. Raises Refused where the
-        method cannot work with them."""
+        """Train `method` without each of `what`; changes: of the sweeps, one for each of `what`.
+        Raises Refused where the method cannot work with them."""
         changes = changes or [WHOLE] * len(what)
-        left = [(method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds
-                if (method, c, s, u) not in self._done]  # fmt: skip
+        left = [
+            (method, c, s, u)
+            for u, c in zip(what, changes, strict=True)
+            for s in self.seeds
+            if (method, c, s, u) not in self._done
+        ]
         (known,) = methods.find([method], self._effort)
         for change in dict.fromkeys(name[1] for name in left):
             changed = change.of(self.asked)
@@ -154,7 +182,9 @@ class Trials:
             for name, fold in folds(tasks, changed, digest(changed), known.input, self._where):
                 self._done[name] = fold
                 self.progress(f"{method}{'' if change == WHOLE else f', {change}'}")
-        for name in ((method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds):
+        for name in (
+            (method, c, s, u) for u, c in zip(what, changes, strict=True) for s in self.seeds
+        ):
             if self._done[name].refused:
                 raise Refused(self._done[name].refused)
 
@@ -164,12 +194,16 @@ class Trials:
         return kept
 
     def _split(self, unseen: Unseen) -> tuple[Array, Array]:
-        """Numbers of sweeps of `asked`: those as recorded to train on, all conditions to test on."""
+        """Numbers of sweeps of `asked`: those as recorded to train on, all conditions to test
+        on."""
         kept = self._kept(unseen)
         return np.flatnonzero(kept), np.flatnonzero(np.tile(~kept, len(self.conditions)))
 
-    def folds(self, method: str, unseen: Unseen, change: Change = WHOLE) -> Iterator[tuple[int, Array, Array]]:
-        """The results of `run` for each seed and condition: the condition's number, sweeps [n], logits [n, K]."""
+    def folds(
+        self, method: str, unseen: Unseen, change: Change = WHOLE
+    ) -> Iterator[tuple[int, Array, Array]]:
+        """The results of `run` for each seed and condition: the condition's number, sweeps [n],
+        logits [n, K]."""
         for seed in self.seeds:
             fold = self._done[method, change, seed, unseen]
             condition, sweep = np.divmod(fold.test, len(self.sweeps))
@@ -178,7 +212,8 @@ class Trials:
                 yield c, sweep[tested], fold.logits[tested]
 
     def right(self, method: str, unseen: Unseen, change: Change = WHOLE) -> Array:
-        """Share [N] of the seeds and conditions in which each sweep got the right label; NaN where it was not tested."""
+        """Share [N] of the seeds and conditions in which each sweep got the right label; NaN where
+        it was not tested."""
         total = np.zeros(len(self.sweeps))
         for _, sweep, logits in self.folds(method, unseen, change):
             total[sweep] += logits.argmax(1) == self.sweeps.labels[sweep]
@@ -186,20 +221,28 @@ class Trials:
         share: Array = total / (len(self.seeds) * len(self.conditions))
         return share
 
-    def scores(self, method: str, aside: int | None = None, changes: Sequence[Change] = ()) -> Array:
+    def scores(
+        self, method: str, aside: int | None = None, changes: Sequence[Change] = ()
+    ) -> Array:
         """`right` of every sweep when its own part is left out, [groups, N].
 
-        aside: a part that no training and no test may use; NaN there. changes: of the sweeps, one for each part.
+        aside: a part that no training and no test may use; NaN there. changes: of the sweeps, one
+        for each part.
         """
         rows = np.full((len(self.groups), len(self.sweeps)), np.nan)
         keys = self.seen_from(aside)
         for (p, unseen), change in zip(keys.items(), changes or [WHOLE] * len(keys), strict=True):
-            tested = self.parts[p].out if aside is None else self.parts[p].out & ~self.parts[aside].out
-            rows[self.groups.index(self.parts[p].group), tested] = self.right(method, unseen, change)[tested]
+            tested = (
+                self.parts[p].out if aside is None else self.parts[p].out & ~self.parts[aside].out
+            )
+            rows[self.groups.index(self.parts[p].group), tested] = self.right(
+                method, unseen, change
+            )[tested]
         return rows
 
     def seen_from(self, aside: int | None) -> dict[int, Unseen]:
-        """By part that is tested on, the parts left out of the training: that part alone, or it and the part `aside`."""
+        """By part that is tested on, the parts left out of the training: that part alone, or it and
+        the part `aside`."""
         if aside is None:
             return {p: (p,) for p in range(len(self.parts))}
         pairs = [u for u in self.pairs() if aside in u]
@@ -208,9 +251,9 @@ class Trials:
     def difference(self, better: Array, worse: Array) -> Difference:
         """Of two methods' `scores`, paired by sweep: a sweep that is hard for both does not count.
 
-        The standard error is that of the mean over values of the group, whose sweeps are correlated, or that over sweeps
-        where it is larger: a few values may agree by chance. Of several groups it is the mean of theirs, as if these were
-        correlated too.
+        The standard error is that of the mean over values of the group, whose sweeps are
+        correlated, or that over sweeps where it is larger: a few values may agree by chance. Of
+        several groups it is the mean of theirs, as if these were correlated too.
         """
         means: list[float] = []
         errors: list[float] = []
@@ -232,19 +275,29 @@ class Trials:
 
     def accuracy(self, scores: Array) -> dict[str, float]:
         """`mean`, and the mean of the groups' 95 % intervals."""
-        ends = [interval(row[there], cluster[there]) for row, cluster in zip(scores, self.clusters, strict=True)
-                if (there := np.isfinite(row)).any()]  # fmt: skip
+        ends = [
+            interval(row[there], cluster[there])
+            for row, cluster in zip(scores, self.clusters, strict=True)
+            if (there := np.isfinite(row)).any()
+        ]
         low, high = np.mean(ends, axis=0)
-        return {"mean": round(self.mean(scores), 4), "low": round(float(low), 4), "high": round(float(high), 4)}
+        return {
+            "mean": round(self.mean(scores), 4),
+            "low": round(float(low), 4),
+            "high": round(float(high), 4),
+        }
 
     def tested(self, method: str) -> tuple[Array, Array, Array, Array]:
-        """All tests with one part left out: group, condition and sweep [n], probabilities [n, K]."""
+        """All tests with one part left out: group, condition and sweep [n], probabilities [n,
+        K]."""
         rows: list[tuple[Array, ...]] = []
         for p, part in enumerate(self.parts):
             for c, sweep, logits in self.folds(method, (p,)):
                 group = np.full(len(sweep), self.groups.index(part.group))
                 rows.append((group, np.full(len(sweep), c), sweep, softmax(logits)))
-        group, condition, sweep, probability = (np.concatenate(column) for column in zip(*rows, strict=True))
+        group, condition, sweep, probability = (
+            np.concatenate(column) for column in zip(*rows, strict=True)
+        )
         return group, condition, sweep, probability
 
 

@@ -1,7 +1,9 @@
-"""How far the sweeps of a scene can be reduced. In: a Selection. Out: a curve for each kind of reduction, and a Change.
+"""How far the sweeps of a scene can be reduced. In: a Selection. Out: a curve for each kind of
+reduction, and a Change.
 
-Each curve trains the chosen method again on reduced sweeps, on the same parts, and compares it with whole sweeps, paired
-by sweep. Kept is the strongest reduction for which it, and every weaker one, loses at most one standard error.
+Each curve trains the chosen method again on reduced sweeps, on the same parts, and compares it with
+whole sweeps, paired by sweep. Kept is the strongest reduction for which it, and every weaker one,
+loses at most one standard error.
 """
 
 from __future__ import annotations
@@ -22,12 +24,14 @@ from train.selection.select import Selection
 Array = NDArray[Any]
 Json = dict[str, Any]
 Step = tuple[str, float, list[Change], Change]
-"""One point of a curve: its name, the share that is left, the change for each part, the change for all sweeps."""
+"""One point of a curve: its name, the share that is left, the change for each part, the change for
+all sweeps."""
 WINDOWS, RATES, BITS = (0.75, 0.5, 0.25), (2, 4, 8), (1, 2, 3, 4)
 POINTS_BEYOND = 2
 """A curve ends at the second point that loses too much: two show where accuracy falls."""
 CONFUSED = 0.25
-"""Two materials are proposed as one where this share of their sweeps is confused; guessing gives half."""
+"""Two materials are proposed as one where this share of their sweeps is confused; guessing gives
+half."""
 HOW_TO_SET = {
     "window": "nothing to set: the box takes the middle of each sweep; the robot may slide for less long",
     "rate": "set the readout board to average {0} frames and send one",
@@ -37,14 +41,25 @@ HOW_TO_SET = {
 
 
 def most(trials: Trials, kinds: Collection[str]) -> int:
-    """The trainings that the curves of these kinds, and what is applied of them together, take at most."""
+    """The trainings that the curves of these kinds, and what is applied of them together, take at
+    most."""
     taxels = trials.sweeps.format.rows * trials.sweeps.format.cols
-    points = {"window": len(WINDOWS), "rate": len(RATES), "bits": len(BITS), "taxels": (taxels - 1).bit_length()}
-    return sum(1 + points[kind] for kind in kinds if kind in points) * len(trials.parts) * len(trials.seeds)
+    points = {
+        "window": len(WINDOWS),
+        "rate": len(RATES),
+        "bits": len(BITS),
+        "taxels": (taxels - 1).bit_length(),
+    }
+    return (
+        sum(1 + points[kind] for kind in kinds if kind in points)
+        * len(trials.parts)
+        * len(trials.seeds)
+    )
 
 
 def curves(choice: Selection, scene: Scene) -> tuple[list[Json], Change, Json]:
-    """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy with it."""
+    """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy
+    with it."""
     found: list[Json] = []
     strongest: dict[str, Step] = {}
     for at, kind in enumerate(scene.reduce):
@@ -54,9 +69,13 @@ def curves(choice: Selection, scene: Scene) -> tuple[list[Json], Change, Json]:
             continue
         curve, strongest[kind] = _curve(choice, scene, kind)
         found.append(curve)
-    applied, accuracy = _together(choice, scene, {kind: strongest[kind] for kind in scene.apply if kind in strongest})
+    applied, accuracy = _together(
+        choice, scene, {kind: strongest[kind] for kind in scene.apply if kind in strongest}
+    )
     for curve in found:
-        curve["applied"] = getattr(applied, curve["kind"], None) != getattr(WHOLE, curve["kind"], None)
+        curve["applied"] = getattr(applied, curve["kind"], None) != getattr(
+            WHOLE, curve["kind"], None
+        )
     return found, applied, accuracy
 
 
@@ -92,7 +111,8 @@ def _scores(trials: Trials, method: str, step: Step) -> Array:
 
 
 def _fine(trials: Trials, scene: Scene, full: Array, scores: Array) -> bool:
-    """Whether the reduced sweeps suffice, and do not miss the wanted accuracy where the whole ones reach it."""
+    """Whether the reduced sweeps suffice, and do not miss the wanted accuracy where the whole ones
+    reach it."""
     falls_short = trials.mean(scores) < scene.accuracy <= trials.mean(full)
     return trials.difference(full, scores).within and not falls_short
 
@@ -111,7 +131,12 @@ def _point(trials: Trials, full: Array, scores: Array, step: Step, fine: bool) -
 def _windows(trials: Trials) -> Iterator[Step]:
     for share in WINDOWS:
         seconds = share * trials.sweeps.format.window / trials.sweeps.rate_hz
-        yield f"{seconds:.3g} s", share, [Change(window=share)] * len(trials.parts), Change(window=share)
+        yield (
+            f"{seconds:.3g} s",
+            share,
+            [Change(window=share)] * len(trials.parts),
+            Change(window=share),
+        )
 
 
 def _rates(trials: Trials) -> Iterator[Step]:
@@ -128,11 +153,17 @@ def _bits(trials: Trials) -> Iterator[Step]:
     kind = trials.sweeps.samples.dtype
     all_bits = 8 if kind.kind == "f" else 8 * kind.itemsize
     for bits in BITS:
-        yield f"{all_bits - bits} bits", 1 - bits / all_bits, [Change(bits=bits)] * len(trials.parts), Change(bits=bits)
+        yield (
+            f"{all_bits - bits} bits",
+            1 - bits / all_bits,
+            [Change(bits=bits)] * len(trials.parts),
+            Change(bits=bits),
+        )
 
 
 def _taxels(trials: Trials) -> Iterator[Step]:
-    """Numbers of taxels that are powers of two. Which taxels is found again without each part, as it is part of the test."""
+    """Numbers of taxels that are powers of two. Which taxels is found again without each part, as
+    it is part of the test."""
     form = trials.sweeps.format
     count = form.rows * form.cols
     orders = [transforms.order(trials.sweeps.take(~part.out)) for part in trials.parts]
@@ -145,12 +176,16 @@ def _taxels(trials: Trials) -> Iterator[Step]:
 
 
 STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
-    "window": _windows, "rate": _rates, "taxels": _taxels, "bits": _bits,
-}  # fmt: skip
+    "window": _windows,
+    "rate": _rates,
+    "taxels": _taxels,
+    "bits": _bits,
+}
 
 
 def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
-    """The reductions of `least` applied one after another, each kept only while all kept ones together are still fine."""
+    """The reductions of `least` applied one after another, each kept only while all kept ones
+    together are still fine."""
     trials, method = choice.trials, choice.final.chosen
     full = reduced = choice.final.scores[method]
     changes, total = [WHOLE] * len(trials.parts), WHOLE
@@ -168,10 +203,11 @@ def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[
 
 
 def classes(choice: Selection, wanted: float) -> Json:
-    """The accuracy gained by merging materials, the most confused pair first; counted without training again.
+    """The accuracy gained by merging materials, the most confused pair first; counted without
+    training again.
 
-    Proposed are pairs that are CONFUSED, and as many as are needed to reach the wanted accuracy. Nothing is applied:
-    only the user knows whether two materials may share a name.
+    Proposed are pairs that are CONFUSED, and as many as are needed to reach the wanted accuracy.
+    Nothing is applied: only the user knows whether two materials may share a name.
     """
     trials = choice.trials
     group, _, sweep, probability = trials.tested(choice.final.chosen)
@@ -182,7 +218,14 @@ def classes(choice: Selection, wanted: float) -> Json:
     while True:
         rows = _rows(trials, group, sweep, probability.argmax(1) == label)
         accuracy, share = trials.accuracy(rows), len(names) / len(trials.sweeps.materials)
-        points.append({"name": f"{len(names)}", "share": round(share, 4), "accuracy": accuracy, "merged": merged})
+        points.append(
+            {
+                "name": f"{len(names)}",
+                "share": round(share, 4),
+                "accuracy": accuracy,
+                "merged": merged,
+            }
+        )
         if len(names) == 2:
             break
         confused = _confused(label, probability)
@@ -195,11 +238,18 @@ def classes(choice: Selection, wanted: float) -> Json:
         probability = np.delete(probability, b, axis=1)
         label = np.where(label == b, a, label - (label > b))
     together = [list(merge) for merge in proposed if len(merge) > 1]
-    return {"kind": "classes", "points": points, "kept": points[0]["name"], "proposed": together, "set": ""}
+    return {
+        "kind": "classes",
+        "points": points,
+        "kept": points[0]["name"],
+        "proposed": together,
+        "set": "",
+    }
 
 
 def _confused(label: Array, probability: Array) -> Array:
-    """[K, K], above the diagonal: the share of two materials' sweeps that are labelled as the other one."""
+    """[K, K], above the diagonal: the share of two materials' sweeps that are labelled as the other
+    one."""
     k = probability.shape[1]
     counts = np.zeros((k, k))
     np.add.at(counts, (label, probability.argmax(1)), 1)

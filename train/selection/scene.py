@@ -1,6 +1,8 @@
-"""Scenes: what an integrator has, and what a model must do there. In: scene.toml. Out: a checked Scene and its sweeps.
+"""Scenes: what an integrator has, and what a model must do there. In: scene.toml. Out: a checked
+Scene and its sweeps.
 
-docs/choose/tubes.toml shows every key. The dataclasses are the schema: a field's type and limits say what the file may hold.
+docs/choose/tubes.toml shows every key. The dataclasses are the schema: a field's type and limits
+say what the file may hold.
 """
 
 from __future__ import annotations
@@ -39,7 +41,11 @@ def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
 
 
 def _texts(value: Any) -> tuple[str, ...] | None:
-    valid = isinstance(value, list) and all(isinstance(v, str) and v for v in value) and len(set(value)) == len(value)
+    valid = (
+        isinstance(value, list)
+        and all(isinstance(v, str) and v for v in value)
+        and len(set(value)) == len(value)
+    )
     return tuple(value) if valid else None
 
 
@@ -48,28 +54,37 @@ def _list(default: tuple[str, ...] = (), of: tuple[str, ...] = ()) -> Any:
         found = _texts(value)
         return None if found is None or (of and set(found) - set(of)) else found
 
-    return custom(default, f"a list of some of {', '.join(of)}" if of else "a list of different texts", read)
+    return custom(
+        default, f"a list of some of {', '.join(of)}" if of else "a list of different texts", read
+    )
 
 
 def _severities(value: Any) -> dict[str, float] | None:
-    numbers = isinstance(value, dict) and all(type(v) in (int, float) and v > 0 for v in value.values())
+    numbers = isinstance(value, dict) and all(
+        type(v) in (int, float) and v > 0 for v in value.values()
+    )
     return {name: float(v) for name, v in value.items()} if numbers else None
 
 
 def _merged(value: Any) -> dict[str, tuple[str, ...]] | None:
     if not isinstance(value, dict):
         return None
-    found = {name: names for name, listed in value.items() if (names := _texts(listed)) and LABEL.fullmatch(name)}
+    found = {
+        name: names
+        for name, listed in value.items()
+        if (names := _texts(listed)) and LABEL.fullmatch(name)
+    }
     return found if len(found) == len(value) else None
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The limits of the board; a figure without a limit does not count. Measured as export.measure measures.
+    """The limits of the board; a figure without a limit does not count. Measured as export.measure
+    measures.
 
-    ms: processor time of a sweep in the box's classifier. kb: size of the whole bundle in units of 1000 bytes. mb: resident
-    memory of a process with the bundle in MiB. slower: how many ms the board needs for one of this machine's: an
-    assumption, until it is measured there.
+    ms: processor time of a sweep in the box's classifier. kb: size of the whole bundle in units of
+    1000 bytes. mb: resident memory of a process with the bundle in MiB. slower: how many ms the
+    board needs for one of this machine's: an assumption, until it is measured there.
     """
 
     ms: float = number(math.inf, 0.001, 1_000_000)
@@ -82,13 +97,14 @@ class Budget:
 class Scene:
     """The content of scene.toml. Every field but `sets` may be left out.
 
-    name, version: of the bundle; default: the file's name, and "1". sets: as --set, files relative to scene.toml, $NAMES
-    replaced by environment variables; only: as --only. materials: those to tell apart, all where empty; merge: several
-    labels that become one. varies: groups that differ in operation from training. folds: number of parts of each group
-    (0: five for one group, four for two, else three). stress: severity by name of the corruption. accuracy: wanted; 0:
-    as high as possible. seeds: number of seeds of training, from 1 on. methods: the candidates, where they are not the
-    usual ones. reduce: properties to try with less of; apply: those of them with which the bundle is packed. full_scale:
-    the sensor's highest raw count; 0: the maximum of its type.
+    name, version: of the bundle; default: the file's name, and "1". sets: as --set, files relative
+    to scene.toml, $NAMES replaced by environment variables; only: as --only. materials: those to
+    tell apart, all where empty; merge: several labels that become one. varies: groups that differ
+    in operation from training. folds: number of parts of each group (0: five for one group, four
+    for two, else three). stress: severity by name of the corruption. accuracy: wanted; 0: as high
+    as possible. seeds: number of seeds of training, from 1 on. methods: the candidates, where they
+    are not the usual ones. reduce: properties to try with less of; apply: those of them with which
+    the bundle is packed. full_scale: the sensor's highest raw count; 0: the maximum of its type.
     """
 
     name: str = _text("")
@@ -96,7 +112,9 @@ class Scene:
     sets: tuple[str, ...] = _list()
     only: tuple[str, ...] = _list()
     materials: tuple[str, ...] = _list()
-    merge: Mapping[str, tuple[str, ...]] = custom({}, "lists of materials by their new name", _merged)
+    merge: Mapping[str, tuple[str, ...]] = custom(
+        {}, "lists of materials by their new name", _merged
+    )
     varies: tuple[str, ...] = _list()
     folds: int = number(0, 3, 20)
     stress: Mapping[str, float] = custom({}, "numbers above 0 by a stress's name", _severities)
@@ -110,8 +128,11 @@ class Scene:
     path: Path = Path()
 
     def sweeps(self) -> Dataset:
-        """The sweeps of the sets, narrowed and merged. Raises FormatError naming scene.toml and what does not fit the sets."""
-        whole = sets.join([sets.load(self._located(spec), 1) for spec in self.sets]).select(self.only)
+        """The sweeps of the sets, narrowed and merged. Raises FormatError naming scene.toml and
+        what does not fit the sets."""
+        whole = sets.join([sets.load(self._located(spec), 1) for spec in self.sets]).select(
+            self.only
+        )
         known = whole.materials
         for name in (*self.materials, *(m for names in self.merge.values() for m in names)):
             if name not in known:
@@ -121,9 +142,15 @@ class Scene:
         labels = tuple(dict.fromkeys(new.get(m, m) for m in kept))
         if bad := unsendable(labels):
             raise FormatError(f"{self.path.name}: {bad}; name each anew in [merge]")
-        at = np.array([labels.index(new.get(m, m)) if m in kept else -1 for m in known])[whole.labels]
+        at = np.array([labels.index(new.get(m, m)) if m in kept else -1 for m in known])[
+            whole.labels
+        ]
         part = whole.take(at >= 0)
-        part = replace(part, labels=at[at >= 0], materials=labels).require_materials().require_pure_recordings()
+        part = (
+            replace(part, labels=at[at >= 0], materials=labels)
+            .require_materials()
+            .require_pure_recordings()
+        )
         for name in self.varies:
             if name not in {"recording", *part.groups}:
                 raise self._error("varies", name, (*sorted(part.groups), "recording"))
@@ -133,7 +160,9 @@ class Scene:
         """`spec` with environment variables replaced, and a file relative to scene.toml."""
         full = os.path.expandvars(spec)
         if "$" in full:
-            raise FormatError(f"{self.path.name}: sets: {spec!r} names a variable that is not set; set it to a folder")
+            raise FormatError(
+                f"{self.path.name}: sets: {spec!r} names a variable that is not set; set it to a folder"
+            )
         return full if full.startswith("sim:") else str(self.path.parent / full)
 
     def _error(self, key: str, value: str, known: tuple[str, ...]) -> FormatError:
@@ -141,17 +170,22 @@ class Scene:
 
 
 def read(path: Path) -> Scene:
-    """The scene in a file. Raises FormatError naming the file, the key, its value and what is allowed."""
+    """The scene in a file. Raises FormatError naming the file, the key, its value and what is
+    allowed."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
         raise FormatError(f"{path.name}: not TOML: {e}") from e
     budget = table.pop("budget", {})
     if not isinstance(budget, dict):
-        raise FormatError(f"{path.name}: budget = {budget!r} is not allowed; write a table [budget]")
+        raise FormatError(
+            f"{path.name}: budget = {budget!r} is not allowed; write a table [budget]"
+        )
     name = re.sub(r"[^A-Za-z0-9 _.-]", "-", path.stem).lstrip(" _.-")[:24] or "scene"
     found = {"name": name} | _values(path.name, "", Scene, table)
-    scene = Scene(**found, budget=Budget(**_values(path.name, "budget.", Budget, budget)), path=path)
+    scene = Scene(
+        **found, budget=Budget(**_values(path.name, "budget.", Budget, budget)), path=path
+    )
     _check(scene, table)
     return scene
 
@@ -160,10 +194,13 @@ def _values(file: str, section: str, schema: type[Any], table: Mapping[str, Any]
     """The values of one table, each as its field reads it."""
     known = {name: key for name, key in keys(schema).items() if key.limits}
     return read_table(
-        known, table,
-        unknown=lambda name: FormatError(f"{file}: key {section}{name} is unknown{_near(name, tuple(known))}"),
+        known,
+        table,
+        unknown=lambda name: FormatError(
+            f"{file}: key {section}{name} is unknown{_near(name, tuple(known))}"
+        ),
         refused=lambda why: FormatError(f"{file}: {section}{why}"),
-    )  # fmt: skip
+    )
 
 
 def _check(scene: Scene, table: Mapping[str, Any]) -> None:
@@ -176,7 +213,9 @@ def _check(scene: Scene, table: Mapping[str, Any]) -> None:
         if merged.count(name) > 1:
             raise FormatError(f"{file}: merge names {name!r} twice; a material goes into one label")
         if scene.materials and name not in scene.materials:
-            raise FormatError(f"{file}: merge names {name!r}, which is not among materials; add it there")
+            raise FormatError(
+                f"{file}: merge names {name!r}, which is not among materials; add it there"
+            )
     known = tuple(methods.every())
     for name in scene.methods:
         if name not in known:
@@ -192,7 +231,9 @@ def _check(scene: Scene, table: Mapping[str, Any]) -> None:
                 f"{file}: stress.{name} = {severity:g} is out of range; use up to {most:g} {digital[name].unit}"
             )
     if "apply" in table and (unused := set(scene.apply) - set(scene.reduce)):
-        raise FormatError(f"{file}: apply names {min(unused)!r}, which is not in reduce; add it there")
+        raise FormatError(
+            f"{file}: apply names {min(unused)!r}, which is not in reduce; add it there"
+        )
 
 
 def _near(value: str, known: tuple[str, ...]) -> str:

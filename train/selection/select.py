@@ -1,8 +1,10 @@
-"""The smallest model that a scene needs. In: a scene and its sweeps. Out: a Selection: what was chosen, and why.
+"""The smallest model that a scene needs. In: a scene and its sweeps. Out: a Selection: what was
+chosen, and why.
 
-The candidates are tried from the cheapest up. Chosen is the cheapest one within one standard error of the best (Breiman
-et al. 1984, sec. 3.4.3), the error being that of the paired difference. Nested validation (Stone 1974) says what such a
-choice is worth: the same choice is made without each part in turn, which then judges what was chosen.
+The candidates are tried from the cheapest up. Chosen is the cheapest one within one standard error
+of the best (Breiman et al. 1984, sec. 3.4.3), the error being that of the paired difference. Nested
+validation (Stone 1974) says what such a choice is worth: the same choice is made without each part
+in turn, which then judges what was chosen.
 """
 
 from __future__ import annotations
@@ -47,10 +49,11 @@ class NothingFits(ApplianceError):
 
 @dataclass(frozen=True)
 class BundleCost:
-    """What a method's bundle costs on this machine: its Measurement, in the units of the scene's budget.
+    """What a method's bundle costs on this machine: its Measurement, in the units of the scene's
+    budget.
 
-    ms: processor time of a sweep, median. kb: size of the whole bundle in units of 1000 bytes. mb: resident memory in
-    MiB. refused: why there is no bundle; the rest is not a number then.
+    ms: processor time of a sweep, median. kb: size of the whole bundle in units of 1000 bytes. mb:
+    resident memory in MiB. refused: why there is no bundle; the rest is not a number then.
     """
 
     ms: float = math.nan
@@ -64,20 +67,23 @@ class BundleCost:
         return cls(measurement.ms_p50, measurement.bundle_kb, measurement.rss_mib)
 
     def order(self, budget: Budget) -> tuple[float, float]:
-        """What candidates are sorted by: the share of the board's time or of its storage that is used, whichever is
-        larger; where neither has a limit the size alone. Memory does not count: it is nearly the same for all. Equal
-        ones are sorted by time."""
+        """What candidates are sorted by: the share of the board's time or of its storage that is
+        used, whichever is larger; where neither has a limit the size alone. Memory does not count:
+        it is nearly the same for all. Equal ones are sorted by time."""
         shares = [share for key, share in self.used(budget).items() if key != "mb"]
         return max(shares, default=self.kb), self.ms
 
     def used(self, budget: Budget) -> dict[str, float]:
         """Share of each part of the budget that has a limit."""
         needs = {"ms": self.ms * budget.slower, "kb": self.kb, "mb": self.mb}
-        return {k: v / limit for k, v in needs.items() if math.isfinite(limit := getattr(budget, k))}
+        return {
+            k: v / limit for k, v in needs.items() if math.isfinite(limit := getattr(budget, k))
+        }
 
 
 def candidates(scene: Scene) -> list[str]:
-    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, the family of compact, and the default."""
+    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, the family
+    of compact, and the default."""
     if scene.methods:
         return list(scene.methods)
     known = methods.every()
@@ -87,11 +93,17 @@ def candidates(scene: Scene) -> list[str]:
 
 
 def bundle_costs(
-    names: Sequence[str], sweeps: Dataset, scene: Scene, effort: Effort, where: Where, progress: Progress
+    names: Sequence[str],
+    sweeps: Dataset,
+    scene: Scene,
+    effort: Effort,
+    where: Where,
+    progress: Progress,
 ) -> dict[str, BundleCost]:
     """The cost of each method's bundle, the cheapest first and refused ones last.
 
-    Bundles are packed one after another and kept; then all are measured at once, and the figures are kept together.
+    Bundles are packed one after another and kept; then all are measured at once, and the figures
+    are kept together.
     """
     with tempfile.TemporaryDirectory() as aside:
         kept = (where.cache or Path(aside)) / "bundles"
@@ -105,12 +117,22 @@ def bundle_costs(
                 folders[method.name] = folder
             progress(f"bundle of {method.name}; all are timed in turns")
         found |= _measured(folders, sweeps, kept)
-    return dict(sorted(found.items(), key=lambda item: (bool(item[1].refused), item[1].order(scene.budget))))
+    return dict(
+        sorted(found.items(), key=lambda item: (bool(item[1].refused), item[1].order(scene.budget)))
+    )
 
 
 def _packed(method: Method, sweeps: Dataset, scene: Scene, kept: Path) -> tuple[Path, str]:
-    """The folder of the method's bundle, and why there is none; what lies in `kept` is not made again."""
-    about = ["bundle", platform.node(), digest(sweeps), method.name, method.effort, scene.full_scale]
+    """The folder of the method's bundle, and why there is none; what lies in `kept` is not made
+    again."""
+    about = [
+        "bundle",
+        platform.node(),
+        digest(sweeps),
+        method.name,
+        method.effort,
+        scene.full_scale,
+    ]
     folder = kept / fingerprint(about, methods.module_of(method.name), "train.export.pack")
     reason = folder.with_suffix(".refused")
     if folder.exists():
@@ -127,24 +149,30 @@ def _packed(method: Method, sweeps: Dataset, scene: Scene, kept: Path) -> tuple[
 
 
 def _measured(folders: dict[str, Path], sweeps: Dataset, kept: Path) -> dict[str, BundleCost]:
-    """The costs of bundles that were measured together: kept ones where the very same bundles were measured before."""
+    """The costs of bundles that were measured together: kept ones where the very same bundles were
+    measured before."""
     if not folders:
         return {}
     about = [platform.node(), *(folder.name for folder in folders.values())]
     record = kept / f"{fingerprint(about, 'train.export.measure')}.json"
     if not record.exists():
         found = measure.measure_all(list(folders.values()), sweeps.samples)
-        put(record, json.dumps([asdict(measurement) for measurement in found]).encode(), parents=True)
+        put(
+            record,
+            json.dumps([asdict(measurement) for measurement in found]).encode(),
+            parents=True,
+        )
     measurements = [Measurement(**entry) for entry in json.loads(record.read_text())]
     return {name: BundleCost.of(one) for name, one in zip(folders, measurements, strict=True)}
 
 
 @dataclass
 class SizeSearch:
-    """One choice while it is made, candidate by candidate in the order of cost. aside: the part it must not see, or None.
+    """One choice while it is made, candidate by candidate in the order of cost. aside: the part it
+    must not see, or None.
 
-    scores: of the candidates so far, as Trials.scores. unchanged: by family, its newest candidate and how many in a row
-    changed nothing.
+    scores: of the candidates so far, as Trials.scores. unchanged: by family, its newest candidate
+    and how many in a row changed nothing.
     """
 
     trials: Trials
@@ -153,10 +181,12 @@ class SizeSearch:
     unchanged: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def enough(self, name: str) -> str:
-        """Why the next candidate `name` need not be tried, "" where it could still change the choice.
+        """Why the next candidate `name` need not be tried, "" where it could still change the
+        choice.
 
-        It need not where even a faultless model would be within one standard error of what is chosen, and where
-        LARGER_WITHOUT_GAIN candidates of its family in a row changed nothing and the last was no better than the one before.
+        It need not where even a faultless model would be within one standard error of what is
+        chosen, and where LARGER_WITHOUT_GAIN candidates of its family in a row changed nothing and
+        the last was no better than the one before.
         """
         if not self.scores:
             return ""
@@ -178,7 +208,10 @@ class SizeSearch:
         self.scores[name] = self.trials.scores(name, self.aside)
         last, times = self.unchanged.get(_family(name), ("", 0))
         better = last and not self.trials.difference(self.scores[name], self.scores[last]).within
-        self.unchanged[_family(name)] = name, (times + 1 if self.chosen == before and not better else 0)
+        self.unchanged[_family(name)] = (
+            name,
+            (times + 1 if self.chosen == before and not better else 0),
+        )
 
     @property
     def best(self) -> str:
@@ -201,8 +234,8 @@ def _family(name: str) -> str:
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen. costs: of all candidates, the cheapest first. why_not: reasons by candidate that was not tried.
-    final: the choice with all data; inner: without each part in turn."""
+    """What was chosen. costs: of all candidates, the cheapest first. why_not: reasons by candidate
+    that was not tried. final: the choice with all data; inner: without each part in turn."""
 
     trials: Trials
     costs: dict[str, BundleCost]
@@ -212,7 +245,8 @@ class Selection:
 
     @property
     def nested(self) -> Array:
-        """Scores [groups, N] of what was chosen without each part, on that part: what the choice is worth."""
+        """Scores [groups, N] of what was chosen without each part, on that part: what the choice is
+        worth."""
         scores = np.full_like(self.final.scores[self.final.chosen], np.nan)
         for p, search in enumerate(self.inner):
             part = self.trials.parts[p]
@@ -225,31 +259,49 @@ class Selection:
         trials, final = self.trials, self.final
         order = list(self.costs)
         return {
-            "chosen": final.chosen, "best": final.best, "rungs": [self._candidate(name, scene) for name in order],
-            "accuracy": trials.accuracy(final.scores[final.chosen]), "honest": self._nested_json(),
-            **dict(self._neighbours()), "next": next(iter(order[order.index(final.chosen) + 1 :]), ""),
+            "chosen": final.chosen,
+            "best": final.best,
+            "rungs": [self._candidate(name, scene) for name in order],
+            "accuracy": trials.accuracy(final.scores[final.chosen]),
+            "honest": self._nested_json(),
+            **dict(self._neighbours()),
+            "next": next(iter(order[order.index(final.chosen) + 1 :]), ""),
             "wanted": scene.accuracy,
             "parts": [{"group": p.group, "values": list(p.values)} for p in trials.parts],
             "conditions": [{"name": name, "accuracy": value} for name, value in self._conditions()],
             "confused": self._confused(),
-        }  # fmt: skip
+        }
 
     def _nested_json(self) -> Json:
-        """Accuracy of the nested choice, for each group too, and how often each candidate was chosen."""
+        """Accuracy of the nested choice, for each group too, and how often each candidate was
+        chosen."""
         trials, scores = self.trials, self.nested
         number = np.arange(len(trials.groups))[:, None]
-        groups = {name: trials.accuracy(np.where(number == g, scores, np.nan)) for g, name in enumerate(trials.groups)}
+        groups = {
+            name: trials.accuracy(np.where(number == g, scores, np.nan))
+            for g, name in enumerate(trials.groups)
+        }
         chose = Counter(search.chosen for search in self.inner)
         return trials.accuracy(scores) | {"groups": groups, "chose": dict(chose.most_common())}
 
     def _neighbours(self) -> Iterator[tuple[str, Json | None]]:
-        """The candidates tried just before and after the chosen one, with their difference from it."""
+        """The candidates tried just before and after the chosen one, with their difference from
+        it."""
         tried = list(self.final.scores)
         chosen = self.final.chosen
         at = tried.index(chosen)
-        smaller, larger = (tried[at - 1] if at else "", tried[at + 1] if at + 1 < len(tried) else "")
-        yield "smaller", {"method": smaller} | self.final.behind(smaller, chosen).json() if smaller else None
-        yield "larger", {"method": larger} | self.final.behind(chosen, larger).json() if larger else None
+        smaller, larger = (
+            tried[at - 1] if at else "",
+            tried[at + 1] if at + 1 < len(tried) else "",
+        )
+        yield (
+            "smaller",
+            {"method": smaller} | self.final.behind(smaller, chosen).json() if smaller else None,
+        )
+        yield (
+            "larger",
+            {"method": larger} | self.final.behind(chosen, larger).json() if larger else None,
+        )
 
     def _candidate(self, name: str, scene: Scene) -> Json:
         cost = self.costs[name]
@@ -261,7 +313,14 @@ class Selection:
             "why_not": self.why_not.get(name, ""),
         }
         if cost.refused:
-            return entry | {"ms": None, "kb": None, "mb": None, "used": {}, "accuracy": None, "behind": None}
+            return entry | {
+                "ms": None,
+                "kb": None,
+                "mb": None,
+                "used": {},
+                "accuracy": None,
+                "behind": None,
+            }
         scores = self.final.scores.get(name)
         return entry | {
             "used": {k: round(v, 3) for k, v in cost.used(scene.budget).items()},
@@ -272,7 +331,10 @@ class Selection:
     def _conditions(self) -> list[tuple[str, float]]:
         _, condition, sweep, probability = self.trials.tested(self.final.chosen)
         right = probability.argmax(1) == self.trials.sweeps.labels[sweep]
-        return [(n, round(float(right[condition == c].mean()), 4)) for c, n in enumerate(self.trials.conditions)]
+        return [
+            (n, round(float(right[condition == c].mean()), 4))
+            for c, n in enumerate(self.trials.conditions)
+        ]
 
     def _confused(self) -> list[Json]:
         """What is taken for what, the most frequent first: shares of the sweeps of a material."""
@@ -280,7 +342,10 @@ class Selection:
         names, counts = self.trials.sweeps.materials, np.zeros((probability.shape[1],) * 2)
         np.add.at(counts, (self.trials.sweeps.labels[sweep], probability.argmax(1)), 1)
         shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-        wrong = [(shares[a, b], a, b) for a, b in np.argwhere((shares > 0) & ~np.eye(len(names), dtype=bool))]
+        wrong = [
+            (shares[a, b], a, b)
+            for a, b in np.argwhere((shares > 0) & ~np.eye(len(names), dtype=bool))
+        ]
         return [
             {"is": names[a], "named": names[b], "share": round(float(share), 4)}
             for share, a, b in sorted(wrong, reverse=True)
@@ -288,25 +353,39 @@ class Selection:
 
 
 def choose(
-    sweeps: Dataset, scene: Scene, effort: Effort, where: Where, log: Log, later: Callable[[Trials], int] = lambda _: 0
+    sweeps: Dataset,
+    scene: Scene,
+    effort: Effort,
+    where: Where,
+    log: Log,
+    later: Callable[[Trials], int] = lambda _: 0,
 ) -> Selection:
-    """Search the candidates from the cheapest up. later: so many trainings come after that, for what is left in all.
+    """Search the candidates from the cheapest up. later: so many trainings come after that, for
+    what is left in all.
 
-    Raises NothingFits where no candidate can be taken, and FormatError where the scene cannot be judged.
+    Raises NothingFits where no candidate can be taken, and FormatError where the scene cannot be
+    judged.
     """
     progress = Progress(0, log)
     trials = Trials(sweeps, scene, effort, where, progress)
     for p in (p for p in range(len(trials.parts)) if not trials.seen_from(p)):
-        raise FormatError(f"{scene.path.name}: without {trials.parts[p].group} {trials.parts[p].values[0]} nothing is left "
-                          "to choose by; a group that varies needs three values: one to train on, one to choose by, one "
-                          "to judge the choice by")  # fmt: skip
+        raise FormatError(
+            f"{scene.path.name}: without {trials.parts[p].group} {trials.parts[p].values[0]} nothing is left "
+            "to choose by; a group that varies needs three values: one to train on, one to choose by, one "
+            "to judge the choice by"
+        )
     names = candidates(scene)
     progress.left(len(names) * (1 + trials.most) + later(trials))
     costs = bundle_costs(names, sweeps, scene, effort, where, progress)
     why_not = {name: cost.refused or _over(cost, scene) for name, cost in costs.items()}
-    final, inner = SizeSearch(trials, None), [SizeSearch(trials, p) for p in range(len(trials.parts))]
+    final, inner = (
+        SizeSearch(trials, None),
+        [SizeSearch(trials, p) for p in range(len(trials.parts))],
+    )
     for at, name in enumerate(costs):
-        progress.left(sum(not why_not[other] for other in [*costs][at:]) * trials.most + later(trials))
+        progress.left(
+            sum(not why_not[other] for other in [*costs][at:]) * trials.most + later(trials)
+        )
         if why_not[name]:
             continue
         why_not[name] = final.enough(name)
@@ -329,14 +408,20 @@ def _over(cost: BundleCost, scene: Scene) -> str:
     """Why a candidate does not fit the board, or nothing."""
     limits = {k: getattr(scene.budget, k) for k in ("ms", "kb", "mb")}
     needs = {"ms": cost.ms * scene.budget.slower, "kb": cost.kb, "mb": cost.mb}
-    over = [f"{needs[k]:.3g} {k} of {limits[k]:g}" for k, share in cost.used(scene.budget).items() if share > 1]
+    over = [
+        f"{needs[k]:.3g} {k} of {limits[k]:g}"
+        for k, share in cost.used(scene.budget).items()
+        if share > 1
+    ]
     return f"over the budget: {', '.join(over)}" if over else ""
 
 
 def _nearest(costs: dict[str, BundleCost], why_not: dict[str, str], scene: Scene) -> str:
     """Why nothing could be taken, with the candidate that is least over the budget."""
     over = {
-        name: max(costs[name].used(scene.budget).values()) for name, why in why_not.items() if why.startswith("over")
+        name: max(costs[name].used(scene.budget).values())
+        for name, why in why_not.items()
+        if why.startswith("over")
     }
     if not over:
         return "; ".join(f"{name} cannot be used here: {why}" for name, why in why_not.items())

@@ -1,6 +1,7 @@
-"""Decides whether onnxruntime may open a model. In: the bytes of an ONNX file, and what its bundle has beside it.
-Out: nothing, or a BundleError that names node, tensor and value. What passes can neither read beside its arrays nor take
-more memory or time than the caps below: each node is followed by its shapes, and every size is a constant of the file.
+"""Decides whether onnxruntime may open a model. In: the bytes of an ONNX file, and what its bundle
+has beside it. Out: nothing, or a BundleError that names node, tensor and value. What passes can
+neither read beside its arrays nor take more memory or time than the caps below: each node is
+followed by its shapes, and every size is a constant of the file.
 """
 
 from __future__ import annotations
@@ -15,30 +16,43 @@ import numpy as np
 from appliance.bundle.onnx_check import operators, reader
 from appliance.bundle.onnx_check.operators import OPERATORS
 from appliance.bundle.onnx_check.reader import Message
-from appliance.bundle.onnx_check.shapes import KINDS, MOST_RANK, PLACE, Call, Out, Shape, Value, need
+from appliance.bundle.onnx_check.shapes import (
+    KINDS,
+    MOST_RANK,
+    PLACE,
+    Call,
+    Out,
+    Shape,
+    Value,
+    need,
+)
 from appliance.core.errors import BundleError
 
 if TYPE_CHECKING:
     from appliance.bundle.manifest import Manifest
 
 VERSIONS = {"": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
-"""Of the operators of each domain: what train/ writes, and the next, in which the operators here hardly differ."""
+"""Of the operators of each domain: what train/ writes, and the next, in which the operators here
+hardly differ."""
 FORMATS = range(8, 10)
 """Of the file (IR version), likewise."""
 NOTES = ("onnx.infer", "onnx.quant.pre_process")
 """Metadata that onnxruntime's quantization writes into a model."""
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
-"""Three times MiniRocket's, the longest of our own; onnxruntime takes a kilobyte or two for each."""
+"""Three times MiniRocket's, the longest of our own; onnxruntime takes a kilobyte or two for
+each."""
 MOST_TENSOR = 64 << 20
-"""Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB once they are floats."""
+"""Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB
+once they are floats."""
 MOST_MEMORY = 160 << 20
-"""Bytes of all of a model by the account of `_Cost`. Our own largest: the paper's CNN in int8 151 MB, MiniRocket 93 MB.
-onnxruntime never took more than this account, and 9 MB for itself; so the service stays below its MemoryMax of 256 MB."""
+"""Bytes of all of a model by the account of `_Cost`. Our own largest: the paper's CNN in int8 151
+MB, MiniRocket 93 MB. onnxruntime never took more than this account, and 9 MB for itself; so the
+service stays below its MemoryMax of 256 MB."""
 COPIES = 3
 """Of a constant in memory: in the parsed file, as a tensor, and laid out for the processor."""
 MOST_WORK = 2_000_000_000
-"""Products, and TOUCH for every number read or written: seconds on a small board. At 1500 frames of 16 taxels MiniRocket
-needs 0.96e9, the paper's CNN in int8 0.88e9."""
+"""Products, and TOUCH for every number read or written: seconds on a small board. At 1500 frames of
+16 taxels MiniRocket needs 0.96e9, the paper's CNN in int8 0.88e9."""
 TOUCH = 8
 """Products that take as long as reading or writing a number, in the slowest operators."""
 MOST_LETTERS = 400
@@ -51,8 +65,9 @@ CONSTANTS = ("float32", "uint8", "int8", "int16", "int32", "int64")
 
 @dataclass(slots=True)
 class _Cost:
-    """What a model costs. bytes: of the file, COPIES of each constant and of what comes of constants alone, all that a
-    sweep moves, as if nothing were ever given back, and the largest workspace of a node. work: see MOST_WORK."""
+    """What a model costs. bytes: of the file, COPIES of each constant and of what comes of
+    constants alone, all that a sweep moves, as if nothing were ever given back, and the largest
+    workspace of a node. work: see MOST_WORK."""
 
     bytes: int
     work: int = 0
@@ -63,20 +78,32 @@ class _Cost:
         products, workspace = operators.work(name, call, made[0].shape)
         self.work += products + TOUCH * sum(prod(v.shape) for v in (*call.inputs, *made))
         self.workspace = max(self.workspace, workspace)
-        self.bytes += sum(_bytes(v) * (1 if v.moved or name == "DequantizeLinear" else COPIES) for v in made)
+        self.bytes += sum(
+            _bytes(v) * (1 if v.moved or name == "DequantizeLinear" else COPIES) for v in made
+        )
         total = self.bytes + self.workspace
-        need(total <= MOST_MEMORY, f"up to here it needs {total} bytes of memory (limit {MOST_MEMORY})")
-        need(self.work <= MOST_WORK, f"up to here it needs {self.work} products (limit {MOST_WORK})")
+        need(
+            total <= MOST_MEMORY,
+            f"up to here it needs {total} bytes of memory (limit {MOST_MEMORY})",
+        )
+        need(
+            self.work <= MOST_WORK, f"up to here it needs {self.work} products (limit {MOST_WORK})"
+        )
 
 
 def check(
-    model: bytes, manifest: Manifest, features: int | None = None, enrolled: int = 0, rank: int | None = None
+    model: bytes,
+    manifest: Manifest,
+    features: int | None = None,
+    enrolled: int = 0,
+    rank: int | None = None,
 ) -> int:
-    """Bytes of memory that `model` needs at most, by the account of MOST_MEMORY. Raises BundleError where it is not an ONNX
-    file that the box may run as the model of a bundle like this. No other place looks at inputs and outputs.
+    """Bytes of memory that `model` needs at most, by the account of MOST_MEMORY. Raises BundleError
+    where it is not an ONNX file that the box may run as the model of a bundle like this. No other
+    place looks at inputs and outputs.
 
-    features: numbers of the input, where it is not raw counts. enrolled: how many of the labels the model does not know.
-    rank: numbers of the embedding. None stands for any number above 0.
+    features: numbers of the input, where it is not raw counts. enrolled: how many of the labels the
+    model does not know. rank: numbers of the embedding. None stands for any number above 0.
     """
     try:
         need(len(model) <= MOST_MEMORY, f"it has {len(model)} bytes (limit {MOST_MEMORY})")
@@ -89,7 +116,9 @@ def check(
             _agree(declared, known)
         _gives([declared.name for declared in read.graph.output], known, manifest, enrolled, rank)
     except BundleError as e:
-        raise BundleError(f"the model must not be opened: {str(e)[:MOST_LETTERS]}; export the bundle again") from e
+        raise BundleError(
+            f"the model must not be opened: {str(e)[:MOST_LETTERS]}; export the bundle again"
+        ) from e
     return cost.bytes + cost.workspace
 
 
@@ -101,10 +130,16 @@ def _versions(read: Message) -> None:
     """The versions of file and operators, and nothing of another domain."""
     need(read.ir_version in FORMATS, f"IR version {read.ir_version} is none of {list(FORMATS)}")
     domains = [opset.domain for opset in read.opset_import]
-    need(len(domains) == len(set(domains)) and "" in domains, f"domains {domains} must be '' and others, each once")
+    need(
+        len(domains) == len(set(domains)) and "" in domains,
+        f"domains {domains} must be '' and others, each once",
+    )
     for opset in read.opset_import:
         known = VERSIONS.get(opset.domain, range(0))
-        need(opset.version in known, f"domain {opset.domain[:80]!r}, version {opset.version}: not in {list(known)}")
+        need(
+            opset.version in known,
+            f"domain {opset.domain[:80]!r}, version {opset.version}: not in {list(known)}",
+        )
     for note in read.metadata_props:
         need(note.key in NOTES, f"metadata {note.key[:80]!r} is none of {', '.join(NOTES)}")
 
@@ -114,14 +149,22 @@ def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
     need(len(graph.input) == 1, f"it has {len(graph.input)} inputs instead of one")
     kind, shape = _declared(graph.input[0])
     f = manifest.format
-    want, form = (f.dtype, (1, f.window, *f.shape)) if manifest.input == "raw" else ("float32", (1, features))
+    want, form = (
+        (f.dtype, (1, f.window, *f.shape))
+        if manifest.input == "raw"
+        else ("float32", (1, features))
+    )
     fits = kind == want and _fits(shape, form)
     need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(form)}")
 
 
 def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
-    """All values of the graph by name: the input, the constants, what each node gives; and its cost. size: bytes of the file."""
-    for what, have, most in ("nodes", graph.node, MOST_NODES), ("constants", graph.initializer, MOST_CONSTANTS):
+    """All values of the graph by name: the input, the constants, what each node gives; and its
+    cost. size: bytes of the file."""
+    for what, have, most in (
+        ("nodes", graph.node, MOST_NODES),
+        ("constants", graph.initializer, MOST_CONSTANTS),
+    ):
         need(len(have) <= most, f"it has {len(have)} {what} (limit {most})")
     (declared,) = graph.input
     known = {declared.name: _bounded(declared.name, Value(*_declared(declared), moved=True))}
@@ -133,30 +176,49 @@ def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
         try:
             _follow(node, known, cost)
         except BundleError as e:
-            raise BundleError(f"node {number} {node.name[:80]!r} ({node.op_type[:80]!r}): {e}") from e
+            raise BundleError(
+                f"node {number} {node.name[:80]!r} ({node.op_type[:80]!r}): {e}"
+            ) from e
     return known, cost
 
 
 def _fits(shape: Shape, form: Form) -> bool:
-    return len(shape) == len(form) and all(want in (None, n) for n, want in zip(shape, form, strict=True))
+    return len(shape) == len(form) and all(
+        want in (None, n) for n, want in zip(shape, form, strict=True)
+    )
 
 
 def _constant(tensor: Message, name: str) -> Value:
     """A constant, whose numbers stay in the file."""
     kind = KINDS.get(tensor.data_type, "")
-    need(kind in CONSTANTS, f"constant {name!r} is of type {kind or tensor.data_type}, none of {', '.join(CONSTANTS)}")
+    need(
+        kind in CONSTANTS,
+        f"constant {name!r} is of type {kind or tensor.data_type}, none of {', '.join(CONSTANTS)}",
+    )
     value = _bounded(name, Value(kind, tuple(tensor.dims)))
     field = {"float32": "float_data", "int64": "int64_data"}.get(kind, "int32_data")
-    numbers = {"float_data": tensor.float_data, "int32_data": tensor.int32_data, "int64_data": tensor.int64_data}
+    numbers = {
+        "float_data": tensor.float_data,
+        "int32_data": tensor.int32_data,
+        "int64_data": tensor.int64_data,
+    }
     filled = [f for f, held in numbers.items() if held is not None and len(held)]
     need(set(filled) <= {field}, f"constant {name!r} has numbers of another type")
     need(not (filled and tensor.raw_data), f"constant {name!r} has its numbers twice")
     if not filled:
         raw = tensor.raw_data or b""
-        need(len(raw) == _bytes(value), f"constant {name!r} has {len(raw)} bytes, not {_bytes(value)}")
-        return replace(value, numbers=np.frombuffer(raw, np.dtype(kind).newbyteorder("<")).reshape(value.shape))
+        need(
+            len(raw) == _bytes(value),
+            f"constant {name!r} has {len(raw)} bytes, not {_bytes(value)}",
+        )
+        return replace(
+            value, numbers=np.frombuffer(raw, np.dtype(kind).newbyteorder("<")).reshape(value.shape)
+        )
     typed: Any = numbers[field]
-    need(len(typed) == prod(value.shape), f"constant {name!r} has {len(typed)} numbers, not {prod(value.shape)}")
+    need(
+        len(typed) == prod(value.shape),
+        f"constant {name!r} has {len(typed)} numbers, not {prod(value.shape)}",
+    )
     if kind != "float32":
         limits = np.iinfo(kind)
         fits = limits.min <= min(typed) and max(typed) <= limits.max
@@ -166,10 +228,19 @@ def _constant(tensor: Message, name: str) -> Value:
 
 def _bounded(name: str, value: Value) -> Value:
     """A tensor with a name, and of a size that may be."""
-    need(name != "" and len(value.shape) <= MOST_RANK, f"{name[:80]!r} has {len(value.shape)} dimensions or no name")
-    need(all(n > 0 for n in value.shape), f"{name[:80]!r} has the shape {list(value.shape)}, which holds nothing")
+    need(
+        name != "" and len(value.shape) <= MOST_RANK,
+        f"{name[:80]!r} has {len(value.shape)} dimensions or no name",
+    )
+    need(
+        all(n > 0 for n in value.shape),
+        f"{name[:80]!r} has the shape {list(value.shape)}, which holds nothing",
+    )
     size = _bytes(value)
-    need(size <= MOST_TENSOR, f"{name[:80]!r} of {list(value.shape)} has {size} bytes (limit {MOST_TENSOR})")
+    need(
+        size <= MOST_TENSOR,
+        f"{name[:80]!r} of {list(value.shape)} has {size} bytes (limit {MOST_TENSOR})",
+    )
     return value
 
 
@@ -190,7 +261,10 @@ def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
     outs: list[Out] = given if isinstance(given, list) else [given]
     need(len(node.output) == len(outs), f"it has {len(node.output)} outputs instead of {len(outs)}")
     moved = any(x.moved for x in inputs)
-    made = [Value("int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE) for kind, shape in outs]
+    made = [
+        Value("int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE)
+        for kind, shape in outs
+    ]
     for name, value in zip(node.output, made, strict=True):
         need(name not in known, f"{name[:80]!r} is made twice")
         known[name] = _bounded(name, value)
@@ -203,10 +277,21 @@ def _settings(node: Message, allowed: Mapping[str, int]) -> dict[str, Any]:
     for a in node.attribute:
         name, code = a.name[:80], a.type
         need(a.name not in found, f"{name!r} is set twice")
-        need(code == allowed.get(a.name), f"setting {name!r} of type {code} is none that it may have")
-        there = {operators.FLOAT: a.f, operators.INT: a.i, operators.TEXT: a.s, operators.TENSOR: a.t,
-                 operators.FLOATS: a.floats, operators.INTS: a.ints or None}  # fmt: skip
-        need([c for c, value in there.items() if value is not None] == [code], f"{name!r} is not as its type has it")
+        need(
+            code == allowed.get(a.name), f"setting {name!r} of type {code} is none that it may have"
+        )
+        there = {
+            operators.FLOAT: a.f,
+            operators.INT: a.i,
+            operators.TEXT: a.s,
+            operators.TENSOR: a.t,
+            operators.FLOATS: a.floats,
+            operators.INTS: a.ints or None,
+        }
+        need(
+            [c for c, value in there.items() if value is not None] == [code],
+            f"{name!r} is not as its type has it",
+        )
         need(code != operators.FLOAT or isfinite(a.f), f"{name} = {a.f}")
         found[a.name] = there[code]
         if code == operators.TEXT:
@@ -222,36 +307,57 @@ def _declared(declared: Message) -> tuple[str, Shape]:
     if held is None or held.shape is None or held.elem_type not in KINDS:
         raise BundleError(f"{declared.name[:80]!r} has no type and shape of a tensor")
     sizes = [d.dim_value for d in held.shape.dim]
-    need(None not in sizes, f"{declared.name[:80]!r} has the shape {sizes}; every size must be a number")
+    need(
+        None not in sizes,
+        f"{declared.name[:80]!r} has the shape {sizes}; every size must be a number",
+    )
     return KINDS[held.elem_type], tuple(sizes)
 
 
 def _agree(declared: Message, known: dict[str, Value]) -> None:
-    """What the file says of a value is what comes of its nodes; quantization leaves notes on values that are gone."""
+    """What the file says of a value is what comes of its nodes; quantization leaves notes on values
+    that are gone."""
     if declared.name in known:
         (kind, shape), have = _declared(declared), known[declared.name]
         what = f"{declared.name[:80]!r} is declared as {kind} {list(shape)} and is {have.kind} {list(have.shape)}"
         need((kind, shape) == (have.kind, have.shape), what)
 
 
-def _gives(names: list[str], known: dict[str, Value], manifest: Manifest, enrolled: int, rank: int | None) -> None:
+def _gives(
+    names: list[str], known: dict[str, Value], manifest: Manifest, enrolled: int, rank: int | None
+) -> None:
     """The outputs are those that the manifest needs, and no other than may be, each of its form."""
     early, labels = manifest.early, len(manifest.labels)
     trained = labels - enrolled
     forms: dict[str, Form] = {
-        "logits": (1, trained), "early": (1, len(early.least) if early else None, trained), "embedding": (1, rank),
-    }  # fmt: skip
-    needed = {"logits"} | ({"early"} if early else set()) | ({"embedding"} if manifest.known else set())
+        "logits": (1, trained),
+        "early": (1, len(early.least) if early else None, trained),
+        "embedding": (1, rank),
+    }
+    needed = (
+        {"logits"} | ({"early"} if early else set()) | ({"embedding"} if manifest.known else set())
+    )
     asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(forms)}"
-    need(len(names) == len(set(names)) and needed <= set(names) <= forms.keys(), f"it gives {names[:9]}; {asked}")
+    need(
+        len(names) == len(set(names)) and needed <= set(names) <= forms.keys(),
+        f"it gives {names[:9]}; {asked}",
+    )
     for name in names:
         need(name in known, f"no node gives the output {name!r}")
         have, axes = known[name], len(forms[name])
-        need(have.kind == "float32" and have.moved and have.shape[:1] == (1,) and len(have.shape) == axes,
-             f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the first 1")  # fmt: skip
+        need(
+            have.kind == "float32"
+            and have.moved
+            and have.shape[:1] == (1,)
+            and len(have.shape) == axes,
+            f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the first 1",
+        )
     classes = known["logits"].shape[1]
     new = f", {enrolled} of them enrolled" if enrolled else ""
-    need(1 < classes == trained, f"it tells {classes} materials apart, the manifest has {labels} labels{new}")
+    need(
+        1 < classes == trained,
+        f"it tells {classes} materials apart, the manifest has {labels} labels{new}",
+    )
     for name in names:
         shape, form = known[name].shape, forms[name]
         need(_fits(shape, form), f"{name} is {list(shape)} instead of {list(form)}")

@@ -1,5 +1,6 @@
-"""The operators that a bundle's model may use: those that the exporters of train/ write, with the settings and types that
-they write. In: domain and name. Out: the operator's rule (shapes.py) and what it takes; for a node its work and workspace.
+"""The operators that a bundle's model may use: those that the exporters of train/ write, with the
+settings and types that they write. In: domain and name. Out: the operator's rule (shapes.py) and
+what it takes; for a node its work and workspace.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ ANY, F, L, B, U8 = tuple(KINDS.values()), ("float32",), ("int64",), ("bool",), (
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """What a bundle's model may do with one operator. rule: what it gives. kinds: types of its inputs in their order, the
-    last of them for all that follow. least, most: how many inputs. settings: code of the type of each."""
+    """What a bundle's model may do with one operator. rule: what it gives. kinds: types of its
+    inputs in their order, the last of them for all that follow. least, most: how many inputs.
+    settings: code of the type of each."""
 
     rule: Rule
     kinds: tuple[tuple[str, ...], ...]
@@ -29,7 +31,9 @@ class Operator:
     settings: Mapping[str, int]
 
 
-def _op(rule: Rule, *kinds: tuple[str, ...], least: int = 0, most: int = 0, **settings: int) -> Operator:
+def _op(
+    rule: Rule, *kinds: tuple[str, ...], least: int = 0, most: int = 0, **settings: int
+) -> Operator:
     return Operator(rule, kinds, least or len(kinds), most or len(kinds), settings)
 
 
@@ -59,27 +63,43 @@ _ONE, _TWO = _op(shapes.same, F), _op(shapes.spread, F, F)
 _COMPARED = _op(shapes.compare, (*F, *L, *U8, "int32"), (*F, *L, *U8, "int32"))
 _REDUCED = _op(shapes.reduce, F, L, least=1, axes=INTS, keepdims=INT)
 _STEPPED = ("uint8", "int8", "int32")
-_MACHINE = {"classlabels_ints": INTS, "vectors_per_class": INTS, "kernel_type": TEXT, "post_transform": TEXT,
-            "coefficients": FLOATS, "kernel_params": FLOATS, "rho": FLOATS, "support_vectors": FLOATS}  # fmt: skip
+_MACHINE = {
+    "classlabels_ints": INTS,
+    "vectors_per_class": INTS,
+    "kernel_type": TEXT,
+    "post_transform": TEXT,
+    "coefficients": FLOATS,
+    "kernel_params": FLOATS,
+    "rho": FLOATS,
+    "support_vectors": FLOATS,
+}
 OPERATORS: dict[tuple[str, str], Operator] = {
-    **dict.fromkeys([("", name) for name in ("Abs", "Cos", "Log", "Neg", "Relu", "Sin", "Sqrt")], _ONE),
+    **dict.fromkeys(
+        [("", name) for name in ("Abs", "Cos", "Log", "Neg", "Relu", "Sin", "Sqrt")], _ONE
+    ),
     **dict.fromkeys([("", name) for name in ("Add", "Div", "Max", "Sub")], _TWO),
     **dict.fromkeys([("", name) for name in ("Equal", "Greater", "Less")], _COMPARED),
-    **dict.fromkeys([("", f"Reduce{name}") for name in ("Max", "Mean", "Min", "SumSquare")], _REDUCED),
+    **dict.fromkeys(
+        [("", f"Reduce{name}") for name in ("Max", "Mean", "Min", "SumSquare")], _REDUCED
+    ),
     ("", "And"): _op(shapes.compare, B, B),
     ("", "ArgMax"): _op(shapes.highest, F, axis=INT, keepdims=INT),
     ("", "Cast"): _op(shapes.cast, ANY, to=INT),
     ("", "Clip"): _op(shapes.clip, (*F, *U8), (*F, *U8), (*F, *U8)),
     ("", "Concat"): _op(shapes.concat, (*F, *L, *U8, "int32"), most=1000, axis=INT),
     ("", "ConstantOfShape"): _op(shapes.filled, L, value=TENSOR),
-    ("", "Conv"): _op(shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS, group=INT),
+    ("", "Conv"): _op(
+        shapes.conv, F, F, F, least=2, strides=INTS, pads=INTS, dilations=INTS, group=INT
+    ),
     ("", "DequantizeLinear"): _op(shapes.dequantize, _STEPPED, F, _STEPPED, axis=INT),
     ("", "Expand"): _op(shapes.expand, (*F, *U8), L),
     ("", "Flatten"): _op(shapes.flatten, ANY, axis=INT),
     ("", "GRU"): _op(shapes.recurrent, F, F, F, F, hidden_size=INT, linear_before_reset=INT),
     ("", "Gather"): _op(shapes.gather, (*F, *L), L, axis=INT),
     ("", "GatherElements"): _op(shapes.gather_each, F, L, axis=INT),
-    ("", "Gemm"): _op(shapes.gemm, F, F, F, least=2, alpha=FLOAT, beta=FLOAT, transA=INT, transB=INT),
+    ("", "Gemm"): _op(
+        shapes.gemm, F, F, F, least=2, alpha=FLOAT, beta=FLOAT, transA=INT, transB=INT
+    ),
     ("", "Identity"): _op(shapes.same, ANY),
     ("", "LogSoftmax"): _op(shapes.along, F, axis=INT),
     ("", "MatMul"): _op(shapes.product, F, F),
@@ -103,4 +123,5 @@ OPERATORS: dict[tuple[str, str], Operator] = {
     ("ai.onnx.ml", "Scaler"): _op(shapes.scale, F, offset=FLOATS, scale=FLOATS),
     ("com.microsoft", "CDist"): _op(shapes.distances, F, F, metric=TEXT),
 }
-"""By domain and name. Constants that only decide shapes and places are int64, and so are those here."""
+"""By domain and name. Constants that only decide shapes and places are int64, and so are those
+here."""

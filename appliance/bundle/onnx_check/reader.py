@@ -1,5 +1,6 @@
-"""Reads the bytes of an ONNX file. In: bytes. Out: the model as a Message, with the fields that a bundle's model may have.
-Anything that two readers could take for two things is refused with a BundleError. Constants stay where they are in the file.
+"""Reads the bytes of an ONNX file. In: bytes. Out: the model as a Message, with the fields that a
+bundle's model may have. Anything that two readers could take for two things is refused with a
+BundleError. Constants stay where they are in the file.
 """
 
 from __future__ import annotations
@@ -17,65 +18,103 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError
 
 MOST_VALUES = 50_000
-"""Fields and single numbers that are read one by one, counted before anything is made of them: protobuf's own library makes
-1 GB of 20 MB of empty nodes. MiniRocket, the longest of our own, has a sixth. An array of weights counts as one."""
+"""Fields and single numbers that are read one by one, counted before anything is made of them:
+protobuf's own library makes 1 GB of 20 MB of empty nodes. MiniRocket, the longest of our own, has a
+sixth. An array of weights counts as one."""
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5
 """Wire types of protobuf that are in use; 1 had eight bytes, 3 and 4 were groups."""
 REFUSED = "refused"
-"""In FIELDS: a field that deserves a name in the message of its refusal. One that is not in FIELDS is refused, too."""
+"""In FIELDS: a field that deserves a name in the message of its refusal. One that is not in FIELDS
+is refused, too."""
 FIELDS: dict[str, dict[int, tuple[str, str]]] = {
     "model": {
-        1: ("ir_version", "code"), 2: ("producer_name", "text"), 3: ("producer_version", "text"), 7: ("graph", "graph"),
-        8: ("opset_import", "opset*"), 14: ("metadata_props", "entry*"), 20: ("training_info", REFUSED),
+        1: ("ir_version", "code"),
+        2: ("producer_name", "text"),
+        3: ("producer_version", "text"),
+        7: ("graph", "graph"),
+        8: ("opset_import", "opset*"),
+        14: ("metadata_props", "entry*"),
+        20: ("training_info", REFUSED),
         25: ("functions", REFUSED),
     },
     "opset": {1: ("domain", "text"), 2: ("version", "code")},
     "entry": {1: ("key", "text"), 2: ("value", "text")},
     "graph": {
-        1: ("node", "node*"), 2: ("name", "text"), 5: ("initializer", "tensor*"), 11: ("input", "declared*"),
-        12: ("output", "declared*"), 13: ("value_info", "declared*"), 15: ("sparse_initializer", REFUSED),
+        1: ("node", "node*"),
+        2: ("name", "text"),
+        5: ("initializer", "tensor*"),
+        11: ("input", "declared*"),
+        12: ("output", "declared*"),
+        13: ("value_info", "declared*"),
+        15: ("sparse_initializer", REFUSED),
     },
     "node": {
-        1: ("input", "text*"), 2: ("output", "text*"), 3: ("name", "text"), 4: ("op_type", "text"),
-        5: ("attribute", "attribute*"), 7: ("domain", "text"),
+        1: ("input", "text*"),
+        2: ("output", "text*"),
+        3: ("name", "text"),
+        4: ("op_type", "text"),
+        5: ("attribute", "attribute*"),
+        7: ("domain", "text"),
     },
     "attribute": {
-        1: ("name", "text"), 2: ("f", "float"), 3: ("i", "signed"), 4: ("s", "bytes"), 5: ("t", "tensor"),
-        6: ("a graph in the graph", REFUSED), 7: ("floats", "floats"), 8: ("ints", "signed*"), 9: ("texts", REFUSED),
-        10: ("tensors", REFUSED), 11: ("graphs in the graph", REFUSED), 20: ("type", "code"),
+        1: ("name", "text"),
+        2: ("f", "float"),
+        3: ("i", "signed"),
+        4: ("s", "bytes"),
+        5: ("t", "tensor"),
+        6: ("a graph in the graph", REFUSED),
+        7: ("floats", "floats"),
+        8: ("ints", "signed*"),
+        9: ("texts", REFUSED),
+        10: ("tensors", REFUSED),
+        11: ("graphs in the graph", REFUSED),
+        20: ("type", "code"),
         22: ("a sparse tensor", REFUSED),
     },
     "tensor": {
-        1: ("dims", "signed*"), 2: ("data_type", "code"), 4: ("float_data", "floats"), 5: ("int32_data", "signed*"),
-        6: ("texts", REFUSED), 7: ("int64_data", "signed*"), 8: ("name", "text"), 9: ("raw_data", "bytes"),
-        10: ("numbers of 64 bits", REFUSED), 13: ("external_data", REFUSED), 14: ("data_location", REFUSED),
+        1: ("dims", "signed*"),
+        2: ("data_type", "code"),
+        4: ("float_data", "floats"),
+        5: ("int32_data", "signed*"),
+        6: ("texts", REFUSED),
+        7: ("int64_data", "signed*"),
+        8: ("name", "text"),
+        9: ("raw_data", "bytes"),
+        10: ("numbers of 64 bits", REFUSED),
+        13: ("external_data", REFUSED),
+        14: ("data_location", REFUSED),
     },
     "declared": {1: ("name", "text"), 2: ("type", "type")},
     "type": {
-        1: ("tensor_type", "tensortype"), 4: ("a sequence", REFUSED), 5: ("a map", REFUSED),
-        8: ("a sparse tensor", REFUSED), 9: ("an optional type", REFUSED),
+        1: ("tensor_type", "tensortype"),
+        4: ("a sequence", REFUSED),
+        5: ("a map", REFUSED),
+        8: ("a sparse tensor", REFUSED),
+        9: ("an optional type", REFUSED),
     },
     "tensortype": {1: ("elem_type", "code"), 2: ("shape", "shape")},
     "shape": {1: ("dim", "dimension*")},
     "dimension": {1: ("dim_value", "signed"), 2: ("a name instead of a number", REFUSED)},
-}  # fmt: skip
-"""By message and number: the field's name and what it holds, with * where it may come again. No message holds one of its
-own kind, so nothing nests without end."""
+}
+"""By message and number: the field's name and what it holds, with * where it may come again. No
+message holds one of its own kind, so nothing nests without end."""
 
 
 class Message(SimpleNamespace):
-    """One message: an attribute for each of its FIELDS that is not REFUSED. A field that the file leaves out is 0 (code),
-    "" (text), () (with *) or else None; floats are float32 [n], bytes a memoryview."""
+    """One message: an attribute for each of its FIELDS that is not REFUSED. A field that the file
+    leaves out is 0 (code), "" (text), () (with *) or else None; floats are float32 [n], bytes a
+    memoryview."""
 
 
 def read(data: bytes) -> Message:
-    """The model in the bytes of an ONNX file. Raises BundleError naming the message, the field and the place."""
+    """The model in the bytes of an ONNX file. Raises BundleError naming the message, the field and
+    the place."""
     return _Reader(data).message("model", 0, len(data))
 
 
 def fields(message: bytes) -> Iterator[tuple[int, slice, slice]]:
-    """The fields of a model or a graph that `read` has accepted, in their order: number, and where in `message` the field
-    and, without tag and length, its content stand."""
+    """The fields of a model or a graph that `read` has accepted, in their order: number, and where
+    in `message` the field and, without tag and length, its content stand."""
     reader, at = _Reader(message), 0
     while at < len(message):
         begin = at
@@ -93,7 +132,11 @@ def _absent(kind: str) -> dict[str, Any]:
     """What a message has for each field that is not there."""
     usual: dict[str, Any] = {"code": 0, "text": ""}
     fields = FIELDS[kind].values()
-    return {name: () if holds[-1] == "*" else usual.get(holds) for name, holds in fields if holds != REFUSED}
+    return {
+        name: () if holds[-1] == "*" else usual.get(holds)
+        for name, holds in fields
+        if holds != REFUSED
+    }
 
 
 class _Reader:
@@ -122,7 +165,8 @@ class _Reader:
         return Message(**(_absent(kind) | found))
 
     def _values(self, holds: str, tag: int, at: int, end: int) -> tuple[list[Any], int]:
-        """One of a field that may come again, or all of them packed, and where the next field begins."""
+        """One of a field that may come again, or all of them packed, and where the next field
+        begins."""
         if holds != "signed" or tag & 7 == VARINT:
             value, at = self._value(holds, tag, at, end)
             return [value], at
@@ -134,7 +178,8 @@ class _Reader:
         return found, end
 
     def _value(self, holds: str, tag: int, at: int, end: int) -> tuple[Any, int]:
-        """What a field holds, and where the next one begins. tag: the field's number and wire type."""
+        """What a field holds, and where the next one begins. tag: the field's number and wire
+        type."""
         if holds in ("code", "signed") and tag & 7 == VARINT:
             number, at = self.varint(at, end)
             if holds == "code" and number >> 31:  # onnxruntime would cut off what is beyond 31 bits
@@ -167,7 +212,9 @@ class _Reader:
             raise _wrong(at, f"{size} bytes are announced and {end - at} are there")
         return at, at + size
 
-    def _four_bytes(self, many: bool, tag: int, at: int, end: int) -> tuple[float | NDArray[Any], int]:
+    def _four_bytes(
+        self, many: bool, tag: int, at: int, end: int
+    ) -> tuple[float | NDArray[Any], int]:
         """One float; or all that stand one after another, each behind its tag, as one array."""
         if end - at < 4:
             raise _wrong(at, "a number is cut off")
@@ -199,7 +246,8 @@ class _Reader:
 
 @cache
 def _runs(tag: int) -> re.Pattern[bytes]:
-    """As many floats as follow each other, each behind its tag of one byte; possessive, so that nothing is remembered."""
+    """As many floats as follow each other, each behind its tag of one byte; possessive, so that
+    nothing is remembered."""
     return re.compile(b"(?:" + re.escape(bytes([tag])) + b".{4})++", re.DOTALL)
 
 

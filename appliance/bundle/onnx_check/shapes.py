@@ -1,6 +1,7 @@
-"""The rules of the operators. In: a node's inputs and settings. Out: type and shape of each output; BundleError where they
-do not fit. The rules are those of the ONNX operator documents (https://onnx.ai/onnx/operators/), within bounds under which
-onnxruntime neither reads beside an array nor divides by zero. Whatever decides a size must be a constant of the file.
+"""The rules of the operators. In: a node's inputs and settings. Out: type and shape of each output;
+BundleError where they do not fit. The rules are those of the ONNX operator documents
+(https://onnx.ai/onnx/operators/), within bounds under which onnxruntime neither reads beside an
+array nor divides by zero. Whatever decides a size must be a constant of the file.
 """
 
 from __future__ import annotations
@@ -15,7 +16,16 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError
 
-KINDS = {1: "float32", 2: "uint8", 3: "int8", 4: "uint16", 5: "int16", 6: "int32", 7: "int64", 9: "bool"}
+KINDS = {
+    1: "float32",
+    2: "uint8",
+    3: "int8",
+    4: "uint16",
+    5: "int16",
+    6: "int32",
+    7: "int64",
+    9: "bool",
+}
 """Types of tensors by ONNX's code; there are no others in a bundle's model."""
 MOST_RANK = 8
 """Dimensions of a tensor; our own have up to five."""
@@ -24,7 +34,8 @@ MOST_WINDOW_RANK = 3
 MOST_STEP = 1 << 16
 """Largest stride, dilation and kernel."""
 PLACE = "place"
-"""Type of an output that is an int64 and numbers a place, so is never negative: onnxruntime does not check it everywhere."""
+"""Type of an output that is an int64 and numbers a place, so is never negative: onnxruntime does
+not check it everywhere."""
 
 Shape = tuple[int, ...]
 Out = tuple[str, Shape]
@@ -32,8 +43,8 @@ Out = tuple[str, Shape]
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A tensor: its type (of KINDS) and shape; its numbers, where it is a constant of the file. moved: whether it depends
-    on the sweep. place: an int64 that is never negative."""
+    """A tensor: its type (of KINDS) and shape; its numbers, where it is a constant of the file.
+    moved: whether it depends on the sweep. place: an int64 that is never negative."""
 
     kind: str
     shape: Shape
@@ -50,12 +61,19 @@ class Call:
     given: Mapping[str, Any]
 
     def numbers(self, at: int, rank: int | None = 1) -> list[int]:
-        """The numbers of an input that must be a constant of `rank` dimensions (None: any). Raises BundleError."""
+        """The numbers of an input that must be a constant of `rank` dimensions (None: any). Raises
+        BundleError."""
         value = self.inputs[at]
         if value.numbers is None:
             raise BundleError(f"input {at + 1} decides a size, but is no constant of the file")
-        need(value.numbers.size <= MOST_RANK, f"input {at + 1} has {value.numbers.size} numbers (limit {MOST_RANK})")
-        need(rank in (None, len(value.shape)), f"input {at + 1} has {len(value.shape)} dimensions instead of {rank}")
+        need(
+            value.numbers.size <= MOST_RANK,
+            f"input {at + 1} has {value.numbers.size} numbers (limit {MOST_RANK})",
+        )
+        need(
+            rank in (None, len(value.shape)),
+            f"input {at + 1} has {len(value.shape)} dimensions instead of {rank}",
+        )
         found: list[int] = value.numbers.ravel().tolist()
         return found
 
@@ -73,7 +91,10 @@ class Call:
         """A setting of `count` whole numbers."""
         values = list(self.given.get(name, [usual] * count))
         need(len(values) == count, f"{name} has {len(values)} numbers instead of {count}")
-        need(all(least <= v <= MOST_STEP for v in values), f"{name} = {values} is out of {least} to {MOST_STEP}")
+        need(
+            all(least <= v <= MOST_STEP for v in values),
+            f"{name} = {values} is out of {least} to {MOST_STEP}",
+        )
         return values
 
 
@@ -86,7 +107,10 @@ def need(holds: bool, otherwise: str) -> None:
 def axes(given: Iterable[Any], rank: int) -> list[int]:
     """Axes as numbers from 0 on, each of them once."""
     named = list(given)
-    need(all(type(a) is int and -rank <= a < rank for a in named), f"axis {named} of {rank} dimensions")
+    need(
+        all(type(a) is int and -rank <= a < rank for a in named),
+        f"axis {named} of {rank} dimensions",
+    )
     found = [a % rank for a in named]
     need(0 < len(found) == len(set(found)), f"axes {named} must be some of {rank}, each once")
     return found
@@ -124,7 +148,8 @@ def choose(call: Call) -> Out:
 
 
 def rest(call: Call) -> Out:
-    """Mod: on some processors a division by zero, or of the least number by -1, ends the program."""
+    """Mod: on some processors a division by zero, or of the least number by -1, ends the
+    program."""
     need(all(n > 0 for n in call.numbers(1, None)), "divisors must be above 0")
     return spread(call)
 
@@ -152,7 +177,9 @@ def reduce(call: Call) -> Out:
     """ReduceMax and its like; up to opset 17 most have the axes as a setting."""
     x = call.inputs[0]
     need(len(call.inputs) == 1 or "axes" not in call.given, "axes are given twice")
-    named = call.numbers(1) if len(call.inputs) == 2 else call.given.get("axes", range(len(x.shape)))
+    named = (
+        call.numbers(1) if len(call.inputs) == 2 else call.given.get("axes", range(len(x.shape)))
+    )
     return x.kind, _without(x.shape, axes(named, len(x.shape)), call.flag("keepdims", 1))
 
 
@@ -181,7 +208,10 @@ def concat(call: Call) -> Out:
     first, shapes = call.inputs[0], [list(x.shape) for x in call.inputs]
     axis = call.axis(len(first.shape))
     alike = {(x.kind, len(x.shape), x.shape[:axis], x.shape[axis + 1 :]) for x in call.inputs}
-    need(len(alike) == 1, f"{sorted({x.kind for x in call.inputs})} of {shapes} cannot be joined along axis {axis}")
+    need(
+        len(alike) == 1,
+        f"{sorted({x.kind for x in call.inputs})} of {shapes} cannot be joined along axis {axis}",
+    )
     return first.kind, (*first.shape[:axis], sum(s[axis] for s in shapes), *first.shape[axis + 1 :])
 
 
@@ -191,7 +221,10 @@ def cut(call: Call) -> Out:
     starts, ends = call.numbers(1), call.numbers(2)
     along = axes(call.numbers(3) if n > 3 else range(len(starts)), len(x.shape))
     steps = call.numbers(4) if n > 4 else [1] * len(starts)
-    need(len(starts) == len(ends) == len(along) == len(steps), "starts, ends, axes and steps differ in number")
+    need(
+        len(starts) == len(ends) == len(along) == len(steps),
+        "starts, ends, axes and steps differ in number",
+    )
     need(all(s >= 1 for s in steps), f"steps {steps} must be above 0")
     shape = list(x.shape)
     for axis, start, end, step in zip(along, starts, ends, steps, strict=True):
@@ -210,7 +243,9 @@ def gather(call: Call) -> Out:
 def _within(at: Value, size: int) -> None:
     """Where the places are constants: each is there. Else onnxruntime looks, sweep by sweep."""
     if at.numbers is not None:
-        need(bool(-size <= at.numbers.min() and at.numbers.max() < size), f"a place is out of {size}")
+        need(
+            bool(-size <= at.numbers.min() and at.numbers.max() < size), f"a place is out of {size}"
+        )
 
 
 def gather_each(call: Call) -> Out:
@@ -224,7 +259,10 @@ def scatter(call: Call) -> Out:
     """ScatterElements."""
     x, at, new = call.inputs
     _beside(call, x, at)
-    need(new.shape == at.shape and new.kind == x.kind, "places and what is put there differ in shape or type")
+    need(
+        new.shape == at.shape and new.kind == x.kind,
+        "places and what is put there differ in shape or type",
+    )
     need(call.given.get("reduction", b"none") in (b"none", b"add"), "reduction must be none or add")
     return x.kind, x.shape
 
@@ -251,12 +289,17 @@ def reshape(call: Call) -> Out:
     """Reshape."""
     x, wanted = call.inputs[0], call.numbers(1)
     need(call.given.get("allowzero", 0) == 0, "allowzero must be 0")
-    need(all(n > 0 or n == -1 or (n == 0 and i < len(x.shape)) for i, n in enumerate(wanted)), f"{wanted} is no shape")
+    need(
+        all(n > 0 or n == -1 or (n == 0 and i < len(x.shape)) for i, n in enumerate(wanted)),
+        f"{wanted} is no shape",
+    )
     shape = [n or x.shape[i] for i, n in enumerate(wanted)]
     if -1 in shape:
         others = prod(n for n in shape if n > 0)
         shape[shape.index(-1)] = prod(x.shape) // others
-    need(-1 not in shape and prod(shape) == prod(x.shape), f"{list(x.shape)} cannot become {wanted}")
+    need(
+        -1 not in shape and prod(shape) == prod(x.shape), f"{list(x.shape)} cannot become {wanted}"
+    )
     return _as(x), tuple(shape)
 
 
@@ -284,7 +327,10 @@ def transpose(call: Call) -> Out:
     """Transpose."""
     x = call.inputs[0]
     order = call.given.get("perm", list(range(len(x.shape)))[::-1])
-    need(sorted(order) == list(range(len(x.shape))), f"perm {order} is no order of {len(x.shape)} dimensions")
+    need(
+        sorted(order) == list(range(len(x.shape))),
+        f"perm {order} is no order of {len(x.shape)} dimensions",
+    )
     return x.kind, tuple(x.shape[i] for i in order)
 
 
@@ -305,7 +351,10 @@ def filled(call: Call) -> Out:
 def count(call: Call) -> Out:
     """Range."""
     (start,), (end,), (step,) = (call.numbers(i, 0) for i in range(3))
-    need(all(abs(n) < 1 << 31 for n in (start, end, step)) and step != 0, f"{start} to {end} in steps of {step}")
+    need(
+        all(abs(n) < 1 << 31 for n in (start, end, step)) and step != 0,
+        f"{start} to {end} in steps of {step}",
+    )
     return spread(call)[0], (max(0, -((start - end) // step)),)
 
 
@@ -314,10 +363,19 @@ def windows(call: Call, kernel: Shape) -> Shape:
     size, n = call.inputs[0].shape[2:], len(kernel)
     need(0 < n == len(size) <= MOST_WINDOW_RANK, f"a kernel of {list(kernel)} on {list(size)}")
     strides, dilations = call.steps("strides", n, 1, 1), call.steps("dilations", n, 1, 1)
-    pads, reach = call.steps("pads", 2 * n, 0, 0), [d * (k - 1) + 1 for d, k in zip(dilations, kernel, strict=True)]
-    need(all(p < r for p, r in zip(pads, reach * 2, strict=True)), f"pads {pads} beyond a kernel that reaches {reach}")
+    pads, reach = (
+        call.steps("pads", 2 * n, 0, 0),
+        [d * (k - 1) + 1 for d, k in zip(dilations, kernel, strict=True)],
+    )
+    need(
+        all(p < r for p, r in zip(pads, reach * 2, strict=True)),
+        f"pads {pads} beyond a kernel that reaches {reach}",
+    )
     free = [s + p + q - r for s, p, q, r in zip(size, pads, pads[n:], reach, strict=False)]
-    need(all(f >= 0 for f in free), f"a kernel that reaches {reach} is larger than {list(size)} with pads {pads}")
+    need(
+        all(f >= 0 for f in free),
+        f"a kernel that reaches {reach} is larger than {list(size)} with pads {pads}",
+    )
     return tuple(f // s + 1 for f, s in zip(free, strides, strict=True))
 
 
@@ -328,7 +386,9 @@ def conv(call: Call) -> Out:
     fit = len(x) == len(w) > 2 and x[1] == groups * w[1]
     need(fit, f"weights of {list(w)} on {list(x)} with group = {groups}")
     need(groups > 0 and w[0] % groups == 0, f"group = {groups} does not divide {w[0]} filters")
-    need(len(call.inputs) == 2 or call.inputs[2].shape == w[:1], "one bias for each filter is wanted")
+    need(
+        len(call.inputs) == 2 or call.inputs[2].shape == w[:1], "one bias for each filter is wanted"
+    )
     return "float32", (x[0], w[0], *windows(call, w[2:]))
 
 
@@ -350,11 +410,16 @@ def product(call: Call) -> Out:
 
 def gemm(call: Call) -> Out:
     """Gemm."""
-    a, b = (value.shape[::-1] if call.flag(name, 0) else value.shape
-            for value, name in zip(call.inputs, ("transA", "transB"), strict=False))  # fmt: skip
+    a, b = (
+        value.shape[::-1] if call.flag(name, 0) else value.shape
+        for value, name in zip(call.inputs, ("transA", "transB"), strict=False)
+    )
     need(len(a) == len(b) == 2 and a[1] == b[0], f"{list(a)} times {list(b)}")
     out = (a[0], b[1])
-    need(len(call.inputs) == 2 or together(call.inputs[2].shape, out) == out, "what is added is too large")
+    need(
+        len(call.inputs) == 2 or together(call.inputs[2].shape, out) == out,
+        "what is added is too large",
+    )
     return "float32", out
 
 
@@ -364,13 +429,19 @@ def recurrent(call: Call) -> Out:
     size = call.given.get("hidden_size", 0)
     call.flag("linear_before_reset", 0)
     need(len(x) == 3 and 0 < size <= MOST_STEP, f"a state of {size} on {list(x)}")
-    need(weights == [(1, 3 * size, x[2]), (1, 3 * size, size), (1, 6 * size)], f"weights of {weights}")
+    need(
+        weights == [(1, 3 * size, x[2]), (1, 3 * size, size), (1, 6 * size)],
+        f"weights of {weights}",
+    )
     return "float32", (x[0], 1, x[1], size)
 
 
 def quantize(call: Call) -> Out:
     """QuantizeLinear, with one step."""
-    need(all(prod(x.shape) == 1 and len(x.shape) < 2 for x in call.inputs[1:]), "step and zero must be single numbers")
+    need(
+        all(prod(x.shape) == 1 and len(x.shape) < 2 for x in call.inputs[1:]),
+        "step and zero must be single numbers",
+    )
     return "uint8", call.inputs[0].shape
 
 
@@ -388,7 +459,10 @@ def scale(call: Call) -> Out:
     """Scaler."""
     x = call.inputs[0].shape
     for name in ("offset", "scale"):
-        need(len(x) == 2 and len(call.given.get(name, ())) == x[1], f"{name} must have a number for each of {list(x)}")
+        need(
+            len(x) == 2 and len(call.given.get(name, ())) == x[1],
+            f"{name} must have a number for each of {list(x)}",
+        )
     return "float32", x
 
 
@@ -404,12 +478,22 @@ def machine(call: Call) -> list[Out]:
     """SVMClassifier: onnxruntime takes the lengths of its tables for granted."""
     x, given = call.inputs[0].shape, call.given
     need(len(x) == 2 and x[0] == 1, f"one row of features is wanted, not {list(x)}")
-    classes, each = list(given.get("classlabels_ints", ())), list(given.get("vectors_per_class", ()))
+    classes, each = (
+        list(given.get("classlabels_ints", ())),
+        list(given.get("vectors_per_class", ())),
+    )
     pairs, vectors = len(classes) * (len(classes) - 1) // 2, sum(each)
-    need(len(classes) > 1 and len(set(classes)) == len(classes) == len(each), "classes and their vectors do not fit")
+    need(
+        len(classes) > 1 and len(set(classes)) == len(classes) == len(each),
+        "classes and their vectors do not fit",
+    )
     need(all(0 < n <= MOST_STEP for n in each), f"vectors_per_class = {each}")
-    lengths = {"support_vectors": vectors * x[1], "coefficients": vectors * (len(classes) - 1), "rho": pairs,
-               "kernel_params": 3}  # fmt: skip
+    lengths = {
+        "support_vectors": vectors * x[1],
+        "coefficients": vectors * (len(classes) - 1),
+        "rho": pairs,
+        "kernel_params": 3,
+    }
     for name, length in lengths.items():
         have = len(given.get(name, ()))
         need(have == length, f"{name} has {have} numbers instead of {length}")

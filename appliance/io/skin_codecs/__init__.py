@@ -1,7 +1,8 @@
-"""The bytes of skins that do not speak PROTOCOL.md, in pure functions. In: bytes, with what earlier ones left over. Out:
-frames, and how many bytes belonged to none.
+"""The bytes of skins that do not speak PROTOCOL.md, in pure functions. In: bytes, with what earlier
+ones left over. Out: frames, and how many bytes belonged to none.
 
-No received bytes make a codec raise, and none invents a frame: what is not enclosed by what its profile says is garbage.
+No received bytes make a codec raise, and none invents a frame: what is not enclosed by what its
+profile says is garbage.
 """
 
 from __future__ import annotations
@@ -18,8 +19,12 @@ __all__ = ["Codec", "Decoded", "Rest", "arranged", "codec"]
 Codec = Callable[[Rest, bytes], Decoded]
 """What was left over and new bytes -> what they contained."""
 _MODULES = {
-    "fixed": "fixed", "text": "text", "papillarray": "papillarray", "xela-can": "xela", "robotiq-tsf": "robotiq",
-}  # fmt: skip
+    "fixed": "fixed",
+    "text": "text",
+    "papillarray": "papillarray",
+    "xela-can": "xela",
+    "robotiq-tsf": "robotiq",
+}
 
 
 def codec(profile: SkinProfile) -> Codec:

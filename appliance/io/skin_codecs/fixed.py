@@ -1,4 +1,5 @@
-"""Frames of a fixed length with a marker before or a trailer after each: FlexiTac, AnySkin, most matrices made at home."""
+"""Frames of a fixed length with a marker before or a trailer after each: FlexiTac, AnySkin, most
+matrices made at home."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from appliance.io.skin_codecs.frames import NONE, Decoded, Rest, arranged, colle
 from appliance.io.skin_profile import SkinProfile
 
 AMBIGUOUS_FRAMES = 32
-"""So many frames are kept while two places in them could be their beginning; then the oldest are given up."""
+"""So many frames are kept while two places in them could be their beginning; then the oldest are
+given up."""
 
 MOST_RIVALS = 8
 """Places in a frame where marks may repeat; real frames have none or one."""
@@ -22,8 +24,9 @@ MOST_RIVALS = 8
 
 @dataclass(frozen=True, slots=True)
 class FixedLayout:
-    """Frames of a fixed length. mark: what stands between two of them: the end of one and the beginning of the next.
-    period: bytes from one mark to the next. tail: bytes of the mark that belong to the frame before it."""
+    """Frames of a fixed length. mark: what stands between two of them: the end of one and the
+    beginning of the next. period: bytes from one mark to the next. tail: bytes of the mark that
+    belong to the frame before it."""
 
     profile: SkinProfile
     mark: bytes
@@ -40,11 +43,14 @@ def _layout(p: SkinProfile) -> FixedLayout:
     count = np.dtype(p.sequence).newbyteorder(order) if p.sequence else None
     mark = p.trailer + p.marker
     body = p.rows * p.cols * p.values * number.itemsize
-    return FixedLayout(p, mark, len(p.trailer), len(mark) + (count.itemsize if count else 0) + body, count, number)
+    return FixedLayout(
+        p, mark, len(p.trailer), len(mark) + (count.itemsize if count else 0) + body, count, number
+    )
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """A frame is what stands between two marks exactly one period apart, once it is known where frames begin."""
+    """A frame is what stands between two marks exactly one period apart, once it is known where
+    frames begin."""
     layout = _layout(profile)
     data, synced = rest.data + new, rest.synced
     at = garbage = before = 0
@@ -60,13 +66,16 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
                 break
         n, broken = _run(layout, data, at)
         if n:
-            runs.append(np.frombuffer(data, np.uint8, n * layout.period, at).reshape(n, layout.period))
+            runs.append(
+                np.frombuffer(data, np.uint8, n * layout.period, at).reshape(n, layout.period)
+            )
             ends.append(at + layout.period * np.arange(1, n + 1) + layout.tail)
             skipped.append(np.array([before, *[0] * (n - 1)], np.int64))
             at, before = at + n * layout.period, 0
         if not broken:
             break
-        # a mark without another one at its distance: frames begin elsewhere now, or bytes are missing
+        # a mark without another one at its distance: frames begin elsewhere now, or bytes are
+        # missing
         at, garbage, before, synced = at + 1, garbage + 1, before + 1, False
     left = Rest(data[at:], synced)
     if not runs:
@@ -75,21 +84,26 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     taxels, counts = _columns(layout, table)
     return Decoded(
         taxels, np.concatenate(ends), np.concatenate(skipped), layout.period, garbage, left, counts
-    )  # fmt: skip
+    )
 
 
-def _columns(layout: FixedLayout, table: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+def _columns(
+    layout: FixedLayout, table: NDArray[np.uint8]
+) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Frames as bytes [n, period] -> raw counts, and sequence numbers where there are any."""
     begin, counts = len(layout.mark), NONE
     if layout.count:
         end = begin + layout.count.itemsize
         counts = np.ascontiguousarray(table[:, begin:end]).view(layout.count)[:, 0].astype(np.int64)
         begin = end
-    return arranged(layout.profile, np.ascontiguousarray(table[:, begin:]).view(layout.number)), counts
+    return arranged(
+        layout.profile, np.ascontiguousarray(table[:, begin:]).view(layout.number)
+    ), counts
 
 
 def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:
-    """How many frames follow the mark at `at`, and whether the next one is broken (False: its end has not come)."""
+    """How many frames follow the mark at `at`, and whether the next one is broken (False: its end
+    has not come)."""
     mark, period = layout.mark, layout.period
     n = 0
     while (end := at + (n + 1) * period) + len(mark) <= len(data):
@@ -112,12 +126,14 @@ def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, boo
 
 
 def _begins(layout: FixedLayout, data: bytes, at: int) -> int | None:
-    """0 if frames begin with the mark at `at`, else the bytes to pass over; None as long as more are needed to tell.
+    """0 if frames begin with the mark at `at`, else the bytes to pass over; None as long as more
+    are needed to tell.
 
-    A mark may occur among the numbers, in every frame at the same place as long as the skin is at rest. So a beginning
-    is certain once two periods have followed it, and no other place within the first is followed for as long. The
-    answer does not depend on how many bytes have come beyond those that it needs. Frames whose beginning cannot be told
-    are passed over as a whole, and so are those full of marks, which would cost more time than their bytes take to come.
+    A mark may occur among the numbers, in every frame at the same place as long as the skin is at
+    rest. So a beginning is certain once two periods have followed it, and no other place within the
+    first is followed for as long. The answer does not depend on how many bytes have come beyond
+    those that it needs. Frames whose beginning cannot be told are passed over as a whole, and so
+    are those full of marks, which would cost more time than their bytes take to come.
     """
     mark, period, rivals = layout.mark, layout.period, [at]
     for i in range(1, AMBIGUOUS_FRAMES + 1):

@@ -26,8 +26,9 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class PtsForm:
-    """Where things are in the content of a packet. size: its bytes. clock: offset of counter and time. numbers: offsets of
-    the bytes of all numbers of all pillars. fixed: offsets of the bytes that say so. seen: what stands there."""
+    """Where things are in the content of a packet. size: its bytes. clock: offset of counter and
+    time. numbers: offsets of the bytes of all numbers of all pillars. fixed: offsets of the bytes
+    that say so. seen: what stands there."""
 
     size: int
     clock: int
@@ -44,7 +45,8 @@ class PtsForm:
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Packets between head and tail with a sum of their bytes; a tail may occur inside, where the sum does not fit."""
+    """Packets between head and tail with a sum of their bytes; a tail may occur inside, where the
+    sum does not fit."""
     data = rest.data + new
     spans, kept = _packets(data)
     size = 4 * profile.rows * profile.cols * profile.values
@@ -63,10 +65,16 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     starts, ends = np.array(taken, np.int64).reshape(-1, 2).T
     clock = np.concatenate(clocks).view(_CLOCK)[:, 0]
     return Decoded(
-        arranged(profile, np.concatenate(numbers).view("<f4")), ends, starts - np.append(0, ends)[:-1],
-        taken[-1][1] - taken[-1][0] if taken else 0, kept - int((ends - starts).sum()), Rest(data[kept:], form=form),
-        clock["count"].astype(np.int64), (clock["us"] & _LOW_32).astype(np.int64), wrong,
-    )  # fmt: skip
+        arranged(profile, np.concatenate(numbers).view("<f4")),
+        ends,
+        starts - np.append(0, ends)[:-1],
+        taken[-1][1] - taken[-1][0] if taken else 0,
+        kept - int((ends - starts).sum()),
+        Rest(data[kept:], form=form),
+        clock["count"].astype(np.int64),
+        (clock["us"] & _LOW_32).astype(np.int64),
+        wrong,
+    )
 
 
 def _packets(data: bytes) -> tuple[list[Span], int]:
@@ -84,12 +92,17 @@ def _packets(data: bytes) -> tuple[list[Span], int]:
 
 
 def _end(data: bytes, begin: int) -> int:
-    """Where the packet ends whose content begins at `begin`; 0 if more bytes are needed, -1 if there is no packet."""
+    """Where the packet ends whose content begins at `begin`; 0 if more bytes are needed, -1 if
+    there is no packet."""
     tail = begin
     while (tail := data.find(_TAIL, tail)) >= 0 and tail - begin <= MOST_PACKET:
-        if tail - 2 > begin and sum(data[begin : tail - 2]) & 0xFFFF == _U16.unpack_from(data, tail - 2)[0]:
+        if (
+            tail - 2 > begin
+            and sum(data[begin : tail - 2]) & 0xFFFF == _U16.unpack_from(data, tail - 2)[0]
+        ):
             return tail + len(_TAIL)
-        # here it ended, damaged: among the bytes up to some later tail, one sum in 65,536 would fit by chance
+        # here it ended, damaged: among the bytes up to some later tail, one sum in 65,536 would fit
+        # by chance
         if data.startswith(_HEAD, tail + len(_TAIL)):
             return -1
         tail += 1
@@ -99,8 +112,9 @@ def _end(data: bytes, begin: int) -> int:
 def _alike(
     data: bytes, spans: list[Span], form: PtsForm | None
 ) -> Iterator[tuple[PtsForm, NDArray[np.uint8], list[Span]]]:
-    """Packets of one form that follow each other: the form, their contents [n, bytes], and where they are. Those
-    without a form are left out. form: of the packets before these, which is not looked for again."""
+    """Packets of one form that follow each other: the form, their contents [n, bytes], and where
+    they are. Those without a form are left out. form: of the packets before these, which is not
+    looked for again."""
     for _, group in groupby(spans, lambda span: span[1] - span[0]):
         where = list(group)
         content = b"".join(data[start + len(_HEAD) : end - len(_TAIL) - 2] for start, end in where)
@@ -122,7 +136,8 @@ def _form(content: bytes) -> PtsForm | None:
         ends = dict(pairwise([*sorted(blocks.values()), len(content)]))
         if ends[blocks[1]] - blocks[1] != _CLOCK.itemsize:
             return None
-        # the sum does not see bytes of 0 that are missing; then block 4 no longer begins with the number of sensors
+        # the sum does not see bytes of 0 that are missing; then block 4 no longer begins with the
+        # number of sensors
         if 4 in blocks:
             fixed += range(blocks[4], blocks[4] + 2)
             if _U16.unpack_from(content, blocks[4]) != _U16.unpack_from(content, blocks[3]):
@@ -137,8 +152,8 @@ def _form(content: bytes) -> PtsForm | None:
 
 
 def _table(content: bytes) -> tuple[dict[int, int], list[int]]:
-    """Type -> offset of each block, and where that stands. The table ends where the first block begins. Raises struct.error,
-    IndexError or ValueError where it does not fit."""
+    """Type -> offset of each block, and where that stands. The table ends where the first block
+    begins. Raises struct.error, IndexError or ValueError where it does not fit."""
     width = content[0]
     if not 1 <= width <= 4:
         raise ValueError(f"offsets of {width} bytes")
@@ -152,8 +167,8 @@ def _table(content: bytes) -> tuple[dict[int, int], list[int]]:
 
 
 def _pillars(content: bytes, at: int) -> tuple[list[int], list[int]]:
-    """Offsets of all pillars, and of the bytes that say where they are, in the block of type 3: sensors, their offsets, of
-    each sensor its pillars, their offsets, and their numbers."""
+    """Offsets of all pillars, and of the bytes that say where they are, in the block of type 3:
+    sensors, their offsets, of each sensor its pillars, their offsets, and their numbers."""
     width, found, fixed = content[0], [], [at, at + 1]
     (sensors,) = _U16.unpack_from(content, at)
     at += 2 + sensors * width

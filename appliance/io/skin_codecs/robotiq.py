@@ -15,25 +15,29 @@ _TSF_HEADER = 4
 _TSF_TAXELS = 28
 _TSF_READ, _TSF_AUTOSEND = 0x61, 0x58
 _TSF_FIELDS = {0x10: 2 * _TSF_TAXELS, 0x20: 2, 0x30: 6, 0x40: 6, 0x50: 6, 0x60: 2, 0x70: 8}
-"""Type of a field (high nibble) -> bytes of its numbers. 0x10 is the grid; the others are dynamic pressure,
-accelerometer, gyroscope, magnetometer, temperature, time stamp."""
+"""Type of a field (high nibble) -> bytes of its numbers. 0x10 is the grid; the others are dynamic
+pressure, accelerometer, gyroscope, magnetometer, temperature, time stamp."""
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Packets of fields, each followed by the next: there is no checksum. A frame is complete when the grid of each
-    finger has come, in one packet or in several."""
+    """Packets of fields, each followed by the next: there is no checksum. A frame is complete when
+    the grid of each finger has come, in one packet or in several."""
     data = rest.data + new
     fingers = profile.rows * profile.cols // _TSF_TAXELS
     numbers: list[NDArray[Any]] = []
     ends: list[int] = []
     skipped: list[int] = []
     grids: dict[int, bytes] = {}
-    at = begun = garbage = before = size = 0  # begun: where the packets of the frame under way begin
+    at = begun = garbage = before = size = (
+        0  # begun: where the packets of the frame under way begin
+    )
     while (end := _tsf_end(data, at)) != 0:
         fields = _tsf_fields(data[at + _TSF_HEADER : end]) if end > 0 else None
         whole = fields is not None and not grids.keys() & fields.keys()
         upto = at + 1 if fields is None else at if not whole else begun
-        if upto > begun:  # no packet, or the other finger's grid did not come: what was collected is not whole
+        if (
+            upto > begun
+        ):  # no packet, or the other finger's grid did not come: what was collected is not whole
             garbage, before, begun, grids = garbage + upto - begun, before + upto - begun, upto, {}
         if fields is None:
             found = data.find(_TSF_START, begun)

@@ -22,7 +22,8 @@ _WRONG_TAXELS = 4
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """One CAN frame a taxel, in the order of their numbers; a frame of the skin is complete with its last taxel."""
+    """One CAN frame a taxel, in the order of their numbers; a frame of the skin is complete with
+    its last taxel."""
     data = rest.data + new
     taxels = profile.rows * profile.cols
     numbers: list[NDArray[Any]] = []
@@ -40,7 +41,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         if taxel == len(found) < taxels and values[0] < _NO_VALUE:
             found.append(values)
         else:
-            # out of turn, no value, or no taxel at all: the frame under way is not whole; taxel 0 begins another
+            # out of turn, no value, or no taxel at all: the frame under way is not whole; taxel 0
+            # begins another
             fresh = taxel == 0 and values[0] < _NO_VALUE
             upto = match.end() - len(line) - 1 if fresh else at
             garbage, before = garbage + upto - begun, before + upto - begun
@@ -52,8 +54,14 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
             size, before, found, begun = at - begun, 0, [], at
     if len(data) - at > MOST_PACKET:
         garbage, begun = garbage + len(data) - begun, len(data)
-    wrong = f"it sends taxels beyond {shown((profile.rows, profile.cols))}" if beyond >= _WRONG_TAXELS else ""
-    return collected(profile, numbers, ends, skipped, garbage, Rest(data[begun:]), size, wrong=wrong)
+    wrong = (
+        f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
+        if beyond >= _WRONG_TAXELS
+        else ""
+    )
+    return collected(
+        profile, numbers, ends, skipped, garbage, Rest(data[begun:]), size, wrong=wrong
+    )
 
 
 def _xela_taxel(line: bytes) -> tuple[int, bytes]:

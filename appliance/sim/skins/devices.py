@@ -1,4 +1,5 @@
-"""A simulated robot whose skin is one that people own, on a terminal. In: the name of its profile, acts. Out: devices."""
+"""A simulated robot whose skin is one that people own, on a terminal. In: the name of its profile,
+acts. Out: devices."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ from appliance.sim.skins.wires import wire
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedDevices(RobotDevices):
-    """Simulated lines, and a skin that is played on a terminal. name: of its profile. folder: where the terminal's link
-    is, removed with this object."""
+    """Simulated lines, and a skin that is played on a terminal. name: of its profile. folder: where
+    the terminal's link is, removed with this object."""
 
     name: str
     player: Player
@@ -38,7 +39,11 @@ class PlayedDevices(RobotDevices):
 def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:
     """A frame [R, C] or [R, C, A] as the skin itself sees it, before the profile turns it."""
     for turn in reversed(profile.orientation):  # each turn is its own inverse
-        taxels = {"transpose": taxels.swapaxes(0, 1), "flip-rows": taxels[::-1], "flip-columns": taxels[:, ::-1]}[turn]
+        taxels = {
+            "transpose": taxels.swapaxes(0, 1),
+            "flip-rows": taxels[::-1],
+            "flip-columns": taxels[:, ::-1],
+        }[turn]
     return taxels
 
 
@@ -54,11 +59,17 @@ class Reel:
 
 
 def build(
-    name: str, profile: SkinProfile, fmt: SweepFormat, acts: Iterable[rig.Act], clock: Clock, source: str, *,
+    name: str,
+    profile: SkinProfile,
+    fmt: SweepFormat,
+    acts: Iterable[rig.Act],
+    clock: Clock,
+    source: str,
+    *,
     remember: bool = True,
-) -> PlayedDevices:  # fmt: skip
-    """Devices on which a robot plays `acts`, sweeps of `fmt`, with the skin of this profile. source, remember: see
-    `sim.devices.build`.
+) -> PlayedDevices:
+    """Devices on which a robot plays `acts`, sweeps of `fmt`, with the skin of this profile.
+    source, remember: see `sim.devices.build`.
 
     Raises ConfigError for a skin that has no emulator.
     """
@@ -69,6 +80,13 @@ def build(
     player = Player(wire(name, fmt.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
     playing.player = player
     return PlayedDevices(
-        clock=playing, gpio=lines, source=source, robot=robot, wait=playing.wait_readable, format=fmt,
-        name=name, player=player, folder=folder,
-    )  # fmt: skip
+        clock=playing,
+        gpio=lines,
+        source=source,
+        robot=robot,
+        wait=playing.wait_readable,
+        format=fmt,
+        name=name,
+        player=player,
+        folder=folder,
+    )

@@ -1,6 +1,8 @@
-"""A skin on a terminal: plays frames through its wire into a pseudo-terminal, at its own rate or as fast as they are read.
+"""A skin on a terminal: plays frames through its wire into a pseudo-terminal, at its own rate or as
+fast as they are read.
 
-In: a wire, frames, a clock. Out: bytes at the near end, whose name is a link that comes and goes with the plug.
+In: a wire, frames, a clock. Out: bytes at the near end, whose name is a link that comes and goes
+with the plug.
 """
 
 from __future__ import annotations
@@ -23,10 +25,11 @@ from appliance.core.clock import Clock, wait_readable
 from appliance.sim.skins.wires import Wire
 
 DRIVER_BYTES = 65_536
-"""What the kernel's driver of a real adapter holds for a slow reader, about; what comes then is thrown away."""
+"""What the kernel's driver of a real adapter holds for a slow reader, about; what comes then is
+thrown away."""
 MOST_AT_ONCE = 1000
-"""Frames that one step makes, of those that are due. A computer that is too slow for the skin would fall behind more with
-each step, and its step never end."""
+"""Frames that one step makes, of those that are due. A computer that is too slow for the skin would
+fall behind more with each step, and its step never end."""
 LOOK_NS = 2_000_000
 """Time between two looks for commands while nothing is due."""
 
@@ -35,20 +38,30 @@ class FrameSource(Protocol):
     """Where the frames come from, by their number."""
 
     def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
-        """Raw counts of frame `i`, asked for in order; numbers may be left out. frame_ns: the time of a frame."""
+        """Raw counts of frame `i`, asked for in order; numbers may be left out. frame_ns: the time
+        of a frame."""
         ...
 
 
 class Player:
-    """Plays a skin. It is plugged in from the beginning, and sends while some program has the terminal open.
+    """Plays a skin. It is plugged in from the beginning, and sends while some program has the
+    terminal open.
 
-    path: the link to the terminal. paced: frames come at the wire's rate by `clock`; else as fast as they are read.
-    collect_ns: the adapter passes on what it has this often (FTDI: 16 ms); 0 at once. mangle: changes what is sent, as a
-    bad cable. paused: the skin sends nothing. frames, sent: number of frames and of bytes sent. thrown: bytes that nobody took.
+    path: the link to the terminal. paced: frames come at the wire's rate by `clock`; else as fast
+    as they are read. collect_ns: the adapter passes on what it has this often (FTDI: 16 ms); 0 at
+    once. mangle: changes what is sent, as a bad cable. paused: the skin sends nothing. frames,
+    sent: number of frames and of bytes sent. thrown: bytes that nobody took.
     """
 
     def __init__(
-        self, wire: Wire, source: FrameSource, clock: Clock, path: Path, *, paced: bool = True, collect_ns: int = 0
+        self,
+        wire: Wire,
+        source: FrameSource,
+        clock: Clock,
+        path: Path,
+        *,
+        paced: bool = True,
+        collect_ns: int = 0,
     ) -> None:
         self.wire, self.path = wire, path
         self.mangle: Callable[[bytes], bytes] = lambda data: data
@@ -113,7 +126,11 @@ class Player:
             return
         self._obey()
         if self._period_ns != self.wire.period_ns:
-            self._origin_ns, self._origin, self._period_ns = self._clock.now_ns(), self._next, self.wire.period_ns
+            self._origin_ns, self._origin, self._period_ns = (
+                self._clock.now_ns(),
+                self._next,
+                self.wire.period_ns,
+            )
         if self.paused or not self.wire.streaming:
             self._skip()
         elif self._paced:
@@ -146,7 +163,9 @@ class Player:
 
     def _send_due(self) -> None:
         now = self._clock.now_ns()
-        until = self._first_after(now // self._collect_ns * self._collect_ns if self._collect_ns else now)
+        until = self._first_after(
+            now // self._collect_ns * self._collect_ns if self._collect_ns else now
+        )
         if (late := until - self._next - MOST_AT_ONCE) > 0:
             self.wire.skip(late)
             self._next += late
@@ -176,7 +195,8 @@ class Player:
 
 
 DELIVERY_S = 0.1
-"""Longest wait for the kernel to pass on what one end of a terminal wrote; it does so in its own time."""
+"""Longest wait for the kernel to pass on what one end of a terminal wrote; it does so in its own
+time."""
 SPIN_S = 5e-4
 """Time for which that is awaited without sleeping."""
 PORT_BYTES = 4000
@@ -184,7 +204,8 @@ PORT_BYTES = 4000
 
 
 class PlayerClock:
-    """A clock whose waits play a skin: nothing is missed while the box sleeps, in real time as in simulated time.
+    """A clock whose waits play a skin: nothing is missed while the box sleeps, in real time as in
+    simulated time.
 
     player: the skin; set before the box runs.
     """
@@ -218,12 +239,17 @@ class PlayerClock:
 
 
 def _wait_for_bytes(fd: int, sent: int) -> bool:
-    """Whether something can be read from `fd`, once the kernel has delivered `sent` bytes; at once if there are none."""
+    """Whether something can be read from `fd`, once the kernel has delivered `sent` bytes; at once
+    if there are none."""
     if not sent:
         return wait_readable(fd, 0)
     begin = time.monotonic()
-    while (waited := time.monotonic() - begin) < DELIVERY_S and (held := _held(fd)) < min(sent, PORT_BYTES):
-        if waited > SPIN_S:  # it usually takes some 10 us; who sleeps on a busy machine is woken much later
+    while (waited := time.monotonic() - begin) < DELIVERY_S and (held := _held(fd)) < min(
+        sent, PORT_BYTES
+    ):
+        if (
+            waited > SPIN_S
+        ):  # it usually takes some 10 us; who sleeps on a busy machine is woken much later
             time.sleep(1e-4) if held else wait_readable(fd, DELIVERY_S)
     return wait_readable(fd, 0)
 

@@ -1,8 +1,9 @@
-"""Simulated sweeps as another skin sees them. In: the simulated finger, a skin's form and scale. Out: raw counts.
+"""Simulated sweeps as another skin sees them. In: the simulated finger, a skin's form and scale.
+Out: raw counts.
 
-The finger and the tubes are those of `sim.skin`, whose parameters were fitted to one skin. Scale and noise here are
-round numbers and fitted to nothing: such sweeps show that a skin's way through the box works, and say nothing of how
-well that skin tells materials.
+The finger and the tubes are those of `sim.skin`, whose parameters were fitted to one skin. Scale
+and noise here are round numbers and fitted to nothing: such sweeps show that a skin's way through
+the box works, and say nothing of how well that skin tells materials.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from appliance.sim import skin
 from appliance.sim.skin import Array, Placement, World
 
 SPAN_MM = 12.0
-"""From the first taxel to the last, along and across: as far as the simulated skin reaches on the finger."""
+"""From the first taxel to the last, along and across: as far as the simulated skin reaches on the
+finger."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Units of a skin. rest: raw count of an unloaded taxel. gain: raw counts for one count of the simulated skin.
+    """Units of a skin. rest: raw count of an unloaded taxel. gain: raw counts for one count of the
+    simulated skin.
 
     noise: of each value, rms in raw counts. least, most: limits of the converter.
     """
@@ -62,12 +65,20 @@ class SkinView:
         return replace(world, rows=f.rows, cols=f.cols, pitch_mm=pitch, shear=f.axes == 3)
 
     def sweep(
-        self, material: str, placement: Placement, rng: Generator, world: World, *,
-        rest_s: float, slide_s: float, after_s: float,
-    ) -> NDArray[Any]:  # fmt: skip
+        self,
+        material: str,
+        placement: Placement,
+        rng: Generator,
+        world: World,
+        *,
+        rest_s: float,
+        slide_s: float,
+        after_s: float,
+    ) -> NDArray[Any]:
         """As `skin.sweep`: raw counts [n, R, C] or [n, R, C, A] at this skin's rate.
 
-        A slow skin does not filter before it samples, so what is faster than half its rate is folded, as with real ones.
+        A slow skin does not filter before it samples, so what is faster than half its rate is
+        folded, as with real ones.
         """
         world = self.world(world)
         slid, moving = skin.slide(rest_s, slide_s, after_s)
@@ -104,5 +115,7 @@ def view(name: str, fmt: SweepFormat) -> SkinView:
     Raises FormatError for two axes or more than three.
     """
     if fmt.axes not in (1, 3):
-        raise FormatError(f"the simulated finger is felt with 1 or 3 axes, not {fmt.axes}; use another profile")
+        raise FormatError(
+            f"the simulated finger is felt with 1 or 3 axes, not {fmt.axes}; use another profile"
+        )
     return SkinView(fmt, SCALES.get(name, Scale()))

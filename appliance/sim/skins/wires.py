@@ -1,7 +1,8 @@
-"""What skins that people own send, byte by byte. In: frames of raw counts, commands from the box. Out: bytes.
+"""What skins that people own send, byte by byte. In: frames of raw counts, commands from the box.
+Out: bytes.
 
-Each class is the skin's side of one line. Sources: the readers and firmware that makers and users have published, named
-at each class. None of the skins was at hand.
+Each class is the skin's side of one line. Sources: the readers and firmware that makers and users
+have published, named at each class. None of the skins was at hand.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ Taxels = NDArray[Any]
 
 
 class Wire(Protocol):
-    """The skin's side of its line. period_ns: time between two frames. streaming: whether it sends frames."""
+    """The skin's side of its line. period_ns: time between two frames. streaming: whether it sends
+    frames."""
 
     period_ns: float
 
@@ -67,7 +69,9 @@ class Marked(_Deaf):
     Source: flexitac 0.3.1, firmware/template.ino (AA 55, R x C uint8).
     """
 
-    def __init__(self, rate_hz: float, marker: bytes = b"\xaa\x55", dtype: str = "u1", trailer: bytes = b"") -> None:
+    def __init__(
+        self, rate_hz: float, marker: bytes = b"\xaa\x55", dtype: str = "u1", trailer: bytes = b""
+    ) -> None:
         super().__init__(rate_hz)
         self._marker, self._dtype, self._trailer = marker, dtype, trailer
 
@@ -96,18 +100,24 @@ class Magnetic(_Deaf):
 class MagneticText(Magnetic):
     """ReSkin: the same numbers as a line of decimal text with two digits after the point.
 
-    Source: anyskin 1.0.0, sensor.py, without `burst_mode`; Arduino's Serial.print(float) gives two digits.
+    Source: anyskin 1.0.0, sensor.py, without `burst_mode`; Arduino's Serial.print(float) gives two
+    digits.
     """
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
         """One line of text."""
-        return "\t".join(f"{value:.2f}" for value in self._with_temperature(taxels).ravel()).encode() + b"\r\n"
+        return (
+            "\t".join(f"{value:.2f}" for value in self._with_temperature(taxels).ravel()).encode()
+            + b"\r\n"
+        )
 
 
 class Rows(_Deaf):
-    """A line of text for each row, and an empty one after the last: 3D-ViTac, and matrices of sketches for Arduino.
+    """A line of text for each row, and an empty one after the last: 3D-ViTac, and matrices of
+    sketches for Arduino.
 
-    Source: the firmware notes of 3D-ViTac's 16 x 16 matrix (numbers separated by blanks, 16 rows and a blank line).
+    Source: the firmware notes of 3D-ViTac's 16 x 16 matrix (numbers separated by blanks, 16 rows
+    and a blank line).
     """
 
     def __init__(self, rate_hz: float, separator: str = " ") -> None:
@@ -121,10 +131,11 @@ class Rows(_Deaf):
 
 
 class PapillArray:
-    """Contactile's PapillArray controller (PTS 2.0). Frames [3 S, 3, 3]: S sensors of 3 x 3 pillars with Fx, Fy, Fz in N.
+    """Contactile's PapillArray controller (PTS 2.0). Frames [3 S, 3, 3]: S sensors of 3 x 3 pillars
+    with Fx, Fy, Fz in N.
 
-    Source: published recordings of a controller's first bytes and readers written by users. Offsets count from the byte
-    that holds their size; the controller pads its table with two zero bytes.
+    Source: published recordings of a controller's first bytes and readers written by users. Offsets
+    count from the byte that holds their size; the controller pads its table with two zero bytes.
     """
 
     START, END = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
@@ -140,7 +151,8 @@ class PapillArray:
         self._tare_left = 0
 
     def hear(self, data: bytes) -> bytes:
-        """`f1000\\n` sets the rate, `z\\n` takes the mean of the next two seconds as zero; other lines do nothing."""
+        """`f1000\\n` sets the rate, `z\\n` takes the mean of the next two seconds as zero; other
+        lines do nothing."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             if line == b"z":
@@ -185,18 +197,27 @@ class PapillArray:
         sums = force.sum(axis=1)
         if kind in (4, 6):
             items = [
-                struct.pack("<H6f", 2, *f, *(0.01 * f)) if kind == 4 else struct.pack("<HB2f", 1, 0, 0.5, 1.0)
+                struct.pack("<H6f", 2, *f, *(0.01 * f))
+                if kind == 4
+                else struct.pack("<HB2f", 1, 0, 0.5, 1.0)
                 for f in sums
             ]
             return _listed(items, at)
         inner = [
-            [struct.pack("<H6f", 2, *f, *(0.1 * f)) if kind == 3 else struct.pack("<Hbf", 1, 0, 0.5) for f in pillars]
+            [
+                struct.pack("<H6f", 2, *f, *(0.1 * f))
+                if kind == 3
+                else struct.pack("<Hbf", 1, 0, 0.5)
+                for f in pillars
+            ]
             for pillars in force
         ]
         sizes = [2 + 2 * len(items) + sum(map(len, items)) for items in inner]
         begins = at + 2 + 2 * len(inner) + np.cumsum([0, *sizes[:-1]])
         head = struct.pack(f"<H{len(inner)}H", len(inner), *begins)
-        return head + b"".join(_listed(items, int(begin)) for items, begin in zip(inner, begins, strict=True))
+        return head + b"".join(
+            _listed(items, int(begin)) for items, begin in zip(inner, begins, strict=True)
+        )
 
 
 def _listed(items: Sequence[bytes], at: int) -> bytes:
@@ -206,11 +227,13 @@ def _listed(items: Sequence[bytes], at: int) -> bytes:
 
 
 class Slcan(_Uncounted):
-    """XELA's uSkin on CAN, behind a USB adapter that speaks slcan. Frames [R, C, 3] uint16: X, Y, Z.
+    """XELA's uSkin on CAN, behind a USB adapter that speaks slcan. Frames [R, C, 3] uint16: X, Y,
+    Z.
 
-    Sources: Lawicel's slcan as github.com/mac-can/SLCAN describes it (commands end with CR, answers are CR or BEL, `z` CR
-    to a transmission); the start command 07 00 to id 0x200 + board, and replies of 0x710 + taxel with big-endian numbers
-    in bytes 1 to 6, from users' readers over socketcan.
+    Sources: Lawicel's slcan as github.com/mac-can/SLCAN describes it (commands end with CR, answers
+    are CR or BEL, `z` CR to a transmission); the start command 07 00 to id 0x200 + board, and
+    replies of 0x710 + taxel with big-endian numbers in bytes 1 to 6, from users' readers over
+    socketcan.
     """
 
     OK, ERROR = b"\r", b"\a"
@@ -238,7 +261,17 @@ class Slcan(_Uncounted):
         match line[:1]:
             case b"":
                 return self.OK
-            case b"S" if not self._open and line[1:] in (b"0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"8"):
+            case b"S" if not self._open and line[1:] in (
+                b"0",
+                b"1",
+                b"2",
+                b"3",
+                b"4",
+                b"5",
+                b"6",
+                b"7",
+                b"8",
+            ):
                 self._speed = line
             case b"O" if line == b"O" and not self._open and self._speed:
                 self._open = True
@@ -254,19 +287,24 @@ class Slcan(_Uncounted):
         return self.OK
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """One CAN message for each taxel. invalid: taxels that have no value now; their X begins with FA."""
+        """One CAN message for each taxel. invalid: taxels that have no value now; their X begins
+        with FA."""
         words = taxels.reshape(-1, 3).astype(">u2").copy()
         if self.invalid:
             words[list(self.invalid), 0] |= 0xFA00
         messages = (b"\0" + row.tobytes() + b"\0" for row in words)
-        return b"".join(b"t%03X8%b\r" % (self.FIRST_ID + i, m.hex().upper().encode()) for i, m in enumerate(messages))
+        return b"".join(
+            b"t%03X8%b\r" % (self.FIRST_ID + i, m.hex().upper().encode())
+            for i, m in enumerate(messages)
+        )
 
 
 class Robotiq(_Uncounted):
     """Robotiq's TSF-85 fingertips. Frames [7 F, 4] uint16: F fingers of 7 x 4 taxels.
 
-    Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it: 9A, a byte that is no
-    checksum yet, command, length, data; fields begin with type << 4 | finger << 2; numbers are big-endian.
+    Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it:
+    9A, a byte that is no checksum yet, command, length, data; fields begin with type << 4 | finger
+    << 2; numbers are big-endian.
     """
 
     READ, AUTOSEND, AUTOSEND_ASYNC, VERSION = 0x61, 0x58, 0x59, 0xE3
@@ -288,7 +326,10 @@ class Robotiq(_Uncounted):
             self._rest[at + 3 : at + 4] or b"\xff"
         )[0]:
             command, length = self._rest[at + 2], self._rest[at + 3]
-            content, self._rest = self._rest[at + 4 : at + 4 + length], self._rest[at + 4 + length :]
+            content, self._rest = (
+                self._rest[at + 4 : at + 4 + length],
+                self._rest[at + 4 + length :],
+            )
             if command in (self.AUTOSEND, self.AUTOSEND_ASYNC) and length == 1:
                 self.streaming = content[0] > 0
                 self.period_ns = content[0] * 1e6 or self.period_ns
@@ -299,13 +340,17 @@ class Robotiq(_Uncounted):
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
         """All fields of all fingers in one packet."""
         fingers = taxels.reshape(-1, 28).astype(np.int64)
-        change = np.zeros(len(fingers)) if self._last is None else (fingers - self._last).mean(axis=1)
+        change = (
+            np.zeros(len(fingers)) if self._last is None else (fingers - self._last).mean(axis=1)
+        )
         self._last = fingers
         data = b""
         for i, (static, dynamic) in enumerate(zip(fingers, change, strict=True)):
             finger = i << 2
             data += bytes([self.STATIC | finger]) + static.astype(">u2").tobytes()
-            data += struct.pack(">Bh", self.DYNAMIC | finger, int(np.clip(round(dynamic), -32768, 32767)))
+            data += struct.pack(
+                ">Bh", self.DYNAMIC | finger, int(np.clip(round(dynamic), -32768, 32767))
+            )
             data += struct.pack(">B3h", self.ACCELEROMETER | finger, *self.UPRIGHT)
             data += struct.pack(">BQ", self.TIMESTAMP | finger, t_us)
         return self._packet(self.AUTOSEND, data)
@@ -316,9 +361,15 @@ class Robotiq(_Uncounted):
 
 
 WIRES: Mapping[str, Callable[[float], Wire]] = {
-    "flexitac": Marked, "matrix": Marked, "anyskin": Magnetic, "reskin": MagneticText, "3d-vitac": Rows,
-    "papillarray": PapillArray, "xela-can": Slcan, "robotiq-tsf": Robotiq,
-}  # fmt: skip
+    "flexitac": Marked,
+    "matrix": Marked,
+    "anyskin": Magnetic,
+    "reskin": MagneticText,
+    "3d-vitac": Rows,
+    "papillarray": PapillArray,
+    "xela-can": Slcan,
+    "robotiq-tsf": Robotiq,
+}
 """The line of each skin, by the name of its profile, for a rate in frames per second."""
 
 

@@ -43,13 +43,22 @@ def model(default_bundle: Bundle) -> Bundle:
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
 
 
-def views_of(simulated: devices.SimDevices, model: Bundle | Expected) -> Callable[[float], list[View]]:
-    """A function that reads the skin of `simulated` for some seconds and returns the Views of this time."""
+def views_of(
+    simulated: devices.SimDevices, model: Bundle | Expected
+) -> Callable[[float], list[View]]:
+    """A function that reads the skin of `simulated` for some seconds and returns the Views of this
+    time."""
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
-    alignment = Alignment(settings, model if isinstance(model, Expected) else Expected.by(model), simulated)
+    alignment = Alignment(
+        settings, model if isinstance(model, Expected) else Expected.by(model), simulated
+    )
 
     def views(seconds: float) -> list[View]:
-        seen, end_ns, next_ns = [], simulated.clock.now_ns() + round(seconds * SECOND), simulated.clock.now_ns()
+        seen, end_ns, next_ns = (
+            [],
+            simulated.clock.now_ns() + round(seconds * SECOND),
+            simulated.clock.now_ns(),
+        )
         while simulated.clock.now_ns() < end_ns:
             alignment.read()
             if simulated.clock.now_ns() >= next_ns:
@@ -62,7 +71,9 @@ def views_of(simulated: devices.SimDevices, model: Bundle | Expected) -> Callabl
 
 def resting(seed: int = 1) -> devices.SimDevices:
     """The simulated finger that rests on the tube while a person aligns the skin."""
-    return devices.build(skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim")
+    return devices.build(
+        skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim"
+    )
 
 
 def states(views: list[View]) -> list[str]:
@@ -71,7 +82,8 @@ def states(views: list[View]) -> list[str]:
 
 
 def test_views_follow_the_touches(model: Bundle):
-    """Finger off, then four touches, each nearer: the message follows, up to the last one, which is in place."""
+    """Finger off, then four touches, each nearer: the message follows, up to the last one, which is
+    in place."""
     views = views_of(resting(), model)
     seen = views(17)
     assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
@@ -105,16 +117,20 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
 
 
 def test_a_skin_that_is_never_near_zero(model: Bundle):
-    """What the bundle knows of the unloaded skin is no load: the finger is told from it, and the hint counts above it."""
+    """What the bundle knows of the unloaded skin is no load: the finger is told from it, and the
+    hint counts above it."""
     rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
     seen = views_of(pressed(130, 145, 52, 130), rest)(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
-    assert "80 raw counts above the unloaded skin" in next(v for v in seen if v.state == "lift").hint
+    assert (
+        "80 raw counts above the unloaded skin" in next(v for v in seen if v.state == "lift").hint
+    )
     assert states(views_of(pressed(130, 145, 52, 130), model)(4)) == ["wait", "lift"]
 
 
 def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
-    """What is a contact comes from the unloaded skin of this moment, as without a bundle; no position is compared."""
+    """What is a contact comes from the unloaded skin of this moment, as without a bundle; no
+    position is compared."""
     m = model.manifest
     limits = replace(m.thresholds, contact=None)
     without = replace(model, manifest=replace(m, place=None, moved=None, thresholds=limits))
@@ -126,7 +142,8 @@ def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
 
 
 def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
-    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is measured anew."""
+    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is
+    measured anew."""
     simulated = resting()
     views = views_of(simulated, model)
     views(2)
@@ -142,7 +159,9 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
 
 def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
     """The View says that there are none, and what to do; the centre is in taxels."""
-    without = replace(default_bundle, manifest=replace(default_bundle.manifest, place=None, moved=None))
+    without = replace(
+        default_bundle, manifest=replace(default_bundle.manifest, place=None, moved=None)
+    )
     views = views_of(resting(), without)
     last = [v for v in views(14.5) if v.centre][-1]
     assert last.state == "no-positions"
@@ -152,16 +171,22 @@ def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
 
 
 def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
-    """A skin that no bundle is for: load and centre, in taxels; what is a contact comes from the unloaded skin."""
+    """A skin that no bundle is for: load and centre, in taxels; what is a contact comes from the
+    unloaded skin."""
     seen = views_of(resting(), Expected(model.format))(14.5)
-    assert [state for state in states(seen) if state != "wait"][:2] == ["no-contact", "no-positions"]
+    assert [state for state in states(seen) if state != "wait"][:2] == [
+        "no-contact",
+        "no-positions",
+    ]
     last = [v for v in seen if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
     assert (last.bundle, last.place, last.unit) == ("none for this skin", None, "taxels")
     assert "no bundle fits this skin" in last.hint
 
 
-@pytest.mark.parametrize(("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")])
+@pytest.mark.parametrize(
+    ("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")]
+)
 def test_a_view_says_what_it_is_of(source: str, word: str):
     """A replayed set is not called simulated; a real skin is not called anything."""
     shown = Canvas(replace(VIEW, source=source), ASCII, 80, 24, "").lines(False)[0]
@@ -172,13 +197,25 @@ def test_a_view_says_what_it_is_of(source: str, word: str):
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
 def test_align_with_what_is_simulated(
-    which: str, want: str, tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str],
+    which: str,
+    want: str,
+    tmp_path: Path,
+    default_bundle: Bundle,
+    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-):  # fmt: skip
+):
     """`align --sim skin` and `--sim replay:SET` find a contact, and say what they are."""
-    np.savez(tmp_path / "s.npz", samples=default_bundle.golden, labels=[0, 1], materials=["a", "b"], rate_hz=750.0)
+    np.savez(
+        tmp_path / "s.npz",
+        samples=default_bundle.golden,
+        labels=[0, 1],
+        materials=["a", "b"],
+        rate_hz=750.0,
+    )
     turns = iter(range(1200))
-    monkeypatch.setattr("appliance.cli.commands.stop_flag", lambda: lambda: next(turns, None) is None)
+    monkeypatch.setattr(
+        "appliance.cli.commands.stop_flag", lambda: lambda: next(turns, None) is None
+    )
     name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
     assert main(["align", "--sim", name, "--virtual"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -191,7 +228,11 @@ def test_another_skin_shape(model: Bundle):
     fmt = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
         model,
-        manifest=replace(model.manifest, format=fmt, place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0))),
+        manifest=replace(
+            model.manifest,
+            format=fmt,
+            place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0)),
+        ),
     )
     load = np.zeros((3000, 2, 3), np.float32)
     load[1000:, :, 1:] = 60.0
@@ -205,7 +246,8 @@ def test_another_skin_shape(model: Bundle):
 
 
 def test_only_the_normal_axis_is_looked_at(model: Bundle):
-    """A finger on the simulated skin with shear is found where it is; shear, which goes below zero, is not shown."""
+    """A finger on the simulated skin with shear is found where it is; shear, which goes below zero,
+    is not shown."""
     world = skin.World(shear=True)
     other = replace(model, manifest=replace(model.manifest, format=world.format))
     script_of = script.named("rest", world.format, 1)[0]
@@ -216,8 +258,21 @@ def test_only_the_normal_axis_is_looked_at(model: Bundle):
     assert last.centre == pytest.approx((6, 6), abs=0.6)
 
 
-VIEW = View(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move it", (4, 4),
-            tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)), 80.0, (3.8, 6.0), (6.0, 6.0), MIDDLE)  # fmt: skip
+VIEW = View(
+    7,
+    "sim",
+    "default 3, 9f3c2a1b",
+    "streaming",
+    "off",
+    "2.2 mm too far towards row 1",
+    "move it",
+    (4, 4),
+    tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)),
+    80.0,
+    (3.8, 6.0),
+    (6.0, 6.0),
+    MIDDLE,
+)
 
 
 def test_a_pipe_gets_one_plain_line_a_second():
@@ -230,13 +285,17 @@ def test_a_pipe_gets_one_plain_line_a_second():
             screen.show(VIEW)
     first, *lines = out.getvalue().splitlines()
     assert first == "page: http://127.0.0.1:8137"
-    assert lines == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
+    assert (
+        lines
+        == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
+    )
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
 @pytest.mark.parametrize("signs", [BLOCKS, ASCII])
 def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
-    """It has no more and no longer lines than fit; at 80 x 24 all numbers, both points, texts and the key are there."""
+    """It has no more and no longer lines than fit; at 80 x 24 all numbers, both points, texts and
+    the key are there."""
     lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
     plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
     assert len(lines) == height
@@ -253,9 +312,12 @@ def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
         "Ctrl-C ends",
         "http://127.0.0.1:8137",
     ]
-    assert all(word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)])
+    assert all(
+        word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)]
+    )
     row_1, row_4 = (
-        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│")) for n in (1, 4)
+        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│"))
+        for n in (1, 4)
     )
     assert signs[0] * 4 in row_1.replace(" ", signs[0])
     assert signs[3] in row_4
@@ -269,7 +331,9 @@ def test_a_place_beside_the_skin_is_shown_at_its_edge():
     far = replace(VIEW, place=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
     lines = Canvas(far, ASCII, 80, 24, "").lines(False)
     assert [
-        line.index("+") for plain in lines if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
+        line.index("+")
+        for plain in lines
+        if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
     ] == [24, 8]
 
 
@@ -282,7 +346,8 @@ def test_only_a_terminal_that_knows_colours_gets_them():
 
 
 def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """There is a View every VIEW_NS, not one for each frame; `stopped` ends it and the skin is released."""
+    """There is a View every VIEW_NS, not one for each frame; `stopped` ends it and the skin is
+    released."""
     simulated, out = resting(), io.StringIO()
     end_ns = simulated.clock.now_ns() + 5 * SECOND
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
@@ -331,10 +396,22 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
-def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(folder: Path, terminal: tuple[int, int], kind: str):
-    """The command in a terminal: exit code 0; the alternate screen is left at the end; a dumb terminal gets none."""
+def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(
+    folder: Path, terminal: tuple[int, int], kind: str
+):
+    """The command in a terminal: exit code 0; the alternate screen is left at the end; a dumb
+    terminal gets none."""
     far, near = terminal
-    command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--set", f"classifier.bundle={folder}"]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "align",
+        "--sim",
+        "rest",
+        "--set",
+        f"classifier.bundle={folder}",
+    ]
     with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
         os.close(near)
         shown = terminals.read(far, run, lambda shown: b"SIMULATED" in shown)

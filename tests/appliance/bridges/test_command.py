@@ -25,20 +25,26 @@ def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Na
 
 
 def test_the_settings_of_a_new_box():
-    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a line, and says which to set."""
+    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a line, and
+    says which to set."""
     args = settled("modbus")
     assert (args.feed, args.link, args.listen, args.allow_writes) == (
-        "/run/palpate/feed.sock", None, "127.0.0.1:1502", False,
-    )  # fmt: skip
+        "/run/palpate/feed.sock",
+        None,
+        "127.0.0.1:1502",
+        False,
+    )
     with pytest.raises(
-        ConfigError, match=r'serial\.port = "" is no line .* set serial\.port = "/run/palpate-tcp/line"'
+        ConfigError,
+        match=r'serial\.port = "" is no line .* set serial\.port = "/run/palpate-tcp/line"',
     ):
         settled("tcp")
 
 
 @pytest.mark.parametrize("kind", LINKS)
 def test_the_line_of_the_bridge(kind: str):
-    """serial.port names its link: it makes that one, at the address of the settings, and passes commands on if they may be."""
+    """serial.port names its link: it makes that one, at the address of the settings, and passes
+    commands on if they may be."""
     sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
     args = settled(kind, sets=sets)
     assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)
@@ -48,15 +54,30 @@ def test_the_line_of_the_bridge(kind: str):
 def test_options_hold():
     """A line, an address, or a feed by option: the settings do not change them."""
     sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
-    args = settled("tcp", "--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes", sets=sets)
-    assert (args.port, args.link, args.listen, args.allow_writes) == ("/dev/ttyUSB0", None, "[::1]:7", True)
+    args = settled(
+        "tcp", "--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes", sets=sets
+    )
+    assert (args.port, args.link, args.listen, args.allow_writes) == (
+        "/dev/ttyUSB0",
+        None,
+        "[::1]:7",
+        True,
+    )
     assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
 
 
 @pytest.mark.parametrize(
-    "sets", [("bridge.allow_writes=true",), ("feed.socket=",), ("serial.port=/dev/ttyAMA0", "feed.socket=")]
+    "sets",
+    [
+        ("bridge.allow_writes=true",),
+        ("feed.socket=",),
+        ("serial.port=/dev/ttyAMA0", "feed.socket="),
+    ],
 )
 def test_no_way_to_the_box(sets: tuple[str, ...]):
     """Commands without a line, or neither line nor feed: refused, with what to set."""
-    with pytest.raises(ConfigError, match=r'feed cannot be written to; set serial\.port = "/run/palpate-modbus/line"'):
+    with pytest.raises(
+        ConfigError,
+        match=r'feed cannot be written to; set serial\.port = "/run/palpate-modbus/line"',
+    ):
         settled("modbus", sets=sets)

@@ -1,4 +1,5 @@
-"""The Modbus bridge as a process, seen by pymodbus's client and by bytes put together by hand; and its map by itself."""
+"""The Modbus bridge as a process, seen by pymodbus's client and by bytes put together by hand; and
+its map by itself."""
 
 from __future__ import annotations
 
@@ -18,7 +19,15 @@ from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
 from appliance.bridges import modbus, modbus_pdu
-from appliance.bridges.modbus import ADDRESSES, COILS, INPUTS, STALE, STATUS_CODES, inputs, registers
+from appliance.bridges.modbus import (
+    ADDRESSES,
+    COILS,
+    INPUTS,
+    STALE,
+    STATUS_CODES,
+    inputs,
+    registers,
+)
 from appliance.bridges.options import MOST
 from appliance.bridges.source import BoxView, noted
 from appliance.cli.main import main
@@ -57,9 +66,12 @@ def word(client: RawModbus, name: str) -> int:
 
 
 def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address: Address):
-    """pymodbus, which knows nothing of us, finds the answer in input and in holding registers, and the inputs."""
+    """pymodbus, which knows nothing of us, finds the answer in input and in holding registers, and
+    the inputs."""
     box.say(result(70_000, label="paper"), state(answered=7))
-    eventually(lambda: word(raw, "answered") == 0 and raw.registers(ADDRESSES["answered"], 2) == [0, 7])
+    eventually(
+        lambda: word(raw, "answered") == 0 and raw.registers(ADDRESSES["answered"], 2) == [0, 7]
+    )
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
         for read_words in (client.read_input_registers, client.read_holding_registers):
             found = read_words(0, count=ADDRESSES["label"] + modbus.LABEL_WORDS)
@@ -67,19 +79,36 @@ def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address:
             words = found.registers
             got = {name: words[at] for name, at in ADDRESSES.items()}
             assert got["map version"] == 1
-            assert (got["state of the skin"], got["answers"], got["status"]) == (1, 1, STATUS_CODES[Status.OK])
-            assert (got["label code"], got["probability"], got["margin"], got["latency"]) == (2, 900, 800, 125)
+            assert (got["state of the skin"], got["answers"], got["status"]) == (
+                1,
+                1,
+                STATUS_CODES[Status.OK],
+            )
+            assert (got["label code"], got["probability"], got["margin"], got["latency"]) == (
+                2,
+                900,
+                800,
+                125,
+            )
             assert words[ADDRESSES["sweep"] :][:2] == [1, 70_000 - 65_536]
-            text = client.convert_from_registers(words[ADDRESSES["label"] :], client.DATATYPE.STRING)
+            text = client.convert_from_registers(
+                words[ADDRESSES["label"] :], client.DATATYPE.STRING
+            )
             assert text.rstrip("\0") == "paper"
         bits = client.read_discrete_inputs(0, count=len(INPUTS)).bits
         assert dict(zip(INPUTS, bits, strict=False)) == {
-            "alive": True, "ready": True, "sweeping": False, "fault": False, "known": True, "early": False,
-        }  # fmt: skip
+            "alive": True,
+            "ready": True,
+            "sweeping": False,
+            "fault": False,
+            "known": True,
+            "early": False,
+        }
 
 
 def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Address):
-    """pymodbus pulses NEW, START and STOP: the box hears them once each, in order, and the answer's number rises."""
+    """pymodbus pulses NEW, START and STOP: the box hears them once each, in order, and the answer's
+    number rises."""
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
         for coil in (NEW, START, STOP):
             assert not client.write_coil(coil, True).isError()
@@ -91,7 +120,8 @@ def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Addres
 
 
 def test_bytes_by_hand(raw: RawModbus):
-    """Requests and replies as the specification prints them: transaction, unit, lengths, exception codes."""
+    """Requests and replies as the specification prints them: transaction, unit, lengths, exception
+    codes."""
     raw.send(bytes.fromhex("0400000001"), transaction=0x1234, unit=7)
     assert raw.receive().hex() == "123400000005" + "07" + "0402" + "0001"
     for pdu, code in (
@@ -125,11 +155,14 @@ def test_a_request_in_pieces_and_several_in_one(raw: RawModbus):
         raw.socket.sendall(bytes([byte]))
     assert raw.receive()[:2] == b"\0\x09"
     raw.socket.sendall(one * 3)
-    assert [raw.receive() for _ in range(3)] == [one[:4] + b"\0\x05\x01" + bytes.fromhex("04020001")] * 3
+    assert [raw.receive() for _ in range(3)] == [
+        one[:4] + b"\0\x05\x01" + bytes.fromhex("04020001")
+    ] * 3
 
 
 def test_nothing_is_written_without_leave(box: SpeakingBox):
-    """Without --allow-writes each write is an illegal function, and the box hears nothing; reading works."""
+    """Without --allow-writes each write is an illegal function, and the box hears nothing; reading
+    works."""
     with bridge("modbus", "--port", box.path) as address, RawModbus(address) as client:
         for pdu in ("050000ff00", "0f0000000501ff"):
             assert client.ask(bytes.fromhex(pdu)) == bytes([int(pdu[:2], 16) | 0x80, 1])
@@ -147,7 +180,8 @@ def test_a_command_that_the_box_refuses(box: SpeakingBox, raw: RawModbus):
 
 
 def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Address):
-    """While the box carries out one of them another peer is told that it is busy, and reading goes on."""
+    """While the box carries out one of them another peer is told that it is busy, and reading goes
+    on."""
     box.script = lambda s: [] if s.kind == "TARE" else obeying(s)
     raw.send(bytes.fromhex("050003ff00"))
     box.wait_for("TARE")
@@ -158,13 +192,18 @@ def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Addres
 
 
 def test_a_silent_box_is_stale_and_comes_back(box: SpeakingBox, raw: RawModbus):
-    """Unplugged: status 99, state 0, FAULT, and the heartbeat stands still; plugged in again it goes on."""
+    """Unplugged: status 99, state 0, FAULT, and the heartbeat stands still; plugged in again it
+    goes on."""
     box.say(result(1))
     eventually(lambda: word(raw, "status") == 1)
     box.unplug()
     eventually(lambda: word(raw, "status") == STALE)
     before = word(raw, "heartbeat")
-    assert (word(raw, "state of the skin"), word(raw, "label code"), word(raw, "answers")) == (0, 0, 1)
+    assert (word(raw, "state of the skin"), word(raw, "label code"), word(raw, "answers")) == (
+        0,
+        0,
+        1,
+    )
     assert raw.ask(bytes.fromhex("0200000006")) == bytes.fromhex("020108")
     assert raw.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
     box.plug_in()
@@ -181,7 +220,11 @@ def test_another_bundle_brings_its_labels(box: SpeakingBox, raw: RawModbus):
     """The box restarts with another bundle: its labels are asked for, codes follow them."""
 
     def other(heard: Sentence) -> list[bytes]:
-        return [sentence("ANS", "LABEL", "ok", 1, "cork", 1)] if heard.kind == "LABEL" else obeying(heard)
+        return (
+            [sentence("ANS", "LABEL", "ok", 1, "cork", 1)]
+            if heard.kind == "LABEL"
+            else obeying(heard)
+        )
 
     box.script = other
     box.say(state(bundle="00000001"), result(1, label="cork"))
@@ -196,8 +239,8 @@ def flood(peer: socket.socket) -> None:
 
 
 def test_hostile_bytes_reach_nobody_else(raw: RawModbus, address: Address):
-    """Noise, wrong headers, an endless stream without sense, a peer that stops in the middle and one that never reads:
-    each loses its own connection at most."""
+    """Noise, wrong headers, an endless stream without sense, a peer that stops in the middle and
+    one that never reads: each loses its own connection at most."""
     generator = random.Random(1)
     for data in [
         *(generator.randbytes(generator.randrange(1, 400)) for _ in range(100)),
@@ -237,7 +280,8 @@ def is_closed(peer: socket.socket) -> bool:
 
 
 def test_a_thousand_connections(raw: RawModbus, address: Address):
-    """No more than the limit are held, the others are closed at once, and who was there first is still served."""
+    """No more than the limit are held, the others are closed at once, and who was there first is
+    still served."""
     peers = []
     for _ in range(1000):
         peers.append(socket.create_connection(address, timeout=LONG_S))
@@ -250,32 +294,65 @@ def test_a_thousand_connections(raw: RawModbus, address: Address):
 
 
 HEALTH = {
-    "type": "health", "time_ns": 9_000_000_000, "skin": "streaming", "trouble": "", "streams": True, "ready": True,
-    "sweeping": False, "answered": 5, "frames": 70_000, "lost_frames": 2, "garbage_bytes": 0, "enumerations": 1,
-    "dropped": 0, "bundle": "b1", "source": "usb",
-}  # fmt: skip
+    "type": "health",
+    "time_ns": 9_000_000_000,
+    "skin": "streaming",
+    "trouble": "",
+    "streams": True,
+    "ready": True,
+    "sweeping": False,
+    "answered": 5,
+    "frames": 70_000,
+    "lost_frames": 2,
+    "garbage_bytes": 0,
+    "enumerations": 1,
+    "dropped": 0,
+    "bundle": "b1",
+    "source": "usb",
+}
 VERDICT = {
-    "type": "verdict", "sweep": 6, "time_ns": 9_500_000_000, "status": "unsure", "label": "paper", "probability": 0.6,
-    "margin": 0.3, "fused": 2, "lost": 1, "latency_ns": 1_250_000, "bundle": "b1", "share": 0.5, "detail": "",
-}  # fmt: skip
+    "type": "verdict",
+    "sweep": 6,
+    "time_ns": 9_500_000_000,
+    "status": "unsure",
+    "label": "paper",
+    "probability": 0.6,
+    "margin": 0.3,
+    "fused": 2,
+    "lost": 1,
+    "latency_ns": 1_250_000,
+    "bundle": "b1",
+    "share": 0.5,
+    "detail": "",
+}
 HELLO = {"type": "hello", "schema": 1, "labels": ["wood", "paper"], "bundle": "b1", "format": {}}
 
 
 def test_the_feed_in_place_of_the_line(tmp_path: Path):
-    """On the box, beside a robot that has the line: the same map; commands are refused; lines of a later form are
-    counted and do no harm."""
+    """On the box, beside a robot that has the line: the same map; commands are refused; lines of a
+    later form are counted and do no harm."""
     strange = {"type": "verdict", "status": "sideways"}
     lines = [HELLO, HEALTH, strange, VERDICT, {"type": "later"}, {"type": "lost", "lines": 4}]
     path = tmp_path / "feed.sock"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()
-        with bridge("modbus", "--feed", path, "--allow-writes") as address, RawModbus(address) as client:
+        with (
+            bridge("modbus", "--feed", path, "--allow-writes") as address,
+            RawModbus(address) as client,
+        ):
             connection, _ = listener.accept()
             connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
             eventually(lambda: word(client, "missed answers") == 4)
-            assert (word(client, "status"), word(client, "damaged sentences")) == (STATUS_CODES[Status.UNSURE], 1)
-            assert (word(client, "label code"), word(client, "likeliest label code"), word(client, "early")) == (
+            assert (word(client, "status"), word(client, "damaged sentences")) == (
+                STATUS_CODES[Status.UNSURE],
+                1,
+            )
+            assert (
+                word(client, "label code"),
+                word(client, "likeliest label code"),
+                word(client, "early"),
+            ) == (
                 0,
                 2,
                 1,
@@ -328,7 +405,8 @@ def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
 
 @pytest.mark.parametrize("status", list(Status))
 def test_each_status_has_its_code(status: Status):
-    """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone, the likeliest with any label."""
+    """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone, the likeliest
+    with any label."""
     label = "paper" if status.classified else ""
     words = registers(viewed(Answer(1, 1.0, status, label, 0.9, 0.8, 1, 0, 1e9)), alive=True)
     assert words[ADDRESSES["status"]] == [*Status].index(status) + 1
@@ -345,7 +423,8 @@ def test_before_anything_was_heard():
 
 
 def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):
-    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, other statuses their errors."""
+    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, other statuses their
+    errors."""
     names: dict[str, Any] = {}
     exec(page_blocks("modbus.md", "python")[0], names)
     numbers = itertools.count(1)
@@ -358,7 +437,13 @@ def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: 
     box.script = script
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as plc:
         assert names["classify"](plc, lambda: None, timeout_s=LONG_S) == 2
-        assert [s.kind for s in box.heard if s.kind in COILS] == ["NEW", "START", "STOP", "START", "STOP"]
+        assert [s.kind for s in box.heard if s.kind in COILS] == [
+            "NEW",
+            "START",
+            "STOP",
+            "START",
+            "STOP",
+        ]
         assert names["classify"](plc, lambda: None, timeout_s=LONG_S) == 0
         with pytest.raises(RuntimeError, match="status 10: the sweep or the skin was at fault"):
             names["classify"](plc, lambda: None, timeout_s=LONG_S)
@@ -370,13 +455,23 @@ def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: 
 def test_the_document_has_the_map():
     """docs/robots/modbus.md lists each register, input, coil and code as the code has them."""
     text = (ROOT / "docs" / "robots" / "modbus.md").read_text()
-    rows = re.findall(r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z ]+)` \|", text.partition("## Discrete inputs")[0], re.M)
-    assert [(int(at), name) for at, name in rows if name in ADDRESSES] == [(at, name) for name, at in ADDRESSES.items()]
+    rows = re.findall(
+        r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z ]+)` \|",
+        text.partition("## Discrete inputs")[0],
+        re.M,
+    )
+    assert [(int(at), name) for at, name in rows if name in ADDRESSES] == [
+        (at, name) for name, at in ADDRESSES.items()
+    ]
     assert re.findall(
-        r"^\| \d+ \| `([a-z]+)` \|", text.partition("Discrete inputs")[2].partition("Coils")[0], re.M
+        r"^\| \d+ \| `([a-z]+)` \|",
+        text.partition("Discrete inputs")[2].partition("Coils")[0],
+        re.M,
     ) == [*INPUTS]
     assert tuple(re.findall(r"^\| \d+ \| ([A-Z]+) \|", text.partition("Coils")[2], re.M)) == COILS
-    codes = dict(re.findall(r"(\d+) `([a-z-]+)`", text.partition("Status codes")[2].partition("\n\n")[0]))
+    codes = dict(
+        re.findall(r"(\d+) `([a-z-]+)`", text.partition("Status codes")[2].partition("\n\n")[0])
+    )
     assert codes == {str(code): str(status) for status, code in STATUS_CODES.items()}
 
 
@@ -386,7 +481,10 @@ def test_the_document_has_the_map():
         (["--port", "x", "--listen", "1502"], "not an address; use HOST:PORT"),
         (["--port", "x", "--listen", "127.0.0.1:99999"], "not an address"),
         (["--port", "x", "--listen", "203.0.113.1:1502"], "name an address of this machine"),
-        (["--link", "/nowhere/line"], "--link /nowhere/line: no such file or directory; name a path that is free"),
+        (
+            ["--link", "/nowhere/line"],
+            "--link /nowhere/line: no such file or directory; name a path that is free",
+        ),
         (["--link", "/proc/version"], "--link /proc/version: file exists"),
     ],
 )
@@ -396,7 +494,9 @@ def test_settings_that_cannot_be(options: list[str], why: str, capsys: pytest.Ca
     assert why in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("options", [["--port", "x", "--most", "0"], ["--port", "x", "--link", "y"]])
+@pytest.mark.parametrize(
+    "options", [["--port", "x", "--most", "0"], ["--port", "x", "--link", "y"]]
+)
 def test_wrong_arguments(options: list[str]):
     """No connections, two boxes: usage errors."""
     with pytest.raises(SystemExit) as e:

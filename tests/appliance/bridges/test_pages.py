@@ -1,4 +1,5 @@
-"""The programs of docs/robots, run straight out of the pages: Python, and URScript read as Python. Modbus: test_modbus."""
+"""The programs of docs/robots, run straight out of the pages: Python, and URScript read as Python.
+Modbus: test_modbus."""
 
 from __future__ import annotations
 
@@ -45,11 +46,14 @@ def sweeps(box: SpeakingBox) -> list[str]:
 
 
 def test_python(box: SpeakingBox):
-    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are sorted out, each fault is an error."""
+    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are sorted out,
+    each fault is an error."""
     names: dict[str, Any] = {}
     exec(page_blocks("python.md", "python")[0], names)
     with Palpate(str(box.path), timeout_s=LONG_S) as client:
-        box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", "unsure", *FAULTS)
+        box.script = answering(
+            "unsure", "ok", "undecided", "unknown", "unsure", "unsure", "unsure", *FAULTS
+        )
         assert names["classify"](client, lambda: None) == "wood"
         assert sweeps(box) == ["NEW", "START", "STOP", "START", "STOP"]
         assert [names["classify"](client, lambda: None) for _ in range(3)] == [None] * 3
@@ -120,13 +124,18 @@ class SocketOfUr:
 
 
 def urscript(block: str, **functions: Any) -> dict[str, Any]:
-    """A block of URScript as Python: `end` and `local` left out. functions: those of the controller."""
+    """A block of URScript as Python: `end` and `local` left out. functions: those of the
+    controller."""
     text = re.sub(r"(?m)^ *end\n", "", block).replace("local ", "")
     names: dict[str, Any] = {
-        "str_find": lambda text, what, start=0: text.find(what, start), "str_len": len,
-        "str_sub": lambda text, at, n: text[at : at + n], "str_cat": lambda a, b: a + b,
-        "textmsg": lambda *texts: None, "movel": lambda pose, a, v: None, **functions,
-    }  # fmt: skip
+        "str_find": lambda text, what, start=0: text.find(what, start),
+        "str_len": len,
+        "str_sub": lambda text, at, n: text[at : at + n],
+        "str_cat": lambda a, b: a + b,
+        "textmsg": lambda *texts: None,
+        "movel": lambda pose, a, v: None,
+        **functions,
+    }
     exec(text, names)
     return names
 
@@ -135,24 +144,31 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
     """The program with a socket."""
     ur = SocketOfUr(address)
     return urscript(
-        page_blocks("urscript.md", "urscript")[1], socket_open=ur.open, socket_read_string=ur.read,
-        socket_send_line=ur.send_line, socket_close=ur.close,
-    )  # fmt: skip
+        page_blocks("urscript.md", "urscript")[1],
+        socket_open=ur.open,
+        socket_read_string=ur.read,
+        socket_send_line=ur.send_line,
+        socket_close=ur.close,
+    )
 
 
 def test_urscript_by_socket(box: SpeakingBox):
-    """urscript.md against a real bridge: a retry without NEW, what is sorted out, each fault by its name."""
+    """urscript.md against a real bridge: a retry without NEW, what is sorted out, each fault by its
+    name."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
         box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)
         assert classify("from", "to", 3) == "wood"
         assert sweeps(box) == ["NEW", "START", "STOP", "START", "STOP"]
         assert [classify("from", "to", 2) for _ in range(3)] == [""] * 3
-        assert [classify("from", "to", 2) for _ in FAULTS] == [f"fault: {status}" for status in FAULTS]
+        assert [classify("from", "to", 2) for _ in FAULTS] == [
+            f"fault: {status}" for status in FAULTS
+        ]
 
 
 def test_urscript_by_socket_at_faults(box: SpeakingBox):
-    """A bridge that refuses commands, a box that does not answer, no bridge: one line for a person, and no hanging."""
+    """A bridge that refuses commands, a box that does not answer, no bridge: one line for a person,
+    and no hanging."""
     with bridge("tcp", "--port", box.path) as address:
         assert by_socket(address)["palpate_classify"]("from", "to", 2).startswith(
             "fault: the box does not answer, or refuses"
@@ -176,7 +192,8 @@ def test_urscript_by_socket_at_faults(box: SpeakingBox):
     ],
 )
 def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
-    """urscript.md with digital lines: READY is waited for, code 0 is swept again, FAULT and silence end it."""
+    """urscript.md with digital lines: READY is waited for, code 0 is swept again, FAULT and silence
+    end it."""
     inputs = {0: ready} | dict.fromkeys(range(1, 7), False)
     pulsed: list[int] = []
     left = iter(answers)
@@ -193,9 +210,11 @@ def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
             inputs.update({3 + bit: bool(code >> bit & 1) for bit in range(4)})
 
     program = urscript(
-        page_blocks("urscript.md", "urscript")[0], get_standard_digital_in=lambda n: inputs[n],
-        set_standard_digital_out=set_output, sleep=lambda seconds: None,
-    )  # fmt: skip
+        page_blocks("urscript.md", "urscript")[0],
+        get_standard_digital_in=lambda n: inputs[n],
+        set_standard_digital_out=set_output,
+        sleep=lambda seconds: None,
+    )
     assert program["palpate_classify"]("from", "to", 3) == want
     assert pulsed == [2, *[0, 1] * len(answers)]
 
@@ -206,11 +225,17 @@ def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
     ids=["services", "action"],
 )
 def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, float]):
-    """ros2.md: a node of a cell, in a process of its own, through the bridge, by services and by the action."""
+    """ros2.md: a node of a cell, in a process of its own, through the bridge, by services and by
+    the action."""
     ros.required()
     ros.messages_required()
     box.script = answering("unsure", "ok", "unknown", "stuck-taxel", "unsure", "unsure", "unsure")
-    command = [str(ros.PYTHON), str(ROOT / "tests" / "factories" / "ros_page.py"), program, json.dumps(settings)]
+    command = [
+        str(ros.PYTHON),
+        str(ROOT / "tests" / "factories" / "ros_page.py"),
+        program,
+        json.dumps(settings),
+    ]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with (
         ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"),
@@ -241,10 +266,13 @@ def test_every_page_is_linked_and_every_link_leads_somewhere():
 
 @pytest.mark.slow
 def test_the_manuals_client_without_hardware(tmp_path: Path):
-    """Its three commands, with another path and a free port: the program names the bundle and prints three answers."""
+    """Its three commands, with another path and a free port: the program names the bundle and
+    prints three answers."""
     text = (ROOT / "docs" / "manual.md").read_text().partition("### A client without hardware")[2]
     blocks = [
-        re.sub(r"(?m)^    ", "", block) for block in re.findall(r"(?:^    .*\n|^\n)+", text, re.M) if block.strip()
+        re.sub(r"(?m)^    ", "", block)
+        for block in re.findall(r"(?:^    .*\n|^\n)+", text, re.M)
+        if block.strip()
     ]
     commands, program = blocks[0].strip().splitlines(), blocks[1]
     line = str(tmp_path / "line")
@@ -262,9 +290,13 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
                 client.replace("as box:\n", "as box:\n    box.wait_ready(timeout_s=60)\n", 1)
             )
             done = subprocess.run(
-                [sys.executable, tmp_path / "client.py"], env={**os.environ, "PYTHONPATH": str(ROOT)},
-                capture_output=True, text=True, timeout=120, check=False,
-            )  # fmt: skip
+                [sys.executable, tmp_path / "client.py"],
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
         finally:
             run.terminate()
     told = done.stdout.splitlines()
@@ -276,12 +308,24 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
-    """The real program behind a bridge, ended without a word in the middle of a sweep: the client's wait ends, the restart is
-    told, and the same client sweeps on."""
+    """The real program behind a bridge, ended without a word in the middle of a sweep: the client's
+    wait ends, the restart is told, and the same client sweeps on."""
     command = [
-        sys.executable, "-m", "appliance", "run", "--sim", "skin", "--trigger", "serial", "--set", f"serial.port={tmp_path / 'line'}",
-        "--set", "feed.socket=", "--set", "store.status=",
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "appliance",
+        "run",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--set",
+        f"serial.port={tmp_path / 'line'}",
+        "--set",
+        "feed.socket=",
+        "--set",
+        "store.status=",
+    ]
     with (
         bridge("tcp", "--link", tmp_path / "line", "--allow-writes") as address,
         Palpate(f"socket://{address[0]}:{address[1]}", timeout_s=LONG_S) as client,

@@ -34,7 +34,10 @@ def _installed() -> None:
 @pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
     """A node that hears the box through the bridge; its parameters come from the page's file."""
-    with ros.peer() as peer, ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}", *WRITES):
+    with (
+        ros.peer() as peer,
+        ros.bridge("--params-file", str(PARAMETERS), "-p", f"port:={box.path}", *WRITES),
+    ):
         eventually(lambda: said(box, lambda: peer.on("state") != []))
         yield peer
 
@@ -54,24 +57,31 @@ def verdict(box: SpeakingBox, node: RosPeer, line: bytes) -> dict:
 
 
 def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
-    """OK with the label; WARN where it cannot be used; ERROR where nothing was learned; stamped, with its frame; early
-    answers say so."""
+    """OK with the label; WARN where it cannot be used; ERROR where nothing was learned; stamped,
+    with its frame; early answers say so."""
     eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
     heard = verdict(box, node, result(1, label="paper"))
     assert (heard["level"], heard["message"], heard["frame_id"]) == (OK, "paper", "fingertip")
-    assert (heard["values"]["code"], heard["values"]["probability"], heard["values"]["early"]) == ("2", "0.9", "false")
+    assert (heard["values"]["code"], heard["values"]["probability"], heard["values"]["early"]) == (
+        "2",
+        "0.9",
+        "false",
+    )
     assert heard["stamp"] > 0
     assert verdict(box, node, result(2, "unsure"))["level"] == WARN
     assert verdict(box, node, result(3, "unknown", ""))["level"] == WARN
     fault = verdict(box, node, result(4, "stuck-taxel", "", detail="taxel 2.3"))
     assert fault["level"] == ERROR
-    assert fault["message"] == "stuck-taxel: a loaded taxel does not move; look at the skin (taxel 2.3)"
+    assert (
+        fault["message"]
+        == "stuck-taxel: a loaded taxel does not move; look at the skin (taxel 2.3)"
+    )
     assert verdict(box, node, result(5, share="0.40"))["values"]["early"] == "true"
 
 
 def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
-    """Diagnostics: OK, WARN once where something was lost, ERROR without a skin, STALE without a box, and OK again; the
-    state follows."""
+    """Diagnostics: OK, WARN once where something was lost, ERROR without a skin, STALE without a
+    box, and OK again; the state follows."""
 
     def level() -> int:
         return node.last("diagnostics")["level"]
@@ -79,16 +89,27 @@ def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
     eventually(lambda: said(box, lambda: level() == OK))
     box.say(result(1), result(5), state(answered=5))
     eventually(
-        lambda: any(d["level"] == WARN and "3 answers did not arrive" in d["message"] for d in node.on("diagnostics"))
+        lambda: any(
+            d["level"] == WARN and "3 answers did not arrive" in d["message"]
+            for d in node.on("diagnostics")
+        )
     )
     eventually(
-        lambda: said(box, lambda: level() == ERROR and node.last("state")["level"] == ERROR, state("mismatch", 5))
+        lambda: said(
+            box,
+            lambda: level() == ERROR and node.last("state")["level"] == ERROR,
+            state("mismatch", 5),
+        )
     )
     box.unplug()
     eventually(lambda: level() == STALE and node.last("state")["level"] == STALE)
     assert not node.call("tare")["success"]
     box.plug_in()
-    eventually(lambda: said(box, lambda: level() == OK and node.last("state")["level"] == OK, state(answered=5)))
+    eventually(
+        lambda: said(
+            box, lambda: level() == OK and node.last("state")["level"] == OK, state(answered=5)
+        )
+    )
     assert verdict(box, node, result(6))["message"] == "wood"
 
 
@@ -97,14 +118,24 @@ def test_services(box: SpeakingBox, node: RosPeer):
     assert node.call("tare") == {"service": "tare", "success": True, "message": "16 taxels"}
     for name in ("new_object", "start", "stop", "abort"):
         assert node.call(name)["success"]
-    assert [s.kind for s in box.heard if s.kind != "LABEL"] == ["TARE", "NEW", "START", "STOP", "ABORT"]
+    assert [s.kind for s in box.heard if s.kind != "LABEL"] == [
+        "TARE",
+        "NEW",
+        "START",
+        "STOP",
+        "ABORT",
+    ]
     box.script = lambda s: [sentence("ANS", s.kind, "error", "set trigger.mode to serial")]
-    assert node.call("start") == {"service": "start", "success": False, "message": "START: set trigger.mode to serial"}
+    assert node.call("start") == {
+        "service": "start",
+        "success": False,
+        "message": "START: set trigger.mode to serial",
+    }
 
 
 def test_the_lifecycle(box: SpeakingBox, node: RosPeer):
-    """Inactive, it publishes no verdict but diagnostics; cleaned up, it has let go of the line; configured and activated
-    again, it works."""
+    """Inactive, it publishes no verdict but diagnostics; cleaned up, it has let go of the line;
+    configured and activated again, it works."""
     assert node.call("deactivate")["success"]
     before = len(node.on("verdict"))
     box.say(result(1), state(answered=1))
@@ -124,19 +155,23 @@ def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
             seen = len(node.on("verdict"))
             assert bool(seen) == bool(number)
             with ros.bridge("-p", f"port:={box.path}") as process:
-                eventually(lambda seen=seen: said(box, lambda: len(node.on("verdict")) > seen, result(1)))
+                eventually(
+                    lambda seen=seen: said(box, lambda: len(node.on("verdict")) > seen, result(1))
+                )
                 process.kill()
                 process.wait(LONG_S)
 
 
 def test_a_late_node_gets_the_state(box: SpeakingBox, node: RosPeer):
-    """The last state is kept for who comes later; the first node stands for the cell, the second for a screen."""
+    """The last state is kept for who comes later; the first node stands for the cell, the second
+    for a screen."""
     with ros.peer() as late:
         assert late.last("state")["values"]["skin"] == "streaming"
 
 
 def test_frames_from_the_feed(tmp_path: Path):
-    """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave no number."""
+    """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave
+    no number."""
     form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
     hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1", "format": form}
     frame = {"type": "frame", "time_ns": 1, "taxels": [[[1, 2, 3]], [[4, None, 6]]]}
@@ -181,21 +216,30 @@ ros.run([])
 
 
 def test_an_end_that_wakes_nobody_is_seen():
-    """rclpy's handler of signals may wake the executor before the context has ended, and the node would wait without end."""
-    done = subprocess.run([ros.PYTHON, "-c", SILENT_END], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False)
+    """rclpy's handler of signals may wake the executor before the context has ended, and the node
+    would wait without end."""
+    done = subprocess.run(
+        [ros.PYTHON, "-c", SILENT_END], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False
+    )
     assert done.returncode == 0
 
 
 def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[str]):
     """This environment has no rclpy: exit code 78, one line with the remedy."""
     assert main(["bridge", "ros"]) == 78
-    assert "source its setup.bash, or install the wheels with the extra [ros]" in capsys.readouterr().err
+    assert (
+        "source its setup.bash, or install the wheels with the extra [ros]"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_launch_file(box: SpeakingBox):
-    """The process that it describes is the bridge with the parameters beside it, configured and activated; it goes through
-    its lifecycle, and ends with SIGINT, which launch sends first. `launch` itself is no wheel: it was not run."""
-    ((process, command),) = ros_launch.processes(PARAMETERS.with_name("palpate.launch.py"), port=str(box.path))
+    """The process that it describes is the bridge with the parameters beside it, configured and
+    activated; it goes through its lifecycle, and ends with SIGINT, which launch sends first.
+    `launch` itself is no wheel: it was not run."""
+    ((process, command),) = ros_launch.processes(
+        PARAMETERS.with_name("palpate.launch.py"), port=str(box.path)
+    )
     assert (process.respawn, process.respawn_delay, process.output) == (True, 2.0, "screen")
     assert command[0] == "python3"
     environment = ros.environment() | {"PATH": f"{ros.PYTHON.parent}:{os.environ['PATH']}"}
@@ -217,13 +261,17 @@ def test_the_launch_file(box: SpeakingBox):
 
 
 def test_the_launch_file_configures_where_it_is_told_to(box: SpeakingBox, tmp_path: Path):
-    """With autostart: false in the YAML beside it, the node waits unconfigured for a manager of its lifecycle."""
+    """With autostart: false in the YAML beside it, the node waits unconfigured for a manager of its
+    lifecycle."""
     for name in ("palpate.launch.py", "palpate.yaml"):
         text = (PARAMETERS.parent / name).read_text()
         (tmp_path / name).write_text(text.replace("autostart: true", "autostart: false"))
     ((_, command),) = ros_launch.processes(tmp_path / "palpate.launch.py", port=str(box.path))
     environment = ros.environment() | {"PATH": f"{ros.PYTHON.parent}:{os.environ['PATH']}"}
-    with ros.peer() as node, subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as launched:
+    with (
+        ros.peer() as node,
+        subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as launched,
+    ):
         try:
             assert not node.call("activate")["success"]
             assert box.heard == []

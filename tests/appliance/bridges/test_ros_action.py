@@ -78,11 +78,22 @@ def silent(heard: Sentence) -> list[bytes]:
 
 
 def test_a_sweep(box: SpeakingBox, node: RosPeer):
-    """START, the slide, STOP, the answer with all that RES says; feedback tells when to slide; NEW where it is wanted."""
+    """START, the slide, STOP, the answer with all that RES says; feedback tells when to slide; NEW
+    where it is wanted."""
     found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True)
     assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
-    assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (1, 1, 1, 0, 1)
-    assert [round(found[name], 3) for name in ("probability", "margin", "latency_ms")] == [0.9, 0.8, 1.25]
+    assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (
+        1,
+        1,
+        1,
+        0,
+        1,
+    )
+    assert [round(found[name], 3) for name in ("probability", "margin", "latency_ms")] == [
+        0.9,
+        0.8,
+        1.25,
+    ]
     assert (found["bundle"], found["message"]) == ("9f3c2a1b", "use the label")
     assert commands(box) == ["NEW", "START", "STOP"]
     eventually(lambda: phases(node) == ["sliding", "judging"])
@@ -91,7 +102,10 @@ def test_a_sweep(box: SpeakingBox, node: RosPeer):
 
 def test_an_early_answer(box: SpeakingBox, node: RosPeer):
     """Feedback has it while the finger slides; the result follows at once."""
-    box.script = lambda s: [*silent(s), *([result(1, label="paper", share="0.40")] if s.kind == "START" else [])]
+    box.script = lambda s: [
+        *silent(s),
+        *([result(1, label="paper", share="0.40")] if s.kind == "START" else []),
+    ]
     found = swept(node, **LONG)
     eventually(lambda: phases(node) == ["sliding", "early"])
     early = node.on("feedback")[-1]
@@ -106,12 +120,18 @@ def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
     unsure = swept(node, slide_s=0.1)
     assert (unsure["state"], unsure["status"], unsure["label"]) == ("succeeded", "unsure", "wood")
     stuck = swept(node, slide_s=0.1)
-    assert (stuck["state"], stuck["status"], stuck["label"], stuck["code"]) == ("aborted", "stuck-taxel", "", 0)
+    assert (stuck["state"], stuck["status"], stuck["label"], stuck["code"]) == (
+        "aborted",
+        "stuck-taxel",
+        "",
+        0,
+    )
     assert stuck["message"] == "a loaded taxel does not move; look at the skin (taxel 2.3)"
 
 
 def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):
-    """A second goal is rejected and disturbs nothing; canceled, the box aborts its sweep; the next goal works."""
+    """A second goal is rejected and disturbs nothing; canceled, the box aborts its sweep; the next
+    goal works."""
     box.script = lambda s: [*obeying(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
     begun(node)
     assert swept(node)["state"] == "rejected"
@@ -125,7 +145,8 @@ def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):
 
 
 def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
-    """Aborted with the reason, at once; a goal without a line, too; plugged in again, the next works."""
+    """Aborted with the reason, at once; a goal without a line, too; plugged in again, the next
+    works."""
     begun(node)
     box.unplug()
     lost = later(node, 0)
@@ -143,7 +164,10 @@ def test_a_dead_box(box: SpeakingBox, node: RosPeer):
     """A box that says nothing any more: given up long before the time limit."""
     box.script = silent
     begun(node)
-    assert later(node, 0)["message"] == "the box has said nothing for 3.5 s during the sweep; is it on?"
+    assert (
+        later(node, 0)["message"]
+        == "the box has said nothing for 3.5 s during the sweep; is it on?"
+    )
     assert node.on("result")[0]["state"] == "aborted"
 
 
@@ -167,8 +191,8 @@ def test_a_goal_that_cannot_be(box: SpeakingBox, node: RosPeer):
 
 
 def test_cleaned_up_meanwhile(box: SpeakingBox, node: RosPeer):
-    """The box's sweep is aborted before its line is closed, and the goal has its result; without a line, goals are
-    aborted; configured again, they work."""
+    """The box's sweep is aborted before its line is closed, and the goal has its result; without a
+    line, goals are aborted; configured again, they work."""
     box.script = lambda s: [*silent(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
     begun(node)
     assert node.call("deactivate")["success"]
@@ -194,7 +218,8 @@ def test_the_bridge_ends_meanwhile(box: SpeakingBox):
 
 
 def test_commands_need_allow_writes(box: SpeakingBox):
-    """Without it neither action nor services reach the box, and no other node can set it; verdicts come."""
+    """Without it neither action nor services reach the box, and no other node can set it; verdicts
+    come."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}"):
         ready(box, peer)
         want = "commands are refused; start the bridge with -p allow_writes:=true"
@@ -216,31 +241,44 @@ def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
     (broken / "__init__.py").write_text("raise ImportError('no palpate_msgs here')\n")
     path = f"{broken.parent}:{ros.environment()['PYTHONPATH']}"
     with (
-        (tmp_path / "log").open("wb") as log, ros.peer() as peer,
+        (tmp_path / "log").open("wb") as log,
+        ros.peer() as peer,
         ros.bridge("-p", f"port:={box.path}", *WRITES, log=log.fileno(), PYTHONPATH=path),
-    ):  # fmt: skip
+    ):
         ready(box, peer)
         assert peer.call("tare")["success"]
     lines = [line for line in (tmp_path / "log").read_text().splitlines() if "~/sweep" in line]
     assert len(lines) == 1
-    assert "~/sweep is not offered (no palpate_msgs here); build palpate_msgs, see docs/robots/ros2.md" in lines[0]
+    assert (
+        "~/sweep is not offered (no palpate_msgs here); build palpate_msgs, see docs/robots/ros2.md"
+        in lines[0]
+    )
 
 
 def test_with_the_messages_nothing_is_said_of_them(box: SpeakingBox, tmp_path: Path):
     """The line is there only where the action is not."""
     with (
-        (tmp_path / "log").open("wb") as log, ros.peer() as peer,
+        (tmp_path / "log").open("wb") as log,
+        ros.peer() as peer,
         ros.bridge("-p", f"port:={box.path}", log=log.fileno()),
-    ):  # fmt: skip
+    ):
         ready(box, peer)
     assert b"~/sweep is not offered" not in (tmp_path / "log").read_bytes()
 
 
 @pytest.mark.slow
 def test_with_the_box_itself(tmp_path: Path):
-    """The box's program on a simulated skin, a bridge on its line, another node: sweeps are numbered, timed and answered by
-    it, whatever the simulated finger did; a second START is what the box makes of it."""
-    quiet = ["--set", "feed.socket=", "--set", "store.status=", "--set", "store.folder=/nonexistent"]
+    """The box's program on a simulated skin, a bridge on its line, another node: sweeps are
+    numbered, timed and answered by it, whatever the simulated finger did; a second START is what
+    the box makes of it."""
+    quiet = [
+        "--set",
+        "feed.socket=",
+        "--set",
+        "store.status=",
+        "--set",
+        "store.folder=/nonexistent",
+    ]
     line = tmp_path / "line"
     command = [
         sys.executable,
@@ -256,7 +294,9 @@ def test_with_the_box_itself(tmp_path: Path):
     ]
     with (
         bridge("tcp", "--link", line, "--allow-writes") as address,
-        subprocess.Popen([*command, *quiet], cwd=ros.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run,
+        subprocess.Popen(
+            [*command, *quiet], cwd=ros.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as run,
         ros.peer() as peer,
         ros.bridge("-p", f"port:=socket://{address[0]}:{address[1]}", *WRITES),
     ):
@@ -280,9 +320,20 @@ def test_the_definition_is_what_was_built():
     """The installed package has the action of the sources, so the tests are of it."""
     prefix = ros.PYTHON.parent.parent
     built = (prefix / "share" / "palpate_msgs" / "action" / "Sweep.action").read_text()
-    assert built == (ros.ROOT / "appliance" / "bridges" / "palpate_msgs" / "action" / "Sweep.action").read_text()
+    assert (
+        built
+        == (
+            ros.ROOT / "appliance" / "bridges" / "palpate_msgs" / "action" / "Sweep.action"
+        ).read_text()
+    )
     told = subprocess.run(
-        [ros.PYTHON, "-c", "from palpate_msgs.action import Sweep; print(Sweep.Goal())"], env=ros.environment(),
-        capture_output=True, text=True, check=True,
-    ).stdout  # fmt: skip
-    assert told.strip() == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0)"
+        [ros.PYTHON, "-c", "from palpate_msgs.action import Sweep; print(Sweep.Goal())"],
+        env=ros.environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert (
+        told.strip()
+        == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0)"
+    )

@@ -1,4 +1,5 @@
-"""The TCP server of the bridges: a peer that takes nothing does not keep the program from ending."""
+"""The TCP server of the bridges: a peer that takes nothing does not keep the program from
+ending."""
 
 from __future__ import annotations
 

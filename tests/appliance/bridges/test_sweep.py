@@ -54,14 +54,17 @@ class Swept:
 
     def use(self, clock: SystemClock) -> None:
         """Another sweep, with this clock."""
-        self.sweep = CommandedSweep(self.source, canceled=self.canceled.is_set, say=self._say, clock=clock)
+        self.sweep = CommandedSweep(
+            self.source, canceled=self.canceled.is_set, say=self._say, clock=clock
+        )
 
     def run(self, **terms: float | bool) -> Answer:
         """Sweep."""
         return self.sweep.run(Wanted(**terms))
 
     def has_heard(self, *names: str) -> bool:
-        """Whether these are the commands that the box has heard, without questions; waits for them."""
+        """Whether these are the commands that the box has heard, without questions; waits for
+        them."""
         eventually(lambda: len(self._heard()) >= len(names))
         return self._heard() == [*names]
 
@@ -134,7 +137,8 @@ def test_an_answer_counts_although_stop_fails(swept: Swept):
 
 
 def test_stop_from_elsewhere(swept: Swept):
-    """With slide_s = 0 the sweep waits for another's STOP and sends none, not even after an early answer."""
+    """With slide_s = 0 the sweep waits for another's STOP and sends none, not even after an early
+    answer."""
     swept.at_phase = lambda phase: swept.source.send("STOP")
     assert swept.run(slide_s=0.0).known
     assert swept.has_heard("START", "STOP")
@@ -184,7 +188,9 @@ def test_canceled_and_not_answered(swept: Swept, monkeypatch: pytest.MonkeyPatch
 def test_no_answer_in_time(swept: Swept):
     """The reason names the time limit, and the box is not left with an open sweep."""
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match=r"no answer within timeout_s = 0.3 of START; the sweep was aborted"):
+    with pytest.raises(
+        NoAnswer, match=r"no answer within timeout_s = 0.3 of START; the sweep was aborted"
+    ):
         swept.run(timeout_s=0.3)
     assert swept.has_heard("START", "STOP", "ABORT")
 
@@ -198,7 +204,8 @@ def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
 
 
 def test_unplugged_while_sliding(swept: Swept):
-    """The reason is the line's, at once and not after the time limit; plugged in again, the next sweep works."""
+    """The reason is the line's, at once and not after the time limit; plugged in again, the next
+    sweep works."""
     swept.at_phase = lambda phase: swept.box.unplug()
     with pytest.raises(LinkLost, match="the box was lost during the sweep: "):
         swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S)
@@ -212,7 +219,9 @@ def test_a_box_that_falls_silent(swept: Swept):
     """Without a sentence for 3.5 s the sweep is given up, long before its time limit."""
     swept.use(Hurried())
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match=r"the box has said nothing for 3.5 s during the sweep; is it on\?"):
+    with pytest.raises(
+        NoAnswer, match=r"the box has said nothing for 3.5 s during the sweep; is it on\?"
+    ):
         swept.run(slide_s=0.0, timeout_s=1000.0)
     assert swept.has_heard("START", "ABORT")
 
@@ -221,7 +230,10 @@ def test_a_box_that_speaks_is_waited_for(swept: Swept):
     """Each sentence begins the 3.5 s anew: only the time limit ends the wait."""
     swept.box.script = saying()
     spoken = CommandedSweep(
-        swept.source, canceled=lambda: bool(spoken.hear(state())), say=lambda phase, answer: None, clock=Hurried()
+        swept.source,
+        canceled=lambda: bool(spoken.hear(state())),
+        say=lambda phase, answer: None,
+        clock=Hurried(),
     )
     with pytest.raises(NoAnswer, match="no answer within timeout_s = 20"):
         spoken.run(Wanted(slide_s=0.0, timeout_s=20.0))
@@ -230,7 +242,9 @@ def test_a_box_that_speaks_is_waited_for(swept: Swept):
 def test_a_box_that_refuses(swept: Swept):
     """Its reason is the reason; nothing of another's is aborted."""
     swept.box.script = lambda s: (
-        [sentence("ANS", "START", "error", "set trigger.mode to serial")] if s.kind == "START" else obeying(s)
+        [sentence("ANS", "START", "error", "set trigger.mode to serial")]
+        if s.kind == "START"
+        else obeying(s)
     )
     with pytest.raises(CommandRefused, match=r"START: set trigger\.mode to serial"):
         swept.run()
@@ -240,7 +254,9 @@ def test_a_box_that_refuses(swept: Swept):
 def test_a_box_that_is_not_ready(swept: Swept, monkeypatch: pytest.MonkeyPatch):
     """No sweep is begun; the reason says what is missing."""
     monkeypatch.setattr(sweep, "READY_S", 0.3)
-    absent = sentence("ANS", "STATE", "ok", "9.000", "absent", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim")
+    absent = sentence(
+        "ANS", "STATE", "ok", "9.000", "absent", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim"
+    )
     swept.box.script = lambda s: [absent] if s.kind == "STATE" else obeying(s)
     with pytest.raises(NoAnswer, match=r"not ready within 0.3 s: the skin is absent"):
         swept.run()
@@ -273,11 +289,14 @@ def test_the_feed_begins_nothing(tmp_path: Path):
         ({"slide_s": -1.0}, "slide_s = -1 is no time from START to STOP; use 0 to 3600"),
         ({"slide_s": float("nan")}, "slide_s = nan is no time"),
         ({"slide_s": float("inf")}, "slide_s = inf is no time"),
-        ({"slide_s": 3.0, "timeout_s": 3.0}, "timeout_s = 3 is no longest time from START to the answer; use more than"),
+        (
+            {"slide_s": 3.0, "timeout_s": 3.0},
+            "timeout_s = 3 is no longest time from START to the answer; use more than",
+        ),
         ({"timeout_s": float("nan")}, "timeout_s = nan is no longest time"),
         ({"timeout_s": 3601.0}, "timeout_s = 3601 is no longest time"),
     ],
-)  # fmt: skip
+)
 def test_times_that_cannot_be(swept: Swept, terms: dict[str, float], text: str):
     """Refused with the value, before anything is sent."""
     with pytest.raises(ConfigError, match=text):

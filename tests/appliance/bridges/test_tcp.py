@@ -1,4 +1,5 @@
-"""The serial line over TCP as a process: what peers hear and may say; the pseudo-terminal that a box opens; limits."""
+"""The serial line over TCP as a process: what peers hear and may say; the pseudo-terminal that a
+box opens; limits."""
 
 from __future__ import annotations
 
@@ -47,8 +48,12 @@ def test_the_client_works_through_it(box: SpeakingBox):
 
 
 def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
-    """STATE, ID and LABEL are answered; what would change something is refused here, and the box never hears it."""
-    with bridge("tcp", "--port", box.path) as address, Palpate(url(address), timeout_s=LONG_S) as client:
+    """STATE, ID and LABEL are answered; what would change something is refused here, and the box
+    never hears it."""
+    with (
+        bridge("tcp", "--port", box.path) as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
         assert client.state().skin == "streaming"
         assert client.identify().name == "mine"
         for ask in (client.start, client.stop, client.tare, client.new_object, client.abort):
@@ -58,13 +63,15 @@ def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
 
 
 def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
-    """Two peers get the same sentences, and each the answers to its own commands alone; what is damaged on the line is
-    not passed on."""
+    """Two peers get the same sentences, and each the answers to its own commands alone; what is
+    damaged on the line is not passed on."""
     with bridge("tcp", "--port", box.path) as address:
         peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
         for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
             peer.sendall(b"$PPLP," + command + b"\r\n")
-            assert peer.recv(4096).startswith(b"$PPLP,ANS," + command + b",ok,")  # so it is served by now
+            assert peer.recv(4096).startswith(
+                b"$PPLP,ANS," + command + b",ok,"
+            )  # so it is served by now
         box.say(result(1).replace(b"wood", b"wo0d"), b"\xff\xfe\r\n", state(), result(2))
         for peer in peers:
             heard = b""
@@ -162,7 +169,9 @@ def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPa
     port = DeafPort()
 
     async def run() -> None:
-        bridge = tcp.TcpBridge("x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop())
+        bridge = tcp.TcpBridge(
+            "x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop()
+        )
         flood = [asyncio.create_task(bridge._ask(Sentence("STATE"))) for _ in range(200)]
         while not port.written:
             await asyncio.sleep(0.01)
@@ -218,11 +227,14 @@ def test_a_silent_peer_makes_room():
 
 
 def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
-    """--link: one name, for serial.port of a box on this machine; what was written before it came is not read later, and
-    the name goes with the bridge."""
+    """--link: one name, for serial.port of a box on this machine; what was written before it came
+    is not read later, and the name goes with the bridge."""
     path = tmp_path / "line"
     with bridge("tcp", "--link", path, "--allow-writes") as address:
-        with socket.create_connection(address, timeout=LONG_S) as peer, serial.Serial(str(path)) as near:
+        with (
+            socket.create_connection(address, timeout=LONG_S) as peer,
+            serial.Serial(str(path)) as near,
+        ):
             peer.sendall(b"hello\r\n")
             assert b"not a command" in peer.recv(4096)  # so it is served by now
             near.write(state())  # stands for the box
@@ -255,7 +267,17 @@ def test_a_link_that_nobody_reads(tmp_path: Path):
 
 def test_it_ends_with_the_service_manager(box: SpeakingBox):
     """SIGTERM: exit code 0 within the time of one command, with a peer connected."""
-    command = [sys.executable, "-m", "appliance", "bridge", "tcp", "--port", str(box.path), "--listen", "127.0.0.1:0"]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "bridge",
+        "tcp",
+        "--port",
+        str(box.path),
+        "--listen",
+        "127.0.0.1:0",
+    ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         line = process.stderr.readline()
         assert "commands are refused (--allow-writes)" in line
@@ -273,5 +295,7 @@ def test_bridges_need_neither_numpy_nor_onnxruntime():
     )
     options = "import sys; import appliance.cli.parser; print({'asyncio', 'appliance.bridges.server'} & {*sys.modules})"
     for text in (code, options):
-        done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=True
+        )
         assert done.stdout.strip() == "set()"

@@ -1,4 +1,5 @@
-"""enrolment.npz: what it adds to a bundle, and that it can add nothing else, whatever stands in it."""
+"""enrolment.npz: what it adds to a bundle, and that it can add nothing else, whatever stands in
+it."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ def made(base: dict[str, bytes]) -> dict[str, bytes]:
 
 def grown(files: dict[str, bytes], label: str, sweeps: np.ndarray = SWEEPS) -> dict[str, bytes]:
     """The files with one label more."""
-    return enrolment.files(files, enrolment.enrol(bundle.from_files(files, "toy"), label, sweeps), None)
+    return enrolment.files(
+        files, enrolment.enrol(bundle.from_files(files, "toy"), label, sweeps), None
+    )
 
 
 def content(files: dict[str, bytes]) -> dict[str, np.ndarray]:
@@ -44,12 +47,15 @@ def content(files: dict[str, bytes]) -> dict[str, np.ndarray]:
 
 def changed(files: dict[str, bytes], **arrays: np.ndarray) -> dict[str, bytes]:
     """With other arrays in enrolment.npz; None takes one out."""
-    held = {name: values for name, values in (content(files) | arrays).items() if values is not None}
+    held = {
+        name: values for name, values in (content(files) | arrays).items() if values is not None
+    }
     return files | {bundle.ENROLMENT: toy_bundle.npz(**held)}
 
 
 def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes], tmp_path: Path):
-    """Byte for byte, one file more; all that was trained is the same, tensor by tensor, and the id is another."""
+    """Byte for byte, one file more; all that was trained is the same, tensor by tensor, and the id
+    is another."""
     assert {name: data for name, data in made.items() if name != bundle.ENROLMENT} == base
     old, new = bundle.from_files(base, "old"), bundle.load(toy_bundle.put(tmp_path / "b", made))
     assert old.classes
@@ -70,7 +76,8 @@ def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes
 
 
 def test_what_an_enrolment_cannot_say_is_computed(made: dict[str, bytes]):
-    """Bias and shape of a label follow from its mean and number of sweeps: the file has no place for them."""
+    """Bias and shape of a label follow from its mean and number of sweeps: the file has no place
+    for them."""
     assert set(content(made)) == set(enrolled.ARRAYS)
     louder = changed(made, bias=np.float32([1e6, 1e6]), means_of_wood=np.zeros((3, 2), np.float32))
     new, old = bundle.from_files(louder, "louder"), bundle.from_files(made, "made")
@@ -95,22 +102,52 @@ WRONG = {
     "no bundle": ({"base": np.zeros(64, np.uint8)}, "names no bundle and its labels"),
     "no labels": ({"labels": np.array([], "U1")}, "names no bundle and its labels"),
     "labels as bytes": ({"labels": np.array([b"felt", b"cork"])}, "names no bundle and its labels"),
-    "a label that is taken": ({"labels": np.array(["felt", "a"])}, "must be at least two different names"),
-    "a label twice": ({"labels": np.array(["felt", "felt"])}, "must be at least two different names"),
+    "a label that is taken": (
+        {"labels": np.array(["felt", "a"])},
+        "must be at least two different names",
+    ),
+    "a label twice": (
+        {"labels": np.array(["felt", "felt"])},
+        "must be at least two different names",
+    ),
     "a label that cannot be sent": ({"labels": np.array(["felt", "$,*"])}, "cannot be sent"),
-    "more labels than means": ({"labels": np.array(["felt", "cork", "silk"])}, r"means float32 \[2, 2\]; .*\[3, 2\]"),
+    "more labels than means": (
+        {"labels": np.array(["felt", "cork", "silk"])},
+        r"means float32 \[2, 2\]; .*\[3, 2\]",
+    ),
     "means of another rank": ({"means": np.zeros((2, 3), np.float32)}, r"means float32 \[2, 3\]"),
     "means as doubles": ({"means": np.zeros((2, 2))}, "means float64"),
-    "a mean that is nan": ({"means": np.float32([[7, 8], [np.nan, 0]])}, "means that are not finite"),
-    "a mean without end": ({"means": np.float32([[7, 8], [3e38, 3e38]])}, "bias that are not finite"),
+    "a mean that is nan": (
+        {"means": np.float32([[7, 8], [np.nan, 0]])},
+        "means that are not finite",
+    ),
+    "a mean without end": (
+        {"means": np.float32([[7, 8], [3e38, 3e38]])},
+        "bias that are not finite",
+    ),
     "no sweep": ({"sweeps": np.array([2, 0])}, "number of sweeps or a spread below 1, or too many"),
-    "sweeps below none": ({"sweeps": np.array([2, -5])}, "number of sweeps or a spread below 1, or too many"),
-    "sweeps without end": ({"sweeps": np.array([2, 1 << 62])}, "number of sweeps or a spread below 1, or too many"),
+    "sweeps below none": (
+        {"sweeps": np.array([2, -5])},
+        "number of sweeps or a spread below 1, or too many",
+    ),
+    "sweeps without end": (
+        {"sweeps": np.array([2, 1 << 62])},
+        "number of sweeps or a spread below 1, or too many",
+    ),
     "a small spread": ({"spread": np.float32([1, 0.5])}, "number of sweeps or a spread below 1"),
     "a spread without end": ({"spread": np.float32([1, np.inf])}, "spread that are not finite"),
-    "golden sweeps of another form": ({"changes": np.zeros((1, 2, 20, 2, 2), np.uint8)}, "changes uint8"),
-    "logits of fewer labels": ({"logits": np.zeros((4, 4), np.float32)}, r"logits float32 \[4, 4\]; float32 \[4, 5\]"),
-    "logits that are nan": ({"logits": np.full((4, 5), np.nan, np.float32)}, "logits that are not finite"),
+    "golden sweeps of another form": (
+        {"changes": np.zeros((1, 2, 20, 2, 2), np.uint8)},
+        "changes uint8",
+    ),
+    "logits of fewer labels": (
+        {"logits": np.zeros((4, 4), np.float32)},
+        r"logits float32 \[4, 4\]; float32 \[4, 5\]",
+    ),
+    "logits that are nan": (
+        {"logits": np.full((4, 5), np.nan, np.float32)},
+        "logits that are not finite",
+    ),
     "no logits": ({"logits": None}, "cannot be read.*logits"),
     "objects": ({"spread": np.array([1, "x"], object)}, "cannot be read"),
 }
@@ -129,7 +166,9 @@ def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str)
     file = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(made[name])) as whole, zipfile.ZipFile(file, "w") as damaged:
         for member in whole.namelist():
-            damaged.writestr(member, b"nothing" if member == whole.namelist()[0] else whole.read(member))
+            damaged.writestr(
+                member, b"nothing" if member == whole.namelist()[0] else whole.read(member)
+            )
     with pytest.raises(BundleError, match=rf"{name} cannot be read: '\w+' is no array"):
         arrays.read(file.getvalue(), name)
 
@@ -141,9 +180,14 @@ def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
         check_refused(made | {bundle.ENROLMENT: data}, "enrolment.npz cannot be read")
     name, extra = (int.from_bytes(whole[at : at + 2], "little") for at in (26, 28))
     packed, central = 30 + name + extra, whole.index(b"PK\1\2")
-    for at, value in ((packed, 0xFF), (central + 8, 1), (central + 10, 99)):  # no deflate, encrypted, method 99
+    for at, value in (
+        (packed, 0xFF),
+        (central + 8, 1),
+        (central + 10, 99),
+    ):  # no deflate, encrypted, method 99
         check_refused(
-            made | {bundle.ENROLMENT: whole[:at] + bytes([value]) + whole[at + 1 :]}, "enrolment.npz cannot be read"
+            made | {bundle.ENROLMENT: whole[:at] + bytes([value]) + whole[at + 1 :]},
+            "enrolment.npz cannot be read",
         )
     bomb = io.BytesIO()
     np.savez_compressed(bomb, **content(made) | {"zeros": np.zeros(70 << 20, np.uint8)})
@@ -154,13 +198,20 @@ def test_a_bundle_without_class_means_takes_no_labels(made: dict[str, bytes]):
     """There is nothing to add them to."""
     plain = toy_bundle.files(known=None, outputs=("logits",))
     base = np.array(bundle.digest(plain[bundle.MANIFEST]))
-    check_refused(plain | {bundle.ENROLMENT: changed(made, base=base)[bundle.ENROLMENT]}, "has no class means")
+    check_refused(
+        plain | {bundle.ENROLMENT: changed(made, base=base)[bundle.ENROLMENT]}, "has no class means"
+    )
 
 
-def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(base: dict[str, bytes], made: dict[str, bytes]):
-    """The most that a forged label can do is to be named itself: for any sweep, the order of the trained labels stays."""
+def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(
+    base: dict[str, bytes], made: dict[str, bytes]
+):
+    """The most that a forged label can do is to be named itself: for any sweep, the order of the
+    trained labels stays."""
     forged = changed(made, means=np.float32([[6, 0], [0, 0]]), spread=np.float32([1e6, 1e6]))
-    it, before = (Classifier(bundle.from_files(files, "toy"), SystemClock()) for files in (forged, base))
+    it, before = (
+        Classifier(bundle.from_files(files, "toy"), SystemClock()) for files in (forged, base)
+    )
     for z in ((0, 0), (6, 0), (0, 6), (3, 1)):
         scores = [run.logits(toy_bundle.window(*z))[:3] for run in (it, before)]
         assert np.argsort(scores[0]).tolist() == np.argsort(scores[1]).tolist()
@@ -170,5 +221,8 @@ def test_labels_are_read_in_the_order_in_which_they_were_enrolled(base: dict[str
     """So that class codes of all others stay the same; the same labels give the same bytes."""
     one, other = grown(grown(base, "felt"), "cork"), grown(grown(base, "cork"), "felt")
     first, second = (bundle.from_files(files, "toy") for files in (one, other))
-    assert (first.manifest.labels[3:], second.manifest.labels[3:]) == (("felt", "cork"), ("cork", "felt"))
+    assert (first.manifest.labels[3:], second.manifest.labels[3:]) == (
+        ("felt", "cork"),
+        ("cork", "felt"),
+    )
     assert one == grown(grown(base, "felt"), "cork")

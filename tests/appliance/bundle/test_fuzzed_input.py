@@ -1,4 +1,5 @@
-"""Results of fuzzing, tested in each run: the corpus, all former crashes, and that each broken promise is detected."""
+"""Results of fuzzing, tested in each run: the corpus, all former crashes, and that each broken
+promise is detected."""
 
 from __future__ import annotations
 
@@ -26,7 +27,11 @@ from train.data import raw_files
 
 TARGETS = sorted(targets.TARGETS)
 INPUTS = {
-    name: [*seeds.SEEDS[name](), *corpus.load(name), *(f.read_bytes() for f in corpus.crashes(name))]
+    name: [
+        *seeds.SEEDS[name](),
+        *corpus.load(name),
+        *(f.read_bytes() for f in corpus.crashes(name)),
+    ]
     for name in TARGETS
 }
 
@@ -129,7 +134,9 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "unpack": lambda data, folder: packets.unpack(data).packets,
     "command": lambda data, folder: any(not c.error for c in robot_link.parse(data)[0]),
     "feed": lambda data, folder: feed.requests(data)[0],
-    "settings": lambda data, folder: config.load(None, folder=folder, site=written(folder, "palpate.toml", data)),
+    "settings": lambda data, folder: config.load(
+        None, folder=folder, site=written(folder, "palpate.toml", data)
+    ),
     "manifest": read_manifest,
     "enrolment": enrolments.read,
     "recording": read_recording,
@@ -137,7 +144,9 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "modbus": lambda data, folder: modbus_pdu.requests(data)[0],
     "import-text": lambda data, folder: raw_files.read(written(folder, "t.csv", data)).values.size,
     "import-mat": lambda data, folder: raw_files.read(written(folder, "t.mat", data)).values.size,
-    "profile": lambda data, folder: skin_profile.load(written(folder, "s.toml", data).stem, [folder]),
+    "profile": lambda data, folder: skin_profile.load(
+        written(folder, "s.toml", data).stem, [folder]
+    ),
     **{f"skin-{name}": partial(frames_of, name) for name in skins.GRIDS},
 }
 """How each target reads an input: a value, nothing, or one of its own errors."""
@@ -154,7 +163,8 @@ def taken(target: str, data: bytes, folder: Path) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
-    """Several inputs are taken and several refused: a corpus of nothing but broken files would prove little."""
+    """Several inputs are taken and several refused: a corpus of nothing but broken files would
+    prove little."""
     check_inputs(target, tmp_path)  # puts beside a manifest what belongs there
     count = sum(taken(target, data, tmp_path) for data in INPUTS[target])
     assert 2 <= count < len(INPUTS[target]) - 2
@@ -209,7 +219,13 @@ def hasty(data: bytes, rest: bytes = b"") -> tuple[list[robot_link.Command], byt
 
 
 COLLECTED = text.collected
-UNPACK, ONE, PARSE, FIT, FRAMES = packets.unpack, packets._one, robot_link.parse, schema.Key.fit, types.Frames
+UNPACK, ONE, PARSE, FIT, FRAMES = (
+    packets.unpack,
+    packets._one,
+    robot_link.parse,
+    schema.Key.fit,
+    types.Frames,
+)
 
 
 def numb(load: Callable[..., Any]) -> Callable[..., Any]:
@@ -230,7 +246,8 @@ def broken_json(text: bytes) -> Any:
 
 
 def eager(layout: Any, data: bytes, at: int) -> bool:
-    """Takes a beginning as certain once one period has followed it, however many bytes have come."""
+    """Takes a beginning as certain once one period has followed it, however many bytes have
+    come."""
     return data.startswith(layout.mark, at + layout.period)
 
 
@@ -247,65 +264,178 @@ def turned(profile: Any, numbers: Any, *more: Any, **named: Any) -> Any:
 
 BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("unpack", "a packet is missed", packets, "unpack", changed(packets, "unpack", fewer)),
-    ("unpack", "garbage is not counted", packets, "unpack",
-     changed(packets, "unpack", lambda got: dataclasses.replace(got, garbage=0))),
+    (
+        "unpack",
+        "garbage is not counted",
+        packets,
+        "unpack",
+        changed(packets, "unpack", lambda got: dataclasses.replace(got, garbage=0)),
+    ),
     ("unpack", "the rest is dropped", packets, "unpack", forgetful),
     ("unpack", "time grows with the square", packets, "unpack", searching),
     ("unpack", "a wrong checksum is taken", packets, "_one", trusting),
-    ("unpack", "frames come twice", packets, "follow", changed(packets, "follow", lambda got: (got[0] * 2, *got[1:]))),
-    ("unpack", "a format is read from the wrong place", packets, "unpack_format",
-     lambda payload: packets.SkinFormat(4, 4, "uint8", 750, 750, 6)),
-    ("unpack", "numbers stand still", usb_sensor.Stream, "_stamp",
-     changed(usb_sensor.Stream, "_stamp", lambda frames: dataclasses.replace(frames, seq=frames.seq * 0))),
-    ("command", "one command a line is lost", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0][1:], got[1]))),
+    (
+        "unpack",
+        "frames come twice",
+        packets,
+        "follow",
+        changed(packets, "follow", lambda got: (got[0] * 2, *got[1:])),
+    ),
+    (
+        "unpack",
+        "a format is read from the wrong place",
+        packets,
+        "unpack_format",
+        lambda payload: packets.SkinFormat(4, 4, "uint8", 750, 750, 6),
+    ),
+    (
+        "unpack",
+        "numbers stand still",
+        usb_sensor.Stream,
+        "_stamp",
+        changed(
+            usb_sensor.Stream,
+            "_stamp",
+            lambda frames: dataclasses.replace(frames, seq=frames.seq * 0),
+        ),
+    ),
+    (
+        "command",
+        "one command a line is lost",
+        robot_link,
+        "parse",
+        changed(robot_link, "parse", lambda got: (got[0][1:], got[1])),
+    ),
     ("command", "the end of a long line is a command", robot_link, "parse", hasty),
-    ("command", "the rest grows", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0], got[1] * 200))),
+    (
+        "command",
+        "the rest grows",
+        robot_link,
+        "parse",
+        changed(robot_link, "parse", lambda got: (got[0], got[1] * 200)),
+    ),
     ("command", "any checksum is right", sentences, "checksum", lambda body: "00"),
     ("command", "an answer has no limit", sentences, "MAX_LINE", 200),
-    ("command", "a command is obeyed twice", robot_link, "parse", changed(robot_link, "parse", lambda got: (got[0] * 2, got[1]))),
-    ("feed", "a request is lost", feed, "requests", changed(feed, "requests", lambda got: (got[0][1:], got[1]))),
-    ("feed", "the rest is dropped", feed, "requests", changed(feed, "requests", lambda got: (got[0], b""))),
+    (
+        "command",
+        "a command is obeyed twice",
+        robot_link,
+        "parse",
+        changed(robot_link, "parse", lambda got: (got[0] * 2, got[1])),
+    ),
+    (
+        "feed",
+        "a request is lost",
+        feed,
+        "requests",
+        changed(feed, "requests", lambda got: (got[0][1:], got[1])),
+    ),
+    (
+        "feed",
+        "the rest is dropped",
+        feed,
+        "requests",
+        changed(feed, "requests", lambda got: (got[0], b"")),
+    ),
     ("feed", "frames without a limit", feed, "MOST_HZ", 1e9),
     ("feed", "a line has no limit", feed, "MOST_REQUEST", 10**9),
     ("feed", "a message of two lines", feed, "_shown", lambda line: "line 1\nline 2"),
-    ("settings", "limits are not looked at", schema.Key, "fit",
-     lambda key, value: value if key.hint in (int, float) else FIT(key, value)),
-    ("settings", "any text is a choice", schema.Key, "fit",
-     lambda key, value: value if isinstance(value, str) else FIT(key, value)),
+    (
+        "settings",
+        "limits are not looked at",
+        schema.Key,
+        "fit",
+        lambda key, value: value if key.hint in (int, float) else FIT(key, value),
+    ),
+    (
+        "settings",
+        "any text is a choice",
+        schema.Key,
+        "fit",
+        lambda key, value: value if isinstance(value, str) else FIT(key, value),
+    ),
     ("settings", "the file is not named", config, "load", numb(config.load)),
-    ("settings", "what is described does not load", config, "describe",
-     changed(config, "describe", lambda text: text.replace("= true", "= 1").replace("0x", ""))),
+    (
+        "settings",
+        "what is described does not load",
+        config,
+        "describe",
+        changed(config, "describe", lambda text: text.replace("= true", "= 1").replace("0x", "")),
+    ),
     ("manifest", "types are not looked at", schema, "_fits", lambda value, hint: True),
     ("manifest", "a message of two lines", manifest.json, "loads", broken_json),
-    ("manifest", "golden sweeps of any form", bundle, "_golden", lambda data, manifest: (np.ones((1, 2, 3, 4)), None)),
-    ("recording", "a time is lost", types, "Frames", lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels)),
+    (
+        "manifest",
+        "golden sweeps of any form",
+        bundle,
+        "_golden",
+        lambda data, manifest: (np.ones((1, 2, 3, 4)), None),
+    ),
+    (
+        "recording",
+        "a time is lost",
+        types,
+        "Frames",
+        lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels),
+    ),
     ("recording", "types are not looked at", types, "typed", unguarded),
     ("recording", "the file is not named", types, "load", numb(types.load)),
     ("capture", "records are not looked at", capture, "_written", lambda kind, t_ns, body: True),
     ("capture", "the last record is never played", capture.Playback, "finished", False),
-    ("manifest", "what is written is something else", bundle.Manifest, "json", lambda manifest: b"{}"),
+    (
+        "manifest",
+        "what is written is something else",
+        bundle.Manifest,
+        "json",
+        lambda manifest: b"{}",
+    ),
     ("skin-flexitac", "frames are told apart by what has come", fixed, "_begins", eager),
-    ("skin-anyskin", "the end of a frame is not looked at", fixed, "_run",
-     lambda layout, data, at: ((len(data) - len(layout.mark) - at) // layout.period, False)),
+    (
+        "skin-anyskin",
+        "the end of a frame is not looked at",
+        fixed,
+        "_run",
+        lambda layout, data, at: ((len(data) - len(layout.mark) - at) // layout.period, False),
+    ),
     ("skin-papillarray", "a wrong sum is taken", papillarray, "_end", unsummed),
     ("skin-xela-can", "the last taxel comes first", xela, "collected", turned),
     ("skin-robotiq-tsf", "the last taxel comes first", robotiq, "collected", turned),
     ("skin-3d-vitac", "the last taxel comes first", text, "collected", turned),
     ("enrolment", "any number of sweeps is taken", enrolled, "MOST_SWEEPS", 1 << 62),
-    ("enrolment", "a golden sweep is lost", enrolled, "with_label",
-     changed(enrolled, "with_label", lambda got: dataclasses.replace(got, golden=got.golden[:-1]))),
-    ("enrolment", "classes of trained labels move", enrolled, "extended",
-     changed(enrolled, "extended", lambda got: dataclasses.replace(got, means=got.means + 1))),
+    (
+        "enrolment",
+        "a golden sweep is lost",
+        enrolled,
+        "with_label",
+        changed(
+            enrolled, "with_label", lambda got: dataclasses.replace(got, golden=got.golden[:-1])
+        ),
+    ),
+    (
+        "enrolment",
+        "classes of trained labels move",
+        enrolled,
+        "extended",
+        changed(enrolled, "extended", lambda got: dataclasses.replace(got, means=got.means + 1)),
+    ),
     ("enrolment", "a message of two lines", enrolled, "AGAIN", "line 1\nline 2"),
     ("profile", "the file is not named", skin_profile, "load", numb(skin_profile.load)),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(
-    ("target", "what", "module", "name", "broken"), BREAKS, ids=[f"{b[0]}-{b[1].replace(' ', '-')}" for b in BREAKS]
+    ("target", "what", "module", "name", "broken"),
+    BREAKS,
+    ids=[f"{b[0]}-{b[1].replace(' ', '-')}" for b in BREAKS],
 )
 def test_each_promise_can_be_seen_broken(
-    target: str, what: str, module: Any, name: str, broken: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    target: str,
+    what: str,
+    module: Any,
+    name: str,
+    broken: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A module that is broken on purpose is detected by the known inputs."""
     monkeypatch.setattr(module, name, broken)
@@ -315,10 +445,20 @@ def test_each_promise_can_be_seen_broken(
 
 @pytest.mark.parametrize(
     ("target", "module", "name"),
-    [("unpack", packets, "unpack_identity"), ("command", sentences, "read"), ("feed", feed, "_request"), ("settings", config, "_checked"),
-     ("manifest", manifest, "typed"), ("recording", types, "typed"), ("capture", capture, "typed"),
-     ("enrolment", arrays, "summed"), ("modbus", modbus_pdu, "parse"), ("import-text", raw_files, "_is_number"), ("import-mat", raw_files.mat_files, "_matrix")],
-)  # fmt: skip
+    [
+        ("unpack", packets, "unpack_identity"),
+        ("command", sentences, "read"),
+        ("feed", feed, "_request"),
+        ("settings", config, "_checked"),
+        ("manifest", manifest, "typed"),
+        ("recording", types, "typed"),
+        ("capture", capture, "typed"),
+        ("enrolment", arrays, "summed"),
+        ("modbus", modbus_pdu, "parse"),
+        ("import-text", raw_files, "_is_number"),
+        ("import-mat", raw_files.mat_files, "_matrix"),
+    ],
+)
 def test_another_error_is_not_kept_back(
     target: str, module: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -335,7 +475,8 @@ def test_another_error_is_not_kept_back(
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
-    """A mutator gives the same for the same seed, and a good part of its outputs is still accepted."""
+    """A mutator gives the same for the same seed, and a good part of its outputs is still
+    accepted."""
 
     def plain(data: bytes) -> bytes:
         return data.replace(b"A", b"E")

@@ -1,4 +1,5 @@
-"""The graph's check: our own models pass, hostile ones are refused with their reason, and what passes cannot hurt."""
+"""The graph's check: our own models pass, hostile ones are refused with their reason, and what
+passes cannot hurt."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ MANIFEST = Manifest("hostile", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255),
 
 @pytest.fixture(scope="module")
 def owns() -> list[mutated_models.Own]:
-    """Models that `palpate-train` writes, which have all allowed operators but GRU and MaxPool between them."""
+    """Models that `palpate-train` writes, which have all allowed operators but GRU and MaxPool
+    between them."""
     return mutated_models.own_models(mutated_models.QUICK)
 
 
@@ -72,7 +74,8 @@ def test_a_hostile_model_is_refused(name: str):
 
 
 def in_child(work: Callable[[], Any], more: int) -> tuple[Any, float]:
-    """What `work` gives or raises in a fork that may take `more` bytes, and how many MB more it had at most."""
+    """What `work` gives or raises in a fork that may take `more` bytes, and how many MB more it had
+    at most."""
 
     def child(end: Any) -> None:
         size = hostile_fuzz.memory("VmSize") * 1024 + more
@@ -98,7 +101,8 @@ def in_child(work: Callable[[], Any], more: int) -> tuple[Any, float]:
 
 
 def test_152_bytes_would_take_6_gigabytes():
-    """Without the check onnxruntime opens the model, and 5.5 GB are not enough for its first sweep."""
+    """Without the check onnxruntime opens the model, and 5.5 GB are not enough for its first
+    sweep."""
     model = hostile.tiny()
     assert len(model) <= 152
     told, _ = in_child(lambda: hostile_fuzz.run(session(model), Random(1)), 5_500_000_000)
@@ -117,7 +121,9 @@ def test_a_file_that_ends_anywhere_is_refused(default: mutated_models.Own):
             check.check(default.model[:end], default.manifest)
 
 
-def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_link_and_a_file_beside_the_model_are_never_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """External data that is there, as a symlink: refused before anything is opened."""
     (tmp_path / "secret").write_bytes(bytes(16))
     (tmp_path / "weights.bin").symlink_to(tmp_path / "secret")
@@ -129,10 +135,15 @@ def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path: Path, m
 def heavy(kind: str) -> bytes:
     """A model that costs nearly as much memory as one may, by one operator."""
     node, model = hostile.node, hostile.model
-    start = [node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0), node("Expand", ["s", "n"], ["m"])]
+    start = [
+        node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0),
+        node("Expand", ["s", "n"], ["m"]),
+    ]
     if kind == "MatMul":
         weights = np.ones((4000, 2000), np.float32)
-        return model([*start, node("MatMul", ["m", "w"], ["y"])], {"n": [1, 4000], "w": weights}).SerializeToString()
+        return model(
+            [*start, node("MatMul", ["m", "w"], ["y"])], {"n": [1, 4000], "w": weights}
+        ).SerializeToString()
     if kind == "TopK":
         count = {"n": [1, 4_000_000], "k": [4_000_000]}
         return model([*start, node("TopK", ["m", "k"], ["y", "at"])], count).SerializeToString()
@@ -164,7 +175,9 @@ def test_what_passes_takes_no_more_than_was_counted(kind: str):
     assert most_mb < (check.MOST_MEMORY >> 20) + 16
 
 
-@pytest.mark.parametrize("limit", ["MOST_MEMORY", "MOST_WORK", "MOST_NODES", "MOST_CONSTANTS", "MOST_TENSOR"])
+@pytest.mark.parametrize(
+    "limit", ["MOST_MEMORY", "MOST_WORK", "MOST_NODES", "MOST_CONSTANTS", "MOST_TENSOR"]
+)
 def test_every_cap_caps(limit: str, default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch):
     """Our own model is refused where a cap is lower than what it needs."""
     monkeypatch.setattr(check, limit, 20)
@@ -206,7 +219,10 @@ def test_the_manifest_decides_what_goes_in_and_comes_out():
 
 def test_enrolled_labels_and_means_decide_as_well():
     """The model knows all labels but the enrolled ones, and its embedding is that of means.npz."""
-    toy, manifest = toy_bundle.model(), replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c", "d"))
+    toy, manifest = (
+        toy_bundle.model(),
+        replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c", "d")),
+    )
     check.check(toy, manifest, enrolled=1, rank=2)
     with pytest.raises(BundleError, match="3 materials apart, the manifest has 4 labels;"):
         check.check(toy, manifest)
@@ -219,7 +235,11 @@ def test_enrolled_labels_and_means_decide_as_well():
 @pytest.mark.parametrize("field", [b"\x0a\x00", b"\x2a\x00"], ids=["nodes", "constants"])
 def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
     """20 MB of empty messages, of which protobuf makes 1 GB: refused after MOST_VALUES of them."""
-    model = hostile.part(1, 8) + hostile.part(7, field * 10_000_000) + hostile.part(8, hostile.part(2, 17))
+    model = (
+        hostile.part(1, 8)
+        + hostile.part(7, field * 10_000_000)
+        + hostile.part(8, hostile.part(2, 17))
+    )
     raised, most_mb = in_child(lambda: check.check(model, MANIFEST), 1 << 30)
     assert "more than 50000 values" in raised
     assert most_mb < 16
@@ -227,19 +247,23 @@ def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
 
 @pytest.mark.slow
 def test_grown_models_pass_and_run():
-    """Random operators in any order, as far as the rules let them: most of them onnxruntime opens and runs."""
+    """Random operators in any order, as far as the rules let them: most of them onnxruntime opens
+    and runs."""
     ran = 0
     for seed in range(20):
         model = grown(Random(seed))
         check.check(model, MANIFEST)
-        told = hostile_fuzz.tried(model, replace(hostile_fuzz.GROWING, manifest=MANIFEST), Random(seed))
+        told = hostile_fuzz.tried(
+            model, replace(hostile_fuzz.GROWING, manifest=MANIFEST), Random(seed)
+        )
         ran += told["outcome"] == "ran"
     assert ran >= 10
 
 
 @pytest.mark.slow
 def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
-    """150 of the campaign's kind, in children of limited memory and time; enough of them get as far as onnxruntime."""
+    """150 of the campaign's kind, in children of limited memory and time; enough of them get as far
+    as onnxruntime."""
     record = hostile_fuzz.fresh(3)
     for told in hostile_fuzz.Fuzz(owns, 3).results(0, 150):
         hostile_fuzz.note(record, told)
@@ -249,8 +273,11 @@ def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
 
 
 @pytest.mark.slow
-def test_fuzzed_enrolments_are_refused_or_answer(owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
-    """A hundred of the campaign's enrolments alone: none names a material without a probability, and some get that far."""
+def test_fuzzed_enrolments_are_refused_or_answer(
+    owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
+):
+    """A hundred of the campaign's enrolments alone: none names a material without a probability,
+    and some get that far."""
     monkeypatch.setattr(hostile_fuzz, "ENROLLED", 1.0)
     record = hostile_fuzz.fresh(4)
     for told in hostile_fuzz.Fuzz(owns, 4).results(0, 100):
@@ -262,8 +289,11 @@ def test_fuzzed_enrolments_are_refused_or_answer(owns: list[mutated_models.Own],
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
-def test_the_campaign_would_tell(how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch):
-    """A child that dies, hangs or takes too much memory is told, with its number, and the next model is tried."""
+def test_the_campaign_would_tell(
+    how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
+):
+    """A child that dies, hangs or takes too much memory is told, with its number, and the next
+    model is tried."""
 
     def run(opened: Any, rng: Random) -> None:
         if how == "dies":
@@ -275,7 +305,9 @@ def test_the_campaign_would_tell(how: str, owns: list[mutated_models.Own], monke
     monkeypatch.setattr(hostile_fuzz, "run", run)
     monkeypatch.setattr(hostile_fuzz, "DEADLINE_S", 0.5)
     fuzz = hostile_fuzz.Fuzz(owns, 1)
-    monkeypatch.setattr(hostile_fuzz.Fuzz, "model", lambda self, number: (owns[0].model, owns[0], Random(1)))
+    monkeypatch.setattr(
+        hostile_fuzz.Fuzz, "model", lambda self, number: (owns[0].model, owns[0], Random(1))
+    )
     told = list(fuzz.results(7, 2))
     wanted = {"dies": "died (-9)", "hangs": "hung", "swells": "no memory"}[how]
     assert [(t["number"], t["outcome"]) for t in told] == [(7, wanted), (8, wanted)]

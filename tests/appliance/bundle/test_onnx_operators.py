@@ -1,4 +1,5 @@
-"""The rules of the operators: what each refuses, and that what each says of its result is what onnxruntime gives."""
+"""The rules of the operators: what each refuses, and that what each says of its result is what
+onnxruntime gives."""
 
 from __future__ import annotations
 
@@ -17,8 +18,16 @@ from appliance.core.errors import BundleError
 from appliance.inference.session import session
 from tests.factories.grown_models import FORM, Sprout
 
-TABLES = {"classlabels_ints": [0, 1], "vectors_per_class": [1, 1], "coefficients": [1.0] * 2, "rho": [0.0],
-          "kernel_params": [1.0] * 3, "support_vectors": [1.0] * 6, "kernel_type": b"RBF", "post_transform": b"NONE"}  # fmt: skip
+TABLES = {
+    "classlabels_ints": [0, 1],
+    "vectors_per_class": [1, 1],
+    "coefficients": [1.0] * 2,
+    "rho": [0.0],
+    "kernel_params": [1.0] * 3,
+    "support_vectors": [1.0] * 6,
+    "kernel_type": b"RBF",
+    "post_transform": b"NONE",
+}
 IMAGE, SWEEP = (1, 3, 8, 8), (1, FORM.window, FORM.rows, FORM.cols)
 
 
@@ -55,7 +64,12 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
     ("do not fit", "ScatterElements", [of(3, 3), fixed(0), of(1)], {}),
     ("do not fit", "GatherElements", [of(3, 3), of(3, 4, kind="int64")], {"axis": 0}),
     ("out of 3", "GatherElements", [of(3), fixed(-4)], {}),
-    ("nothing to choose", "ArrayFeatureExtractor", [of(kind="int64"), Value("int64", (1,), None, True, True)], {}),
+    (
+        "nothing to choose",
+        "ArrayFeatureExtractor",
+        [of(kind="int64"), Value("int64", (1,), None, True, True)],
+        {},
+    ),
     ("allowzero", "Reshape", [of(3), fixed(3)], {"allowzero": 1}),
     ("is no shape", "Reshape", [of(3), fixed(-2, 3)], {}),
     ("cannot become", "Reshape", [of(3), fixed(2, -1)], {}),
@@ -64,7 +78,12 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
     ("is no order", "Transpose", [of(3, 3)], {"perm": [0, 0]}),
     ("one float", "ConstantOfShape", [fixed(3)], {"value": Value("float32", (2,))}),
     ("one float", "ConstantOfShape", [fixed(3)], {"value": Value("int64", (1,))}),
-    ("steps of 1", "Range", [fixed(-(2**62), shape=()), fixed(2**62, shape=()), fixed(1, shape=())], {}),
+    (
+        "steps of 1",
+        "Range",
+        [fixed(-(2**62), shape=()), fixed(2**62, shape=()), fixed(1, shape=())],
+        {},
+    ),
     ("a kernel of", "Conv", [of(1, 3, 8, 8, 8, 8), of(1, 3, 1, 1, 1, 1)], {}),
     ("weights of", "Conv", [of(*IMAGE), of(2, 4, 3, 3)], {}),
     ("weights of", "Conv", [of(1, 3), of(2, 3)], {}),
@@ -86,9 +105,24 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
     ("weights of", "GRU", [of(4, 1, 2), of(1, 6, 3), of(1, 6, 2), of(1, 12)], {"hidden_size": 2}),
     ("weights of", "GRU", [of(4, 1, 2), of(1, 6, 2), of(1, 6, 2), of(1, 11)], {"hidden_size": 2}),
     ("single numbers", "QuantizeLinear", [of(3), of(3), of(3, kind="uint8")], {}),
-    ("as many steps", "DequantizeLinear", [of(3, kind="int8"), of(2), of(2, kind="int8")], {"axis": 0}),
-    ("as many steps", "DequantizeLinear", [of(3, kind="int8"), of(3), of(kind="int8")], {"axis": 0}),
-    ("zeros of uint8 for int8", "DequantizeLinear", [of(3, kind="int8"), of(), of(kind="uint8")], {}),
+    (
+        "as many steps",
+        "DequantizeLinear",
+        [of(3, kind="int8"), of(2), of(2, kind="int8")],
+        {"axis": 0},
+    ),
+    (
+        "as many steps",
+        "DequantizeLinear",
+        [of(3, kind="int8"), of(3), of(kind="int8")],
+        {"axis": 0},
+    ),
+    (
+        "zeros of uint8 for int8",
+        "DequantizeLinear",
+        [of(3, kind="int8"), of(), of(kind="uint8")],
+        {},
+    ),
     ("offset must have", "Scaler", [of(1, 3)], {"offset": [1.0], "scale": [1.0] * 3}),
     ("must have", "Scaler", [of(3)], {"offset": [1.0] * 3, "scale": [1.0] * 3}),
     ("metric", "CDist", [of(2, 3), of(2, 3)], {"metric": b"sqeuclidean"}),
@@ -111,7 +145,8 @@ def test_a_rule_refuses(words: str, name: str, inputs: list[Value], given: dict[
 
 @pytest.mark.slow
 def test_all_rules_say_what_onnxruntime_gives():
-    """Models of random operators: type and shape of everything that a sweep moves, as the rules have it and as it is."""
+    """Models of random operators: type and shape of everything that a sweep moves, as the rules
+    have it and as it is."""
     seen: set[str] = set()
     compared = 0
     for seed in range(60):
@@ -119,15 +154,24 @@ def test_all_rules_say_what_onnxruntime_gives():
         sprout.add("", "Cast", ["sweep"], {"to": 1})
         for _ in range(15):
             sprout.grow()
-        moved = {name: value for name, value in sprout.known.items() if value.moved and name != "sweep"}
+        moved = {
+            name: value for name, value in sprout.known.items() if value.moved and name != "sweep"
+        }
         nodes = list(sprout.nodes)
         model = onnx.load_from_string(sprout.model())
         del model.graph.output[:], model.graph.node[:]
         model.graph.node.extend(nodes)
-        types = {name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(value.kind)) for name, value in moved.items()}
-        model.graph.output.extend(onnx.helper.make_tensor_value_info(name, types[name], None) for name in moved)
+        types = {
+            name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(value.kind))
+            for name, value in moved.items()
+        }
+        model.graph.output.extend(
+            onnx.helper.make_tensor_value_info(name, types[name], None) for name in moved
+        )
         try:
-            gives = session(model.SerializeToString()).run(None, {"sweep": np.ones(SWEEP, np.uint8)})
+            gives = session(model.SerializeToString()).run(
+                None, {"sweep": np.ones(SWEEP, np.uint8)}
+            )
         except Exception:  # a place that is not there: onnxruntime looks sweep by sweep
             continue
         for (name, value), have in zip(moved.items(), gives, strict=True):

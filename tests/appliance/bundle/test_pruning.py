@@ -1,4 +1,5 @@
-"""Pruning: what is left of a model gives the same bits, and what only other outputs need is gone."""
+"""Pruning: what is left of a model gives the same bits, and what only other outputs need is
+gone."""
 
 from __future__ import annotations
 
@@ -22,26 +23,36 @@ def names(model: bytes, field: str) -> list[str]:
     return [one.name for one in getattr(reader.read(model).graph, field)]
 
 
-@pytest.mark.parametrize("outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)])
+@pytest.mark.parametrize(
+    "outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)]
+)
 def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...]):
-    """Golden sweeps and noise: each output of the pruned model is that of the whole one, to the bit."""
-    whole, pruned = session(default_bundle.model), session(prune(default_bundle.model, set(outputs)))
+    """Golden sweeps and noise: each output of the pruned model is that of the whole one, to the
+    bit."""
+    whole, pruned = (
+        session(default_bundle.model),
+        session(prune(default_bundle.model, set(outputs))),
+    )
     assert [o.name for o in pruned.get_outputs()] == [name for name in ALL if name in outputs]
-    noise = np.random.default_rng(0).integers(0, 256, (5, *default_bundle.golden.shape[1:]), np.uint8)
+    noise = np.random.default_rng(0).integers(
+        0, 256, (5, *default_bundle.golden.shape[1:]), np.uint8
+    )
     for window in (*default_bundle.golden, *noise):
         want, have = (run(of, outputs, {"sweep": window[None]}) for of in (whole, pruned))
         assert [a.tobytes() for a in have] == [a.tobytes() for a in want]
 
 
 def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
-    """No node and no constant of the heads is left, nothing that no output needs, and all that the outputs need."""
+    """No node and no constant of the heads is left, nothing that no output needs, and all that the
+    outputs need."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     graph = reader.read(pruned).graph
     needed = {name for node in graph.node for name in node.input} | set(names(pruned, "output"))
     assert all(needed.intersection(node.output) for node in graph.node)
     assert {tensor.name for tensor in graph.initializer} <= needed
     given, kept = (
-        {name for node in reader.read(of).graph.node for name in node.output} for of in (default_bundle.model, pruned)
+        {name for node in reader.read(of).graph.node for name in node.output}
+        for of in (default_bundle.model, pruned)
     )
     assert {"early", "head.steps"} <= given - kept
     assert len(names(pruned, "initializer")) < len(names(default_bundle.model, "initializer"))
@@ -68,7 +79,9 @@ def test_a_model_without_other_outputs_stays_as_it_is():
 def test_declarations_of_what_is_gone_are_gone():
     """Of inner values only those of nodes that are left stay declared."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
-    inferred = onnx.shape_inference.infer_shapes(onnx.load_from_string(toy_bundle.model(ALL))).SerializeToString()
+    inferred = onnx.shape_inference.infer_shapes(
+        onnx.load_from_string(toy_bundle.model(ALL))
+    ).SerializeToString()
     assert {"row", "mean"} <= set(names(inferred, "value_info"))
     pruned = prune(inferred, {"embedding"})
     assert set(names(pruned, "value_info")) == {"float", "mean", "taxels"}
@@ -77,7 +90,9 @@ def test_declarations_of_what_is_gone_are_gone():
 
 def test_an_output_that_is_not_there_is_refused():
     """The message names it, and what there is; so does that for bytes that are no model."""
-    with pytest.raises(BundleError, match=r"gives \['embedding', 'logits'\], not \['early'\]; export"):
+    with pytest.raises(
+        BundleError, match=r"gives \['embedding', 'logits'\], not \['early'\]; export"
+    ):
         prune(toy_bundle.model(), {"logits", "early"})
     with pytest.raises(BundleError, match=r"gives \[\], not \['logits'\]"):
         prune(b"", {"logits"})

@@ -1,4 +1,5 @@
-"""`palpate install` beside a service that runs: a bundle for another skin than the one that streams is refused."""
+"""`palpate install` beside a service that runs: a bundle for another skin than the one that streams
+is refused."""
 
 from __future__ import annotations
 
@@ -23,10 +24,26 @@ from tests.factories.deliveries import Delivery
 
 RUNNING = bundle.load(bundle.DEFAULT)
 HEALTH = Health(
-    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000, lost_frames=0,
-    garbage_bytes=0, enumerations=1, dropped=0, bundle=RUNNING.id, source="usb",
-    stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
-)  # fmt: skip
+    time_ns=0,
+    skin="streaming",
+    trouble="",
+    streams=True,
+    sweeping=False,
+    answered=7,
+    frames=5_000,
+    lost_frames=0,
+    garbage_bytes=0,
+    enumerations=1,
+    dropped=0,
+    bundle=RUNNING.id,
+    source="usb",
+    stale_frames=0,
+    overflows=0,
+    fifo_overflows=0,
+    glitches=0,
+    lost_edges=0,
+    storms=0,
+)
 
 
 @pytest.fixture
@@ -44,7 +61,8 @@ def streaming(settings: Config, health: Health | None) -> object:
 
 
 def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config):
-    """Without a service, without a skin, or with a bundle that is not the store's, nothing is known."""
+    """Without a service, without a skin, or with a bundle that is not the store's, nothing is
+    known."""
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
     assert streaming(settings, replace(HEALTH, skin="mismatch", streams=False)) is None
@@ -54,8 +72,14 @@ def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config
 def test_a_bundle_for_another_skin_is_refused_with_both_formats():
     """One for the same skin with another window is taken, and any where the skin is not known."""
     fmt = RUNNING.format
-    other = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, rows=5, cols=3, rate_hz=100.0)))
-    with pytest.raises(BundleError, match=r"is for a skin of 5x3 uint8 at 100 Hz.*the one that streams has 4x4 uint8"):
+    other = replace(
+        RUNNING,
+        manifest=replace(RUNNING.manifest, format=replace(fmt, rows=5, cols=3, rate_hz=100.0)),
+    )
+    with pytest.raises(
+        BundleError,
+        match=r"is for a skin of 5x3 uint8 at 100 Hz.*the one that streams has 4x4 uint8",
+    ):
         bundle_commands.suits(other, fmt)
     bundle_commands.suits(other, None)
     shorter = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, window=750)))
@@ -63,15 +87,24 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
 
 
 @deliveries.NEEDED
-def test_the_command_refuses_it_unless_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`palpate install` beside a service whose skin streams: nothing is changed; with `--other-skin` it is on trial."""
+def test_the_command_refuses_it_unless_it_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """`palpate install` beside a service whose skin streams: nothing is changed; with
+    `--other-skin` it is on trial."""
     box = Delivery(tmp_path)
     held = toy_bundle.files()
-    held[bundle.MANIFEST] = replace(Manifest.parse(held[bundle.MANIFEST]), counter=1, schema=SCHEMA).json()
+    held[bundle.MANIFEST] = replace(
+        Manifest.parse(held[bundle.MANIFEST]), counter=1, schema=SCHEMA
+    ).json()
     folder = box.copied(deliveries.signed(held, box.key))
     how = {"folder": box.how.folder, "signers": box.how.signers, "status": tmp_path / "status.json"}
     StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
-    command = ["install", str(folder), *(word for name in how for word in ("--set", f"store.{name}={how[name]}"))]
+    command = [
+        "install",
+        str(folder),
+        *(word for name in how for word in ("--set", f"store.{name}={how[name]}")),
+    ]
     before = sorted(Path(box.how.folder).rglob("*"))
     assert main(command) == 78
     said = capsys.readouterr()

@@ -25,7 +25,14 @@ from appliance.cli.main import main
 from appliance.core import config, statistics
 from appliance.core.clock import SystemClock
 from appliance.core.devices import Devices
-from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError, LineError, SensorError
+from appliance.core.errors import (
+    ApplianceError,
+    BundleError,
+    ConfigError,
+    FormatError,
+    LineError,
+    SensorError,
+)
 from appliance.core.types import Frames, Status, Sweep, save
 from appliance.inference.classifier import Classifier
 from appliance.io import packets
@@ -48,7 +55,9 @@ def test_run_prints_sentences_and_ends_with_its_script(capsysbinary: pytest.Capt
 @pytest.mark.slow
 def test_run_ends_within_a_second_of_sigterm():
     """SIGTERM: exit code 0 within a second, in real time with a streaming skin."""
-    with subprocess.Popen([sys.executable, "-m", "appliance", "run", "--sim", "skin"], stdout=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        [sys.executable, "-m", "appliance", "run", "--sim", "skin"], stdout=subprocess.PIPE
+    ) as run:
         while b",streaming," not in run.stdout.readline():
             pass
         start = time.monotonic()
@@ -63,21 +72,38 @@ def test_run_on_a_serial_port():
     """With serial.port set the sentences come out there, and standard output stays empty."""
     with pseudo_terminal.pair() as (far, name):
         done = subprocess.run(
-            [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--set", f"serial.port={name}"],
-            capture_output=True, check=True,
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "appliance",
+                "run",
+                "--sim",
+                "skin",
+                *VIRTUAL,
+                "--set",
+                f"serial.port={name}",
+            ],
+            capture_output=True,
+            check=True,
+        )
         assert done.stdout == b""
         assert os.read(far, 65536).count(b",RES,") == 3
 
 
-def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
-    """`run --capture` with a black box, then `replay` of either, and of the same sweeps recorded without a bundle: the
-    same labels and probabilities."""
+def test_kept_and_captured_sweeps_are_replayed(
+    tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
+):
+    """`run --capture` with a black box, then `replay` of either, and of the same sweeps recorded
+    without a bundle: the same labels and probabilities."""
     kept = ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
     assert main(["run", "--sim", "skin", *VIRTUAL, "--capture", str(tmp_path / "c"), *kept]) == 0
 
     def output() -> list[list[bytes]]:
-        return [line.split(b",")[4:8] for line in capsysbinary.readouterr().out.splitlines() if b",RES," in line]
+        return [
+            line.split(b",")[4:8]
+            for line in capsysbinary.readouterr().out.splitlines()
+            if b",RES," in line
+        ]
 
     first = output()
     assert main(["replay", str(tmp_path / "c")]) == 0
@@ -95,13 +121,19 @@ def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsysbinary: pyt
 def test_a_full_disk_costs_the_recording_never_the_classifying(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    """Neither sweeps nor capture can be written: each is logged, every sweep is answered, exit code 0."""
+    """Neither sweeps nor capture can be written: each is logged, every sweep is answered, exit code
+    0."""
 
     def full(*args: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("appliance.core.storage.write", full)
-    assert main(["record", "--sim", "skin", *VIRTUAL, "--out", str(tmp_path), "--capture", "/dev/full"]) == 0
+    assert (
+        main(
+            ["record", "--sim", "skin", *VIRTUAL, "--out", str(tmp_path), "--capture", "/dev/full"]
+        )
+        == 0
+    )
     output = capfd.readouterr()
     assert output.out.count(",RES,") == 3
     assert output.out.count(",full,0,,,,No space left on device*") == 3
@@ -111,10 +143,23 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
 
 @pytest.mark.slow
 def test_a_log_on_a_full_disk_costs_the_log_alone():
-    """Where standard error cannot be written, sweeps are answered all the same, and the exit code is 0."""
-    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin", *VIRTUAL, "--capture", "/dev/full"]
+    """Where standard error cannot be written, sweeps are answered all the same, and the exit code
+    is 0."""
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "run",
+        "--sim",
+        "skin",
+        *VIRTUAL,
+        "--capture",
+        "/dev/full",
+    ]
     with open("/dev/full", "w") as full:
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=full, text=True, timeout=60, check=False
+        )
     assert done.returncode == 0
     assert done.stdout.count("$PPLP,RES,") == 3
 
@@ -122,12 +167,17 @@ def test_a_log_on_a_full_disk_costs_the_log_alone():
 def test_replay_of_a_sweep_set(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
-    """`run --sim replay:FILE`: each window of a set, over the wire, gets the verdict that the window itself gets."""
+    """`run --sim replay:FILE`: each window of a set, over the wire, gets the verdict that the
+    window itself gets."""
     samples = np.concatenate([default_bundle.golden, default_bundle.golden[::-1]])
     np.savez(
-        tmp_path / "set.npz", samples=samples, labels=np.zeros(len(samples), int), materials=np.array(["a", "b"]),
-        rate_hz=750.0, group_recording=np.repeat(np.arange(2), len(default_bundle.golden)),
-    )  # fmt: skip
+        tmp_path / "set.npz",
+        samples=samples,
+        labels=np.zeros(len(samples), int),
+        materials=np.array(["a", "b"]),
+        rate_hz=750.0,
+        group_recording=np.repeat(np.arange(2), len(default_bundle.golden)),
+    )
     assert main(["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]) == 0
     results = [r.split(b",") for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
     assert [int(r[8]) for r in results] == [*range(1, len(default_bundle.golden) + 1)] * 2
@@ -151,13 +201,18 @@ def known_sweeps(whole: bundle.Bundle) -> list[tuple[float, np.ndarray]]:
 def test_the_sequential_test_is_configured(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], default_bundle: bundle.Bundle
 ):
-    """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in `replay`."""
+    """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in
+    `replay`."""
     least_sure = min(known_sweeps(default_bundle), key=lambda named: named[0])
     samples = least_sure[1][None].repeat(3, axis=0)
     np.savez(
-        tmp_path / "set.npz", samples=samples, labels=np.zeros(3, int), materials=np.array(["a"]), rate_hz=750.0,
+        tmp_path / "set.npz",
+        samples=samples,
+        labels=np.zeros(3, int),
+        materials=np.array(["a"]),
+        rate_hz=750.0,
         group_recording=np.zeros(3, int),
-    )  # fmt: skip
+    )
     never = [
         "--set",
         "classifier.min_probability=1",
@@ -167,10 +222,19 @@ def test_the_sequential_test_is_configured(
         "classifier.fuse=product",
     ]
     played = ["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]
-    kept = ["--capture", str(tmp_path / "c"), "--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
+    kept = [
+        "--capture",
+        str(tmp_path / "c"),
+        "--set",
+        f"store.folder={tmp_path}",
+        "--set",
+        "store.black_box=9",
+    ]
 
     def output() -> list[bytes]:
-        return [r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
+        return [
+            r.split(b",")[4] for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r
+        ]
 
     assert least_sure[0] < 0.9999, "take more sweeps, so that one is less sure"
     assert main([*played, *never, *kept]) == 0
@@ -184,7 +248,8 @@ def test_the_sequential_test_is_configured(
 
 
 def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """classifier.early with a bundle without early heads ends before the first sweep; `check` names it."""
+    """classifier.early with a bundle without early heads ends before the first sweep; `check` names
+    it."""
     folder = Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
     manifest = json.loads((folder / bundle.MANIFEST).read_text()) | {"early": None}
     (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
@@ -197,14 +262,21 @@ def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFix
     assert "FAIL  golden sweeps" in capsys.readouterr().out
 
 
-def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]):
+def test_a_sweep_that_was_answered_early_is_replayed_so(
+    tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
+):
     """By a bundle that decides there; another one is named."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy_bundle.FORMAT)
     for least, code in ((0.5, 0), (2.0, 1)):
-        made = toy_bundle.files(early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
+        made = toy_bundle.files(
+            early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early")
+        )
         folder = toy_bundle.put(tmp_path / f"b{least}", made)
-        assert main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"]) == code
+        assert (
+            main(["replay", str(tmp_path / "s.npy"), "--set", f"classifier.bundle={folder}"])
+            == code
+        )
     output = capsysbinary.readouterr()
     assert output.out.count(b",RES,1,") == 1
     assert b",ok,a," in output.out
@@ -221,8 +293,19 @@ def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
 
 @pytest.mark.slow
 def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """On a machine without devices: the bundle is fine, the devices are not, each with its own line, and exit code 1."""
-    code = main(["check", "--board", "rpi5", "--set", f"serial.port={tmp_path}/none", "--set", "sensor.product_id=1"])
+    """On a machine without devices: the bundle is fine, the devices are not, each with its own
+    line, and exit code 1."""
+    code = main(
+        [
+            "check",
+            "--board",
+            "rpi5",
+            "--set",
+            f"serial.port={tmp_path}/none",
+            "--set",
+            "sensor.product_id=1",
+        ]
+    )
     lines = {line[6:20].strip(): line for line in capsys.readouterr().out.splitlines()}
     assert code == 1
     assert lines["bundle"].startswith("ok")
@@ -233,12 +316,22 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Without a bundle the skin is checked all the same; one for another skin is named with both forms and what to do."""
-    skin_and_no_bundle = ["check", "--sim", "skin", "--virtual", "--set", f"classifier.bundle={tmp_path / 'none'}"]
+    """Without a bundle the skin is checked all the same; one for another skin is named with both
+    forms and what to do."""
+    skin_and_no_bundle = [
+        "check",
+        "--sim",
+        "skin",
+        "--virtual",
+        "--set",
+        f"classifier.bundle={tmp_path / 'none'}",
+    ]
     assert main(skin_and_no_bundle) == 1
     assert [line[:20].split()[:2] for line in capsys.readouterr().out.splitlines()] == [
-        ["FAIL", "bundle"], ["ok", "skin"], ["ok", "gpio"],
-    ]  # fmt: skip
+        ["FAIL", "bundle"],
+        ["ok", "skin"],
+        ["ok", "gpio"],
+    ]
     other = toy_bundle.put(tmp_path / "toy", toy_bundle.files())
     assert main(["check", "--sim", "skin", "--virtual", "--set", f"classifier.bundle={other}"]) == 1
     (fail,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAIL")]
@@ -258,8 +351,8 @@ def test_check_of_a_trigger_without_lines(mode: str, capsys: pytest.CaptureFixtu
 def test_record_on_a_machine_without_gpio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], form: str
 ):
-    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are recorded, in the form
-    that the skin announces, or that a person describes."""
+    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are
+    recorded, in the form that the skin announces, or that a person describes."""
     simulated = main_module._simulated(
         "skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True), config.load(None)
     )
@@ -270,7 +363,20 @@ def test_record_on_a_machine_without_gpio(
     if form:
         monkeypatch.setattr("appliance.io.skins.announced", None)
     described = ["--format", form] if form else []
-    code = main(["record", "--every", "4", "--sweeps", "3", "--out", str(tmp_path), "--material", "wood", *described])
+    code = main(
+        [
+            "record",
+            "--every",
+            "4",
+            "--sweeps",
+            "3",
+            "--out",
+            str(tmp_path),
+            "--material",
+            "wood",
+            *described,
+        ]
+    )
     assert code == 0
     assert len([*tmp_path.glob("*.npy")]) == 3
     about = json.loads((tmp_path / "sweep-000001.json").read_text())
@@ -283,10 +389,25 @@ def test_record_on_a_machine_without_gpio(
 
 
 def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`record --sim replay:SET` of a skin that no bundle is for: each window comes out as it went in."""
+    """`record --sim replay:SET` of a skin that no bundle is for: each window comes out as it went
+    in."""
     samples = np.random.default_rng(1).integers(100, 4000, (3, 40, 5, 3)).astype(np.int16)
-    np.savez(tmp_path / "s.npz", samples=samples, labels=[0, 0, 1], materials=["a", "b"], rate_hz=50.0)
-    assert main(["record", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--out", str(tmp_path / "kept")]) == 0
+    np.savez(
+        tmp_path / "s.npz", samples=samples, labels=[0, 0, 1], materials=["a", "b"], rate_hz=50.0
+    )
+    assert (
+        main(
+            [
+                "record",
+                "--sim",
+                f"replay:{tmp_path / 's.npz'}",
+                "--virtual",
+                "--out",
+                str(tmp_path / "kept"),
+            ]
+        )
+        == 0
+    )
     kept = [np.load(path)["taxels"] for path in sorted((tmp_path / "kept").glob("*.npy"))]
     assert np.array_equal(kept, samples)
     output = capsys.readouterr()
@@ -296,19 +417,40 @@ def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.slow
 def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
-    """`palpate record --trigger key` as a person uses it: lines and no sentences; Ctrl-C ends it, the terminal is as
-    before."""
+    """`palpate record --trigger key` as a person uses it: lines and no sentences; Ctrl-C ends it,
+    the terminal is as before."""
     far, near = os.openpty()
     before = termios.tcgetattr(near)
-    command = [sys.executable, "-m", "appliance", "record", "--sim", "skin", "--trigger", "key", "--material", "wood"]
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "record",
+        "--sim",
+        "skin",
+        "--trigger",
+        "key",
+        "--material",
+        "wood",
+    ]
     with subprocess.Popen(
-        [*command, "--out", str(tmp_path)], stdin=near, stdout=near, stderr=near, start_new_session=True,
+        [*command, "--out", str(tmp_path)],
+        stdin=near,
+        stdout=near,
+        stderr=near,
+        start_new_session=True,
         preexec_fn=lambda: fcntl.ioctl(near, termios.TIOCSCTTY, 0),
-    ) as run:  # fmt: skip
+    ) as run:
         shown = b""
-        for until, key in ((b"streaming", b" "), (b"bar stops the sweep", b" "), (b"no answer, short", b"\x03")):
+        for until, key in (
+            (b"streaming", b" "),
+            (b"bar stops the sweep", b" "),
+            (b"no answer, short", b"\x03"),
+        ):
             before_it = shown
-            shown += terminals.read(far, run, lambda more, before=before_it, until=until: until in before + more)
+            shown += terminals.read(
+                far, run, lambda more, before=before_it, until=until: until in before + more
+            )
             assert until in shown
             os.write(far, key)
         assert terminals.ended(run, shown) == 0
@@ -323,7 +465,9 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
     """Each value with the file it comes from."""
     assert main(["config", "--board", "rpi5", "--set", "sweep.max_duration_s=9"]) == 0
     out = capsys.readouterr().out
-    assert "# --set" in next(line for line in out.splitlines() if line.startswith("sweep.max_duration_s"))
+    assert "# --set" in next(
+        line for line in out.splitlines() if line.startswith("sweep.max_duration_s")
+    )
     assert "board-rpi5.toml" in out
 
 
@@ -340,37 +484,89 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (["run", "--sim", "world"], ConfigError, "--sim world is unknown"),
         (["run", "--board", "toaster"], ConfigError, "rpi5"),
         (["run", "--set", "sweep.max_durtion_s=1"], ConfigError, "max_duration_s"),
-        (["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
+        (
+            ["run", "--sim", "skin", "--set", "classifier.bundle=/nowhere"],
+            BundleError,
+            "no bundle at /nowhere",
+        ),
         (["run", "--sim", "replay:/nowhere.npz"], FormatError, "nowhere.npz: not a sweep set"),
         (["run", "--board", "rpi5"], LineError, "gpiochip"),
         (["replay", "/nowhere"], FormatError, "cannot be read"),
         (["replay", "/nowhere.npy"], FormatError, "not a recorded sweep"),
-        (["record", "--sim", "skin", "--virtual", "--out", "/proc/x"], ConfigError, "--out /proc/x"),
-        (["record", "--material", "wood"], SensorError, "or say what it sends, with --format 4x4:uint8:750"),
-        (["skin", "show"], SensorError, "or name another skin with --skin; `palpate skin detect` says which"),
-        (["skin", "show", "--skin", "no.toml"], ConfigError, "no.toml: cannot be read: no such file or directory"),
-        (["record", "--format", "4x4:uint8:750", "--out", "OUT"], ConfigError, "--trigger serial, key or timed"),
-        (["record", "--format", "4:uint8"], ConfigError, "--format 4:uint8: not understood; give rows x columns"),
-        (["record", "--format", "4x4:uint9:10"], ConfigError, "--format 4x4:uint9:10: data type 'uint9' is unknown"),
-        (["record", "--format", "4x4:uint8:10", "--window", "13"], ConfigError, "use a shorter --window"),
+        (
+            ["record", "--sim", "skin", "--virtual", "--out", "/proc/x"],
+            ConfigError,
+            "--out /proc/x",
+        ),
+        (
+            ["record", "--material", "wood"],
+            SensorError,
+            "or say what it sends, with --format 4x4:uint8:750",
+        ),
+        (
+            ["skin", "show"],
+            SensorError,
+            "or name another skin with --skin; `palpate skin detect` says which",
+        ),
+        (
+            ["skin", "show", "--skin", "no.toml"],
+            ConfigError,
+            "no.toml: cannot be read: no such file or directory",
+        ),
+        (
+            ["record", "--format", "4x4:uint8:750", "--out", "OUT"],
+            ConfigError,
+            "--trigger serial, key or timed",
+        ),
+        (
+            ["record", "--format", "4:uint8"],
+            ConfigError,
+            "--format 4:uint8: not understood; give rows x columns",
+        ),
+        (
+            ["record", "--format", "4x4:uint9:10"],
+            ConfigError,
+            "--format 4x4:uint9:10: data type 'uint9' is unknown",
+        ),
+        (
+            ["record", "--format", "4x4:uint8:10", "--window", "13"],
+            ConfigError,
+            "use a shorter --window",
+        ),
         (
             ["record", "--sim", "skin", "--virtual", "--skin", "anyskin", "--window", "0.01"],
             FormatError,
             "a window of 0 frames is empty",
         ),
-        (["record", "--sim", "skin", "--format", "2x2:uint8:10"], FormatError, "2x2 uint8 at 10 Hz"),
+        (
+            ["record", "--sim", "skin", "--format", "2x2:uint8:10"],
+            FormatError,
+            "2x2 uint8 at 10 Hz",
+        ),
         (["run", "--trigger", "serial"], ConfigError, "serial.port names none"),
         (["run", "--trigger", "key"], ConfigError, "standard input is no terminal"),
-        (["run", "--trigger", "key", "--every", "3"], ConfigError, "--every and --sweep are for --trigger timed"),
+        (
+            ["run", "--trigger", "key", "--every", "3"],
+            ConfigError,
+            "--every and --sweep are for --trigger timed",
+        ),
         (["run", "--every", "3"], ConfigError, "a sweep of 3 s every 3 s leaves no pause"),
         (["run", "--sweep", "0"], ConfigError, "trigger.sweep_s = 0.0 is not allowed"),
-        (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "--capture /proc/x"),
+        (
+            ["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"],
+            ConfigError,
+            "--capture /proc/x",
+        ),
     ],
 )
 def test_exit_codes(
-    args: list[str], trouble: type[ApplianceError], hint: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    args: list[str],
+    trouble: type[ApplianceError],
+    hint: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-):  # fmt: skip
+):
     """Each kind of trouble has its exit code and one line that says what to do."""
     if "rpi5" in args and trouble is LineError and any(Path("/dev").glob("gpiochip*")):
         pytest.skip("this machine has gpio chips")
@@ -388,25 +584,39 @@ def test_a_window_is_a_length_of_time(text: str, capsys: pytest.CaptureFixture[s
         main(["record", "--sim", "skin", "--virtual", "--window", text])
     assert ended.value.code == 2
     assert (
-        f"argument --window: {text} is no number of seconds that will do; use 0.01 to 3600" in capsys.readouterr().err
+        f"argument --window: {text} is no number of seconds that will do; use 0.01 to 3600"
+        in capsys.readouterr().err
     )
 
 
 @pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])
 def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]):
     """A sweep set without one of its arrays is named with what is missing."""
-    arrays = {"samples": np.zeros((2, 5, 4, 4), np.uint8), "labels": [0, 0], "materials": ["a"], "rate_hz": 750.0}
+    arrays = {
+        "samples": np.zeros((2, 5, 4, 4), np.uint8),
+        "labels": [0, 0],
+        "materials": ["a"],
+        "rate_hz": 750.0,
+    }
     np.savez(tmp_path / "s.npz", **{k: v for k, v in arrays.items() if k != key})
-    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    assert (
+        main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    )
     assert key in capsys.readouterr().err
 
 
 def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A set that the bundle was not made for is refused with both formats."""
     np.savez(
-        tmp_path / "s.npz", samples=np.zeros((2, 5, 3, 3), np.int16), labels=[0, 0], materials=["a"], rate_hz=100.0
+        tmp_path / "s.npz",
+        samples=np.zeros((2, 5, 3, 3), np.int16),
+        labels=[0, 0],
+        materials=["a"],
+        rate_hz=100.0,
     )
-    assert main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    assert (
+        main(["run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]) == FormatError.exit_code
+    )
     err = capsys.readouterr().err
     assert "3x3 int16 at 100 Hz" in err
     assert "4x4 uint8 at 750 Hz" in err
@@ -440,19 +650,26 @@ def test_wilson():
 
 
 def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture[str]):
-    """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is asked for."""
+    """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is asked
+    for."""
     no_bundle = ["--set", "classifier.bundle=/nowhere"]
     assert main(["skin", "check", "--sim", "skin", "--virtual", *no_bundle]) == 0
     told = capsys.readouterr()
     lines = told.out.splitlines()
     assert len(lines) == 12
-    assert "frames are listened to for 10 s" in told.err  # before anything is printed, a person knows how long it takes
+    assert (
+        "frames are listened to for 10 s" in told.err
+    )  # before anything is printed, a person knows how long it takes
     assert all(line.startswith("ok       ") for line in lines)
 
 
-def test_skin_check_fails_with_a_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_skin_check_fails_with_a_part(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """One line says FAIL and what to do; exit code 1."""
-    monkeypatch.setattr(packets, "pack", lambda *args, right=packets.pack: right(*args)[:-4] + bytes(4))
+    monkeypatch.setattr(
+        packets, "pack", lambda *args, right=packets.pack: right(*args)[:-4] + bytes(4)
+    )
     assert main(["skin", "check", "--sim", "skin", "--virtual"]) == 1
     assert "FAIL     crc       " in (out := capsys.readouterr().out)
     assert "the CRC is 0; compute CRC-32" in out
@@ -463,11 +680,21 @@ def test_skin_check_fails_with_a_part(monkeypatch: pytest.MonkeyPatch, capsys: p
     [
         (["--seconds", "0"], 2, "0 is no number of seconds that will do; use 1 to 3600"),
         (["--seconds", "long"], 2, "long is no number of seconds"),
-        (["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"], 69, "no port /dev/none"),
-        (["--set", "sensor.skin=anyskin"], 78, 'sensor.skin = "anyskin" sends what its maker defines (codec "fixed")'),
+        (
+            ["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"],
+            69,
+            "no port /dev/none",
+        ),
+        (
+            ["--set", "sensor.skin=anyskin"],
+            78,
+            'sensor.skin = "anyskin" sends what its maker defines (codec "fixed")',
+        ),
     ],
 )
-def test_skin_check_refuses(options: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]):
+def test_skin_check_refuses(
+    options: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]
+):
     """Arguments out of range, and a board that is not there."""
     try:
         ended: object = main(["skin", "check", *options])

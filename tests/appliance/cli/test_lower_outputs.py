@@ -20,22 +20,36 @@ def chip() -> gpio.SimGpio:
     return gpio.SimGpio(rig.VirtualClock(), {"/dev/gpiochip0": [f"GPIO{i}" for i in range(28)]})
 
 
-def test_all_outputs_are_requested_low_and_given_back(chip: gpio.SimGpio, monkeypatch: pytest.MonkeyPatch):
-    """Each output of the board, once, as an output at its low level; inputs are left alone; nothing is held after."""
+def test_all_outputs_are_requested_low_and_given_back(
+    chip: gpio.SimGpio, monkeypatch: pytest.MonkeyPatch
+):
+    """Each output of the board, once, as an output at its low level; inputs are left alone; nothing
+    is held after."""
     asked = []
     request = chip.request_lines
-    monkeypatch.setattr(chip, "request_lines", lambda *a, **k: asked.append(a[1]) or request(*a, **k))
+    monkeypatch.setattr(
+        chip, "request_lines", lambda *a, **k: asked.append(a[1]) or request(*a, **k)
+    )
     assert lower_outputs.main(["--board", "rpi5"], chip) == 0
     ((lines, settings),) = [item for one in asked for item in one.items()]
     output = config.load("rpi5").output
-    names = [output.ready, output.busy, output.fault, output.decided, output.result_valid, *output.class_bits]
+    names = [
+        output.ready,
+        output.busy,
+        output.fault,
+        output.decided,
+        output.result_valid,
+        *output.class_bits,
+    ]
     assert sorted(f"GPIO{offset}" for offset in lines) == sorted(names)
     assert settings.direction is chip.line.Direction.OUTPUT
     assert settings.output_value is chip.line.Value.INACTIVE
     assert chip.requests == []
 
 
-def test_a_box_without_lines_has_nothing_to_lower(chip: gpio.SimGpio, capsys: pytest.CaptureFixture[str]):
+def test_a_box_without_lines_has_nothing_to_lower(
+    chip: gpio.SimGpio, capsys: pytest.CaptureFixture[str]
+):
     """No board, no line, no word."""
     assert lower_outputs.main(["--set", "output.ready="], chip) == 0
     assert capsys.readouterr() == ("", "")
@@ -51,7 +65,8 @@ def test_a_box_without_lines_has_nothing_to_lower(chip: gpio.SimGpio, capsys: py
 def test_what_cannot_be_lowered_is_said(
     chip: gpio.SimGpio, args: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
 ):
-    """Held by another program, or settings that cannot be read: one line, and the exit code of its kind."""
+    """Held by another program, or settings that cannot be read: one line, and the exit code of its
+    kind."""
     request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
     assert lower_outputs.main(args, chip) == code
     error = capsys.readouterr().err
@@ -67,5 +82,7 @@ def test_it_is_quick_as_it_loads_little():
         "import sys; from appliance.cli import lower_outputs; lower_outputs.main([]);"
         "print({'numpy', 'onnxruntime', 'usb', 'serial'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     assert done.stdout == "set()\n"

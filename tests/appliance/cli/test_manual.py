@@ -1,4 +1,5 @@
-"""The manual and the change log beside the code: what they name is there, and what is there they name."""
+"""The manual and the change log beside the code: what they name is there, and what is there they
+name."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ from tests.factories.paths import ROOT
 DOCS = ROOT / "docs"
 MANUAL = (DOCS / "manual.md").read_text()
 CHANGES = (ROOT / "CHANGELOG.md").read_text()
-SECTIONS = {title: text for title, text in re.findall(r"(?ms)^## \d+\. (.+?)$(.*?)(?=^## |\Z)", MANUAL)}
+SECTIONS = {
+    title: text for title, text in re.findall(r"(?ms)^## \d+\. (.+?)$(.*?)(?=^## |\Z)", MANUAL)
+}
 BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
 """The lines of all code blocks."""
 PARSER = parser.parser(RUNS)
@@ -38,7 +41,9 @@ def rows(section: str, column: str) -> Iterator[list[str]]:
     """The cells of each row of the tables of a section whose first column is headed so."""
     inside = False
     for line in SECTIONS[section].splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+        cells = (
+            [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+        )
         if cells and inside and not set(cells[0]) <= {"-"}:
             yield cells
         inside = bool(cells) and (inside or cells[0] == column)
@@ -50,17 +55,25 @@ def named(section: str, column: str) -> list[str]:
 
 
 def spoken() -> list[list[str]]:
-    """The arguments of each `palpate` command of the manual's code blocks; what it prints has wide gaps."""
+    """The arguments of each `palpate` command of the manual's code blocks; what it prints has wide
+    gaps."""
     found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in BLOCKS)
     return [shlex.split(m[1]) for m in found if m and "   " not in m[1]]
 
 
 def test_every_status_is_explained():
-    """Section 6 has the statuses of sweep.Status, in their order, and the skin's states, each with what to do."""
+    """Section 6 has the statuses of sweep.Status, in their order, and the skin's states, each with
+    what to do."""
     title = "Statuses, and what to do about each"
     assert named(title, "status") == [*Status]
-    kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, errors.SensorError)]
-    assert set(named(title, "state")) == {k.state for k in kinds if k is not errors.SensorError} | {"streaming"}
+    kinds = [
+        k
+        for k in vars(errors).values()
+        if isinstance(k, type) and issubclass(k, errors.SensorError)
+    ]
+    assert set(named(title, "state")) == {k.state for k in kinds if k is not errors.SensorError} | {
+        "streaming"
+    }
     assert all(all(cells) for column in ("status", "state") for cells in rows(title, column))
 
 
@@ -70,7 +83,8 @@ def test_every_serial_command_is_named():
 
 
 def test_sentences_are_as_the_box_forms_and_reads_them():
-    """Each sentence of the manual has its checksum; RES, STA, ANS and REC are there; commands are understood."""
+    """Each sentence of the manual has its checksum; RES, STA, ANS and REC are there; commands are
+    understood."""
     found = re.findall(r"\$PPLP,([A-Z]+)([^*`\n]*)\*([0-9A-F]{2})", MANUAL)
     kinds = set()
     for kind, rest, given in found:
@@ -114,7 +128,8 @@ def test_training_commands_are_there():
 
 
 def test_make_targets_are_there():
-    """Each `make TARGET NAME=...` of the manual is a target that uses this variable; install and deploy are among them."""
+    """Each `make TARGET NAME=...` of the manual is a target that uses this variable; install and
+    deploy are among them."""
     text = (ROOT / "Makefile").read_text()
     targets = set(re.findall(r"(?m)^([a-z-]+):", text))
     called = re.findall(r"(?m)(?:^    |`)make ([a-z-]+)([^`\n#]*)", MANUAL)
@@ -167,21 +182,30 @@ def test_exit_codes_are_those_of_the_code():
 
 @pytest.mark.parametrize("board", ["rpi4", "rpi5"])
 def test_wiring_is_that_of_the_board_files(board: str):
-    """Each line's kernel name and pin as in the board file, the header drawn as there, the kernel's settings too."""
+    """Each line's kernel name and pin as in the board file, the header drawn as there, the kernel's
+    settings too."""
     text = (ROOT / "firmware_config" / f"board-{board}.toml").read_text()
     settings = config.load(board)
     lines = {
-        "START": settings.trigger.start, "STOP": settings.trigger.stop, "NEW OBJECT": settings.trigger.new_object,
-        **{name.upper().replace("_", " "): getattr(settings.output, name)
-           for name in ("ready", "busy", "result_valid", "fault", "decided")},
+        "START": settings.trigger.start,
+        "STOP": settings.trigger.stop,
+        "NEW OBJECT": settings.trigger.new_object,
+        **{
+            name.upper().replace("_", " "): getattr(settings.output, name)
+            for name in ("ready", "busy", "result_valid", "fault", "decided")
+        },
         **{f"class bit {i}": name for i, name in enumerate(settings.output.class_bits)},
-    }  # fmt: skip
+    }
     shown = {cells[0]: cells[1:] for cells in rows("Wiring", "line")}
     assert shown.keys() - lines.keys() == {"serial TXD", "serial RXD"}
     for role, (_, name, pin, _) in shown.items():
         assert name == lines.get(role, name)
         assert re.search(rf"\({pin}\) +{name}\b|\b{name} +\({pin}\)", text), role
-    header = ["    " + line[2:].rstrip() for line in text.splitlines() if re.search(r"\(\d+\) \(\d+\)", line)]
+    header = [
+        "    " + line[2:].rstrip()
+        for line in text.splitlines()
+        if re.search(r"\(\d+\) \(\d+\)", line)
+    ]
     assert len(header) == 20
     assert "\n".join(header) in MANUAL
     boot = re.findall(r"(?m)^#     ((?:dt|enable)\S+)$", text)
@@ -190,7 +214,8 @@ def test_wiring_is_that_of_the_board_files(board: str):
 
 
 def test_links_and_pictures_are_there():
-    """Each link leads to a file or a place of this page; each picture of docs/manual is shown, with a word for the blind."""
+    """Each link leads to a file or a place of this page; each picture of docs/manual is shown, with
+    a word for the blind."""
     for name, text in (("docs/manual.md", MANUAL), ("CHANGELOG.md", CHANGES)):
         for target in re.findall(r"\]\(([^)#]+)\)", text):
             assert not target.startswith("http"), target
@@ -201,10 +226,16 @@ def test_links_and_pictures_are_there():
 
 def test_pictures_go_to_the_box():
     """What `make install` copies holds the manual and each of its pictures."""
-    copied = re.findall(r'"(docs/[^"]+)": "/usr/share/doc/palpate/([^"]+)"', (ROOT / "systemd/install.py").read_text())
+    copied = re.findall(
+        r'"(docs/[^"]+)": "/usr/share/doc/palpate/([^"]+)"',
+        (ROOT / "systemd/install.py").read_text(),
+    )
     assert ("docs/manual.md", "manual.md") in copied
     for target in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", MANUAL):
-        assert any(f"docs/{target}".startswith(source) and target.startswith(place) for source, place in copied), target
+        assert any(
+            f"docs/{target}".startswith(source) and target.startswith(place)
+            for source, place in copied
+        ), target
 
 
 @pytest.mark.parametrize("path", PICTURES, ids=lambda p: p.name)
@@ -223,7 +254,8 @@ def test_pictures_stand_alone(path: Path):
 
 
 def test_any_terminal_shows_it():
-    """ASCII alone; drawings fit into 80 columns; the sections are those that its first page lists."""
+    """ASCII alone; drawings fit into 80 columns; the sections are those that its first page
+    lists."""
     assert MANUAL.isascii()
     assert CHANGES.isascii()
     drawn = re.findall(r"(?m)^.*[_~]{4}.*$|^.*={4}.*$", MANUAL)
@@ -234,12 +266,14 @@ def test_any_terminal_shows_it():
 
 
 def place(title: str) -> str:
-    """The place in a page that GitHub gives a heading: lower case, without punctuation, a hyphen for each space."""
+    """The place in a page that GitHub gives a heading: lower case, without punctuation, a hyphen
+    for each space."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def test_the_contents_lead_to_their_sections():
-    """Each line of the contents, and each link to a place of the manual in another document, names a heading that is there."""
+    """Each line of the contents, and each link to a place of the manual in another document, names
+    a heading that is there."""
     places = {place(title) for title in re.findall(r"(?m)^#+ (.+)$", MANUAL)}
     linked = re.findall(r"\]\(#([^)]+)\)", MANUAL)
     assert len(linked) >= len(SECTIONS)
@@ -249,45 +283,92 @@ def test_the_contents_lead_to_their_sections():
 
 
 def test_each_drawing_is_seen_once():
-    """Where the manual is rendered it shows the pictures, and the same as text only where it is read as text: in comments,
-    which end where they should."""
+    """Where the manual is rendered it shows the pictures, and the same as text only where it is
+    read as text: in comments, which end where they should."""
     comments = re.findall(r"(?s)<!-- as text:\n\n(.*?)-->", MANUAL)
     rendered = re.sub(r"(?s)<!--.*?-->", "", MANUAL)
     assert len(comments) == len(PICTURES)
     for text in comments:
         assert all(line.startswith("    ") or not line for line in text.splitlines())
     assert not re.findall(r"(?m)^    .*[_~]{4}.*$", rendered)
-    assert "-->" not in rendered.replace(SECTIONS["What it is"], ""), "a comment ended inside its drawing"
+    assert "-->" not in rendered.replace(SECTIONS["What it is"], ""), (
+        "a comment ended inside its drawing"
+    )
 
 
-def verdict(sweep: int, what: Status, label: str = "", probability: float = 0.0, **more: Any) -> Verdict:
+def verdict(
+    sweep: int, what: Status, label: str = "", probability: float = 0.0, **more: Any
+) -> Verdict:
     """An answer, 1 ms after its sweep."""
-    about = {"time_ns": 0, "margin": 0.9, "scores": np.empty(0), "fused": 1, "lost": 0, "latency_ns": 1_000_000} | more
-    return Verdict(sweep=sweep, status=what, label=label, probability=probability, bundle="d5b2b6ef", **about)
+    about = {
+        "time_ns": 0,
+        "margin": 0.9,
+        "scores": np.empty(0),
+        "fused": 1,
+        "lost": 0,
+        "latency_ns": 1_000_000,
+    } | more
+    return Verdict(
+        sweep=sweep, status=what, label=label, probability=probability, bundle="d5b2b6ef", **about
+    )
 
 
 def test_samples_are_what_the_box_prints():
-    """Lines of the journal, of `palpate status` and of `palpate bundles`, from the code that prints them."""
-    shown = [systemd.words(verdict(1, Status.OK, "wood", 0.991)), systemd.words(verdict(8, Status.SENSOR_LOST))]
+    """Lines of the journal, of `palpate status` and of `palpate bundles`, from the code that prints
+    them."""
+    shown = [
+        systemd.words(verdict(1, Status.OK, "wood", 0.991)),
+        systemd.words(verdict(8, Status.SENSOR_LOST)),
+    ]
     health = {
-        "time_ns": 0, "skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "answered": 1,
-        "frames": 54006, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1, "dropped": 0, "bundle": "d5b2b6ef",
-        "source": "usb", "stale_frames": 0, "overflows": 0, "fifo_overflows": 0, "glitches": 0, "lost_edges": 0,
+        "time_ns": 0,
+        "skin": "streaming",
+        "trouble": "",
+        "streams": True,
+        "sweeping": False,
+        "answered": 1,
+        "frames": 54006,
+        "lost_frames": 0,
+        "garbage_bytes": 0,
+        "enumerations": 1,
+        "dropped": 0,
+        "bundle": "d5b2b6ef",
+        "source": "usb",
+        "stale_frames": 0,
+        "overflows": 0,
+        "fifo_overflows": 0,
+        "glitches": 0,
+        "lost_edges": 0,
         "storms": 0,
-    }  # fmt: skip
+    }
     now_ns = 72_000_000_000
     file = {
-        **health, "running": True, "why": "", "pid": 712, "version": __version__, "since_ns": 0,
+        **health,
+        "running": True,
+        "why": "",
+        "pid": 712,
+        "version": __version__,
+        "since_ns": 0,
         "model": "default 2, 6 labels",
-        "verdicts": [verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000).as_dict(arrays=False)],
-    }  # fmt: skip
+        "verdicts": [
+            verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000).as_dict(
+                arrays=False
+            )
+        ],
+    }
     shown += status.lines(file, now_ns)
     detail = "start 1 of 3, 7 of 20 sweeps, 41 of 600 s, as of its last start or end"
-    shown += bundle_commands.lines([
-        bundle_commands.ListedBundle("9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail),
-        bundle_commands.ListedBundle("5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""),
-        bundle_commands.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
-    ])  # fmt: skip
+    shown += bundle_commands.lines(
+        [
+            bundle_commands.ListedBundle(
+                "9" * 64, "9f3c2a1b", "mine", "2", 2, "anna", "on trial", detail
+            ),
+            bundle_commands.ListedBundle(
+                "5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""
+            ),
+            bundle_commands.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
+        ]
+    )
     assert [line for line in shown if line not in BLOCKS] == []
 
 

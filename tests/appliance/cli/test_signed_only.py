@@ -1,4 +1,5 @@
-"""Which bundles a robot is answered by: signed ones, unless a setting allows others, and then everything says so."""
+"""Which bundles a robot is answered by: signed ones, unless a setting allows others, and then
+everything says so."""
 
 from __future__ import annotations
 
@@ -35,17 +36,23 @@ def box(tmp_path: Path) -> Delivery:
 def of(box: Delivery) -> list[str]:
     """The options that name the box's store, keys and status."""
     how = {
-        "store.folder": box.how.folder, "store.signers": box.how.signers, "store.enrolment_key": box.how.enrolment_key,
-        "store.status": box.folder / "status.json", "feed.socket": box.folder / "feed.sock",
-    }  # fmt: skip
+        "store.folder": box.how.folder,
+        "store.signers": box.how.signers,
+        "store.enrolment_key": box.how.enrolment_key,
+        "store.status": box.folder / "status.json",
+        "feed.socket": box.folder / "feed.sock",
+    }
     return [word for name, value in how.items() for word in ("--set", f"{name}={value}")]
 
 
-@pytest.mark.parametrize("command", [("run",), ("check",), ("enrol", "felt", "--out", "new"), ("run", "--shadow")])
+@pytest.mark.parametrize(
+    "command", [("run",), ("check",), ("enrol", "felt", "--out", "new"), ("run", "--shadow")]
+)
 def test_a_robot_is_answered_by_signed_bundles_alone(
     box: Delivery, command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ):
-    """`classifier.bundle` and `--shadow DIR` with an unsigned bundle: refused, with both remedies, before anything else."""
+    """`classifier.bundle` and `--shadow DIR` with an unsigned bundle: refused, with both remedies,
+    before anything else."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     if command == ("run", "--shadow"):
         main([*command, str(folder), *of(box)])  # then it ends, since no line is wired
@@ -84,7 +91,8 @@ def test_what_answers_no_robot_takes_any_bundle(box: Delivery, capsys: pytest.Ca
 def test_the_setting_is_said_at_each_start_by_check_and_by_status(
     box: Delivery, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """While it is on, whatever runs; the status file has it for `palpate status`, and the feed for the page."""
+    """While it is on, whatever runs; the status file has it for `palpate status`, and the feed for
+    the page."""
     monkeypatch.setattr(StatusFile, "stopping", lambda self: None)
     for options, said in ((ALLOWED, True), ((), False)):
         assert main(["run", *VIRTUAL, *of(box), *options]) == 0
@@ -97,7 +105,8 @@ def test_the_setting_is_said_at_each_start_by_check_and_by_status(
 
 
 def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.CaptureFixture[str]):
-    """Then an unsigned bundle starts; here it ends for want of a trigger line, after the warning."""
+    """Then an unsigned bundle starts; here it ends for want of a trigger line, after the
+    warning."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
     warning, *_, end = capsys.readouterr().err.splitlines()
@@ -117,11 +126,16 @@ def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_an_enrolled_label_comes_into_the_store(box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]):
+def test_an_enrolled_label_comes_into_the_store(
+    box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
+):
     """Signed by the box, on trial; the bundles are listed with who signed what."""
     before = box.committed(1)
     assert main(["enrol", "cork", *of(box)]) == 0
-    assert "7 labels; it runs on trial from the next start on: systemctl restart palpate" in capsys.readouterr().err
+    assert (
+        "7 labels; it runs on trial from the next start on: systemctl restart palpate"
+        in capsys.readouterr().err
+    )
     running = box.store.running()
     assert running.bundle.enrolled == {"cork": 5}
     assert main(["bundles", *of(box)]) == 0
@@ -132,7 +146,9 @@ def test_an_enrolled_label_comes_into_the_store(box: Delivery, sliding: None, ca
 
 
 @pytest.mark.slow
-def test_an_enrolled_folder_is_signed(box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]):
+def test_an_enrolled_folder_is_signed(
+    box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
+):
     """--out DIR: `palpate install DIR` takes it."""
     box.committed(1)
     out = box.folder / "with-cork"
@@ -149,13 +165,17 @@ def test_an_enrolled_folder_is_signed(box: Delivery, sliding: None, capsys: pyte
         ((), "key: No such file or directory, so nothing can be enrolled"),
         (("--set", "classifier.early=true"), "early answers end with an enrolment"),
         (ALLOWED, "with classifier.allow_unsigned what is enrolled is not signed"),
-        (VIRTUAL[:3], "with --sim what is enrolled is not signed, and a box takes none such; give --out DIR"),
+        (
+            VIRTUAL[:3],
+            "with --sim what is enrolled is not signed, and a box takes none such; give --out DIR",
+        ),
     ],
 )
 def test_what_cannot_be_enrolled_is_told_before_the_robot_sweeps(
     box: Delivery, options: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str]
 ):
-    """No key, early answers that would end, unsigned results without a folder: one line, exit code 78, no sweep."""
+    """No key, early answers that would end, unsigned results without a folder: one line, exit code
+    78, no sweep."""
     (box.enrolment_key.folder / KEY).unlink()
     assert main(["enrol", "cork", *of(box), *options]) == 78
     output = capsys.readouterr()

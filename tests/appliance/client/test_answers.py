@@ -17,7 +17,21 @@ from tests.factories import speaking_box
 def verdict(status: Status, detail: str = "", share: float = 1.0) -> Verdict:
     """A verdict with this status."""
     label = "wood" if status.classified else ""
-    return Verdict(7, 10**9, status, label, 0.9, 0.8, np.array([0.9]), 2, 1, 1_250_000, "9f3c2a1b", detail, share)
+    return Verdict(
+        7,
+        10**9,
+        status,
+        label,
+        0.9,
+        0.8,
+        np.array([0.9]),
+        2,
+        1,
+        1_250_000,
+        "9f3c2a1b",
+        detail,
+        share,
+    )
 
 
 @pytest.mark.parametrize("status", list(Status))
@@ -25,18 +39,23 @@ def test_an_answer_survives_its_sentence(status: Status):
     """All fields of RES, for each status."""
     read = Answer.read(result(verdict(status, "moved 2.1 mm"), "usb").decode())
     label = "wood" if status.classified else ""
-    assert read == Answer(7, 1.0, status, label, 0.9, 0.8, 2, 1, 1.25, "9f3c2a1b", "usb", 1.0, "moved 2.1 mm")
+    assert read == Answer(
+        7, 1.0, status, label, 0.9, 0.8, 2, 1, 1.25, "9f3c2a1b", "usb", 1.0, "moved 2.1 mm"
+    )
 
 
 def test_a_field_more_is_the_loss_that_cannot_be_seen():
     """RES with field 14 says so; without it loss is known."""
-    lines = [result(verdict(Status.OK), "usb", loss_known=known).decode() for known in (True, False)]
+    lines = [
+        result(verdict(Status.OK), "usb", loss_known=known).decode() for known in (True, False)
+    ]
     assert [Answer.read(line).loss_known for line in lines] == [True, False]
 
 
 @pytest.mark.parametrize("status", list(Status))
 def test_each_status_is_one_kind(status: Status):
-    """A status is known, unsure, faulty, or final without a label to use; and each says what to do."""
+    """A status is known, unsure, faulty, or final without a label to use; and each says what to
+    do."""
     answer = Answer.read(result(verdict(status), "usb").decode())
     final = status in (Status.UNDECIDED, Status.UNKNOWN, Status.RECORDED)
     assert [answer.known, answer.unsure, answer.faulty, final].count(True) == 1
@@ -55,10 +74,17 @@ def test_an_early_answer_says_so():
 
 
 @pytest.mark.parametrize(
-    "fields", ["", "x", "7,1.0,strange,wood,0.9,0.8,1,0,1,b,usb,1.00,", "7,1.0,ok,wood,0.9,0.8,one,0,1,b,usb,1.00,"]
+    "fields",
+    [
+        "",
+        "x",
+        "7,1.0,strange,wood,0.9,0.8,1,0,1,b,usb,1.00,",
+        "7,1.0,ok,wood,0.9,0.8,one,0,1,b,usb,1.00,",
+    ],
 )
 def test_a_sentence_of_another_form_is_named(fields: str):
-    """Too few fields, a status that is not known, a word for a number: an error that repeats them."""
+    """Too few fields, a status that is not known, a word for a number: an error that repeats
+    them."""
     with pytest.raises(FormatError, match="older than the box"):
         Answer.of(fields.split(","))
 
@@ -66,21 +92,29 @@ def test_a_sentence_of_another_form_is_named(fields: str):
 def test_a_damaged_line_is_no_answer():
     """A wrong checksum, none at all, half a line."""
     line = result(verdict(Status.OK), "usb").decode()
-    assert [Answer.read(text) for text in (line.replace("wood", "wo0d"), line.partition("*")[0], line[:20])] == [
-        None
-    ] * 3
+    assert [
+        Answer.read(text)
+        for text in (line.replace("wood", "wo0d"), line.partition("*")[0], line[:20])
+    ] == [None] * 3
 
 
 def test_the_state_is_read_with_all_counts():
     """STA as the box sends it; ready if the skin streams and no sweep is open."""
     read = BoxState.of(sentences.read(speaking_box.state(answered=3)).fields)
-    assert (read.skin, read.answered, read.frames, read.bundle) == ("streaming", 3, 3000, "9f3c2a1b")
+    assert (read.skin, read.answered, read.frames, read.bundle) == (
+        "streaming",
+        3,
+        3000,
+        "9f3c2a1b",
+    )
     assert read.ready
     assert not BoxState.of(sentences.read(speaking_box.state(sweeping=1)).fields).ready
     assert not BoxState.of(sentences.read(speaking_box.state("lost")).fields).ready
 
 
-@pytest.mark.parametrize(("kind", "fields"), [(BoxState, ["1", "streaming"]), (BoxIdentity, ["mine", "2"])])
+@pytest.mark.parametrize(
+    ("kind", "fields"), [(BoxState, ["1", "streaming"]), (BoxIdentity, ["mine", "2"])]
+)
 def test_too_few_fields_are_named(kind: type[BoxState | BoxIdentity], fields: list[str]):
     """A state or an identity that is cut short."""
     with pytest.raises(FormatError, match="older than the box"):

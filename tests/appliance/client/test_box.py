@@ -1,4 +1,5 @@
-"""The client of the serial line: against a scripted box, against noise, unplugging and silence, against the real program."""
+"""The client of the serial line: against a scripted box, against noise, unplugging and silence,
+against the real program."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ def box(speaking: SpeakingBox) -> Iterator[Palpate]:
 
 
 def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
-    """The example of the module: ready, START, STOP, the answer; the commands come in this order."""
+    """The example of the module: ready, START, STOP, the answer; the commands come in this
+    order."""
     box.new_object()
     box.start()
     box.stop()
@@ -93,8 +95,8 @@ def test_a_gap_in_the_numbers_is_told(speaking: SpeakingBox, box: Palpate):
 
 
 def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate):
-    """Numbers begin anew: told once, whether an answer or a state shows it first; answers that it gave meanwhile are
-    counted."""
+    """Numbers begin anew: told once, whether an answer or a state shows it first; answers that it
+    gave meanwhile are counted."""
     speaking.say(result(40), state(answered=40), result(1), state(answered=1))
     box.result(LONG_S)
     assert box.result(LONG_S).missed == 0
@@ -104,7 +106,8 @@ def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate)
 
 
 def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpate):
-    """A flipped character, a missing checksum, noise, an endless line: no answer, a count, and the gap at the next."""
+    """A flipped character, a missing checksum, noise, an endless line: no answer, a count, and the
+    gap at the next."""
     speaking.say(
         result(1),
         result(2).replace(b"wood", b"wo0d"),
@@ -129,10 +132,14 @@ def test_a_sentence_from_a_newer_box_is_told(speaking: SpeakingBox, box: Palpate
 
 def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate):
     """What the box says; also for a command that was damaged on its way there."""
-    speaking.script = lambda s: [sentence("ANS", s.kind, "error", "sweeps are triggered otherwise; set trigger.mode")]
+    speaking.script = lambda s: [
+        sentence("ANS", s.kind, "error", "sweeps are triggered otherwise; set trigger.mode")
+    ]
     with pytest.raises(CommandRefused, match="START: sweeps are triggered otherwise"):
         box.start()
-    speaking.script = lambda s: [sentence("ANS", "", "error", "not a command; send for example PPLP ID")]
+    speaking.script = lambda s: [
+        sentence("ANS", "", "error", "not a command; send for example PPLP ID")
+    ]
     with pytest.raises(CommandRefused, match="not a command"):
         box.start()
 
@@ -153,7 +160,9 @@ def test_an_answer_to_another_command_is_left_alone(speaking: SpeakingBox, box: 
         (Palpate.labels, sentence("ANS", "LABEL", "ok")),
     ],
 )
-def test_an_answer_of_another_form(speaking: SpeakingBox, box: Palpate, ask: Callable, answer: bytes):
+def test_an_answer_of_another_form(
+    speaking: SpeakingBox, box: Palpate, ask: Callable, answer: bytes
+):
     """Fields that are missing are an error, not a guess."""
     speaking.script = lambda s: [answer]
     with pytest.raises(FormatError):
@@ -163,7 +172,9 @@ def test_an_answer_of_another_form(speaking: SpeakingBox, box: Palpate, ask: Cal
 def test_a_silent_box(speaking: SpeakingBox, box: Palpate):
     """Nothing is waited for without end, and the error says when something was last heard."""
     speaking.script = lambda s: []
-    with pytest.raises(NoAnswer, match=r"no answer to STATE within 0\.05 s; the last sentence came"):
+    with pytest.raises(
+        NoAnswer, match=r"no answer to STATE within 0\.05 s; the last sentence came"
+    ):
         box.state(SHORT_S)
     with pytest.raises(NoAnswer, match=r"no answer to a sweep within 0\.05 s"):
         box.result(SHORT_S)
@@ -171,7 +182,9 @@ def test_a_silent_box(speaking: SpeakingBox, box: Palpate):
         box.wait_ready(SHORT_S)
 
 
-@pytest.mark.parametrize(("said", "why"), [(("lost",), "the skin is lost"), (("streaming",), "a sweep is open")])
+@pytest.mark.parametrize(
+    ("said", "why"), [(("lost",), "the skin is lost"), (("streaming",), "a sweep is open")]
+)
 def test_a_box_that_is_not_ready(speaking: SpeakingBox, box: Palpate, said: tuple[str], why: str):
     """The reason stands in the error."""
     fields = state(*said, sweeping=int(said[0] == "streaming")).decode().strip()[10:-3].split(",")
@@ -196,8 +209,11 @@ def waiting(job: Callable[[], object]) -> tuple[threading.Thread, list[Appliance
 
 
 @pytest.mark.parametrize("job", [lambda box: box.ask("TEST"), lambda box: box.result(LONG_S)])
-def test_unplugging_ends_every_wait(speaking: SpeakingBox, box: Palpate, job: Callable[[Palpate], object]):
-    """What was asked is answered with an error at once, and after plugging in the same client goes on."""
+def test_unplugging_ends_every_wait(
+    speaking: SpeakingBox, box: Palpate, job: Callable[[Palpate], object]
+):
+    """What was asked is answered with an error at once, and after plugging in the same client goes
+    on."""
     speaking.script = lambda s: [] if s.kind == "TEST" else obeying(s)
     thread, errors = waiting(lambda: job(box))
     if "result" not in job.__code__.co_names:
@@ -214,7 +230,8 @@ def test_unplugging_ends_every_wait(speaking: SpeakingBox, box: Palpate, job: Ca
 
 
 def test_a_port_is_not_closed_while_a_command_is_written():
-    """The thread that reads finds it lost meanwhile: it closes the port when the command is out, which then fails as lost."""
+    """The thread that reads finds it lost meanwhile: it closes the port when the command is out,
+    which then fails as lost."""
     began, closed, early = threading.Event(), threading.Event(), []
 
     class FailingPort:
@@ -320,11 +337,14 @@ class ShiftedClock(SystemClock):
 
 
 def test_a_socket_in_place_of_a_port():
-    """`socket://host:port` as pyserial opens it; one that was closed, and one that says nothing, is opened again."""
+    """`socket://host:port` as pyserial opens it; one that was closed, and one that says nothing, is
+    opened again."""
     clock = ShiftedClock()
     with create_server(("127.0.0.1", 0)) as server:
         server.settimeout(LONG_S)
-        with Palpate(f"socket://127.0.0.1:{server.getsockname()[1]}", timeout_s=LONG_S, clock=clock) as box:
+        with Palpate(
+            f"socket://127.0.0.1:{server.getsockname()[1]}", timeout_s=LONG_S, clock=clock
+        ) as box:
             first, _ = server.accept()
             first.sendall(result(1))
             assert box.result(LONG_S).label == "wood"
@@ -342,18 +362,22 @@ def test_a_socket_in_place_of_a_port():
 
 
 def test_the_client_needs_pyserial_alone():
-    """A fresh process that imports it has loaded neither numpy nor onnxruntime, and nothing of the box but core."""
+    """A fresh process that imports it has loaded neither numpy nor onnxruntime, and nothing of the
+    box but core."""
     code = (
         "import sys; import appliance.client.box; names = set(sys.modules);"
         "print(sorted({n.split('.')[0] for n in names} & {'numpy', 'onnxruntime', 'usb', 'gpiod', 'serial'}),"
         "sorted({n.split('.')[1] for n in names if n.startswith('appliance.')}))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "['serial'] ['client', 'core']"
 
 
 def test_what_is_no_sentence_of_ours_is_counted(box: Palpate, speaking: SpeakingBox):
-    """REC of `palpate record` and kinds of later versions are passed over; their form is right, so they are no damage."""
+    """REC of `palpate record` and kinds of later versions are passed over; their form is right, so
+    they are no damage."""
     speaking.say(sentence("REC", 7, "stored", 5), sentence("NEW", 1), result(1))
     assert box.result(LONG_S).sweep == 1
     assert box.damaged == 0

@@ -1,4 +1,5 @@
-"""The feed's reader: lines in parts, boxes that come, go, restart and speak another language, and `palpate run` itself."""
+"""The feed's reader: lines in parts, boxes that come, go, restart and speak another language, and
+`palpate run` itself."""
 
 from __future__ import annotations
 
@@ -70,7 +71,10 @@ def test_lines_come_whole_however_they_are_split():
         (b'{"type": 1}\n', "is no line of a feed"),
         (b"[" * 100_000 + b"\n", "is no line of a feed"),
         (b"x" * (MOST_LINE + 1), "a line of over 1048576 bytes"),
-        (b'{"type": "hello", "schema": 2}\n', "speaks schema 2 of the feed, this reader 1; update one of them"),
+        (
+            b'{"type": "hello", "schema": 2}\n',
+            "speaks schema 2 of the feed, this reader 1; update one of them",
+        ),
         (b'{"type": "hello"}\n', "speaks schema None"),
     ],
 )
@@ -110,7 +114,8 @@ def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
 
 @pytest.mark.slow
 def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
-    """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with it."""
+    """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with
+    it."""
     assert feed.read(0) is None
     assert "no palpate offers its feed there; start it" in feed.trouble
     FakeFeed(feed.path).listener.close()
@@ -142,7 +147,8 @@ def test_it_is_not_closed_by_silence_and_waits_as_long_as_it_should(feed: Feed):
 
 
 def test_the_reason_of_the_box_is_kept(tmp_path: Path):
-    """A request that is none: what the box said before it closed stands in `trouble`, and is a line of its own."""
+    """A request that is none: what the box said before it closed stands in `trouble`, and is a line
+    of its own."""
     offered = Offered(tmp_path / "feed.sock")
     offered.turns()
     with Feed(offered.path, frames_hz=50) as feed:
@@ -176,18 +182,29 @@ def test_its_default_is_the_setting_of_the_box():
 
 def test_a_reader_loads_no_numpy():
     """Nothing but Python's own modules and a little of the box."""
-    code = (
-        "import sys, appliance.client.feed; print(sorted({'numpy', 'serial', 'usb', 'onnxruntime'} & set(sys.modules)))"
+    code = "import sys, appliance.client.feed; print(sorted({'numpy', 'serial', 'usb', 'onnxruntime'} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
 @contextmanager
 def running(path: Path) -> Iterator[subprocess.Popen]:
     """`palpate run` on a simulated skin, with its feed at `path`; killed at the end."""
-    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin", "--set", f"feed.socket={path}"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "run",
+        "--sim",
+        "skin",
+        "--set",
+        f"feed.socket={path}",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
+    ) as process:
         try:
             yield process
         finally:
@@ -196,8 +213,8 @@ def running(path: Path) -> Iterator[subprocess.Popen]:
 
 @pytest.mark.slow
 def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
-    """One reader over two processes: hello again with another pid, though the first left its socket behind; the second
-    ends in order, says so, and removes it."""
+    """One reader over two processes: hello again with another pid, though the first left its socket
+    behind; the second ends in order, says so, and removes it."""
     path = tmp_path / "feed.sock"
     pids = []
     with Feed(path, frames_hz=5, sweeps=True) as feed:

@@ -8,9 +8,11 @@ from appliance.core.clock import DeviceClock, SystemClock
 PACKET_NS = 4 * 1e9 / 750
 
 
-def errors_ms(ppm: float, seconds: float, seed: int, spikes: float = 0.01) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time in s, error of the clock in ms and error of a plain arrival stamp in ms, packet by packet as a box sees
-    them."""
+def errors_ms(
+    ppm: float, seconds: float, seed: int, spikes: float = 0.01
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time in s, error of the clock in ms and error of a plain arrival stamp in ms, packet by
+    packet as a box sees them."""
     rng = np.random.default_rng(seed)
     clock = DeviceClock()
     n = round(seconds * 1e9 / PACKET_NS)
@@ -30,8 +32,8 @@ def errors_ms(ppm: float, seconds: float, seed: int, spikes: float = 0.01) -> tu
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_drift_and_spikes(ppm: float, seed: int):
-    """80 ppm and 1 % spikes of 5-40 ms: under 1 ms from the fifth second on, where the arrival time alone is wrong by
-    tens of ms."""
+    """80 ppm and 1 % spikes of 5-40 ms: under 1 ms from the fifth second on, where the arrival time
+    alone is wrong by tens of ms."""
     t_s, error, plain = errors_ms(ppm, 60, seed)
     assert np.abs(error[t_s >= 5]).max() < 1
     assert plain[t_s >= 5].max() > 5
@@ -46,7 +48,12 @@ def test_wraps_of_the_device_clock():
 def test_unwrap_goes_both_ways():
     """A stamp slightly in the past unwraps backwards, not 71 minutes ahead."""
     clock = DeviceClock()
-    assert [clock.unwrap(u) for u in (2**32 - 10, 5, 2**32 - 1, 6)] == [2**32 - 10, 2**32 + 5, 2**32 - 1, 2**32 + 6]
+    assert [clock.unwrap(u) for u in (2**32 - 10, 5, 2**32 - 1, 6)] == [
+        2**32 - 10,
+        2**32 + 5,
+        2**32 - 1,
+        2**32 + 6,
+    ]
 
 
 def test_slope_is_bounded():
@@ -60,7 +67,8 @@ def test_slope_is_bounded():
 
 
 def test_system_clock_sleeps():
-    """The real clock reaches the time it sleeps to, and returns at once for a time that has passed."""
+    """The real clock reaches the time it sleeps to, and returns at once for a time that has
+    passed."""
     clock = SystemClock()
     until = clock.now_ns() + 2_000_000
     clock.sleep_until(until)
@@ -70,7 +78,8 @@ def test_system_clock_sleeps():
 
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
-    """A FIFO that stays 400 ms full for a minute shifts the clock by the crystals' drift, not by 400 ms."""
+    """A FIFO that stays 400 ms full for a minute shifts the clock by the crystals' drift, not by
+    400 ms."""
     clock, errors_ms = DeviceClock(), []
     for i in range(100 * 125):
         true_ns = i * 8_000_000
@@ -84,8 +93,8 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
 @pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
 def test_no_line_is_kept_for_ever(ppm: float):
-    """A board beyond the bound whose first packets all came late: the error is that of the last 20 s and stops
-    growing."""
+    """A board beyond the bound whose first packets all came late: the error is that of the last 20
+    s and stops growing."""
     rng, clock, arrival_ns, error_ms = np.random.default_rng(0), DeviceClock(), 0, []
     for true_ns in range(0, 150_000_000_000, 16_000_000):
         late_ns = 20e6 if true_ns < 5e9 else 1e6

@@ -1,4 +1,5 @@
-"""Settings: layers and their sources, every way a file can be wrong, and the board files as wiring plans."""
+"""Settings: layers and their sources, every way a file can be wrong, and the board files as wiring
+plans."""
 
 from __future__ import annotations
 
@@ -25,8 +26,12 @@ BOARDS = sorted(path.stem.removeprefix("board-") for path in FIRMWARE.glob("boar
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A folder with `sensor.toml`, two boards and an empty `palpate.toml`."""
-    (tmp_path / "sensor.toml").write_text("[sensor]\ntimeout_ms = 50\nretry_ms = 300\n[trigger]\nglitch_us = 100\n")
-    (tmp_path / "board-a.toml").write_text('[trigger]\nstart = "L1"\nstop = "L2"\nglitch_us = 200\n')
+    (tmp_path / "sensor.toml").write_text(
+        "[sensor]\ntimeout_ms = 50\nretry_ms = 300\n[trigger]\nglitch_us = 100\n"
+    )
+    (tmp_path / "board-a.toml").write_text(
+        '[trigger]\nstart = "L1"\nstop = "L2"\nglitch_us = 200\n'
+    )
     (tmp_path / "board-b.toml").write_text('[output]\nready = "L9"\n')
     (tmp_path / "palpate.toml").write_text("")
     return tmp_path
@@ -42,9 +47,12 @@ def _shipped(board: str | None = None, *sets: str) -> config.Config:
 
 
 def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
-    """Defaults, sensor.toml, board, site and --set each decide one value; of two --set the last wins."""
+    """Defaults, sensor.toml, board, site and --set each decide one value; of two --set the last
+    wins."""
     (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nstorm_edges = 50\n")
-    c = _load(folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0")
+    c = _load(
+        folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0"
+    )
     assert (c.board, c.sources["board"]) == ("a", "--board")
     got = {
         "sensor.silence_ms": (c.sensor.silence_ms, 500, "code"),
@@ -56,7 +64,9 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     }
     for name, (value, want, source) in got.items():
         assert (value, c.sources[name]) == (want, source), name
-    assert len(c.sources) == 1 + sum(len(dataclasses.fields(getattr(c, s))) for s in config.Config.__slots__[1:-2])
+    assert len(c.sources) == 1 + sum(
+        len(dataclasses.fields(getattr(c, s))) for s in config.Config.__slots__[1:-2]
+    )
 
 
 def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path) -> None:
@@ -97,14 +107,38 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
         ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),
         ("[trigger]\nactive_low = 1", "trigger.active_low = 1", "true or false"),
         ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
-        ("[trigger]\nbias = ['pull-up']", "trigger.bias = ['pull-up']", 'one of "pull-down", "pull-up"'),
+        (
+            "[trigger]\nbias = ['pull-up']",
+            "trigger.bias = ['pull-up']",
+            'one of "pull-down", "pull-up"',
+        ),
         ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
         ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
-        ("[output]\nclass_bits = 'GPIO16'", "output.class_bits = 'GPIO16'", 'names such as ["GPIO16"]'),
-        ("[output]\nclass_bits = ['A', '']", "output.class_bits = ['A', '']", 'names such as ["GPIO16"]'),
-        ("[sweep]\nmax_duration_s = nan", "sweep.max_duration_s = nan", "a number from 0.1 to 3600.0"),
-        ("[sensor]\nread_bytes = 1000", "sensor.read_bytes = 1000", "a multiple of 512 from 512 to 1048576"),
-        ("[sensor]\nproduct_id = 0x10000", "sensor.product_id = 65536", "a whole number from 1 to 65535"),
+        (
+            "[output]\nclass_bits = 'GPIO16'",
+            "output.class_bits = 'GPIO16'",
+            'names such as ["GPIO16"]',
+        ),
+        (
+            "[output]\nclass_bits = ['A', '']",
+            "output.class_bits = ['A', '']",
+            'names such as ["GPIO16"]',
+        ),
+        (
+            "[sweep]\nmax_duration_s = nan",
+            "sweep.max_duration_s = nan",
+            "a number from 0.1 to 3600.0",
+        ),
+        (
+            "[sensor]\nread_bytes = 1000",
+            "sensor.read_bytes = 1000",
+            "a multiple of 512 from 512 to 1048576",
+        ),
+        (
+            "[sensor]\nproduct_id = 0x10000",
+            "sensor.product_id = 65536",
+            "a whole number from 1 to 65535",
+        ),
         ("[sensor\nserial = 1", "not TOML", "line 1"),
         ("[sensor]\n\nlink = vendor", "not TOML", "line 3"),
     ],
@@ -149,7 +183,9 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
         ('serial.port="a" x=1', "serial", "port", '"a" x=1'),
     ],
 )
-def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, section: str, key: str, value: object) -> None:
+def test_set_takes_toml_or_a_bare_string(
+    folder: Path, option: str, section: str, key: str, value: object
+) -> None:
     """A text that is not one TOML value is used as a string."""
     got = getattr(getattr(_load(folder, None, option), section), key)
     assert (got, type(got)) == (value, type(value))
@@ -157,7 +193,8 @@ def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, section: str
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
 def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> None:
-    """By option and by site file; no name leads out of the folder, and a value that is no name is an error."""
+    """By option and by site file; no name leads out of the folder, and a value that is no name is
+    an error."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
     with pytest.raises(ConfigError, match=r"palpate\.toml: board = .*boards there: a, b$"):
         _load(folder)
@@ -169,7 +206,9 @@ def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> N
 def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
     """`board` in sensor.toml would be read too late."""
     (folder / "sensor.toml").write_text('board = "a"\n')
-    with pytest.raises(ConfigError, match=r"sensor\.toml: board is chosen in .*palpate\.toml, or with --board"):
+    with pytest.raises(
+        ConfigError, match=r"sensor\.toml: board is chosen in .*palpate\.toml, or with --board"
+    ):
         _load(folder)
 
 
@@ -177,8 +216,12 @@ def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
     """Across layers and inside class_bits; both roles and both sources are named."""
     with pytest.raises(ConfigError) as e:
         _load(folder, "a", "output.busy=L1")
-    assert "--set: output.busy = 'L1' is the line of trigger.start (board-a.toml) already" in str(e.value)
-    with pytest.raises(ConfigError, match=r"output\.class_bits = 'X' is the line of output\.class_bits"):
+    assert "--set: output.busy = 'L1' is the line of trigger.start (board-a.toml) already" in str(
+        e.value
+    )
+    with pytest.raises(
+        ConfigError, match=r"output\.class_bits = 'X' is the line of output\.class_bits"
+    ):
         _load(folder, None, "output.class_bits=['X', 'X']")
 
 
@@ -207,21 +250,34 @@ def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None
 
 def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path) -> None:
     """The printed text is a palpate.toml with the same settings."""
-    sets = ["output.class_bits=['A', 'B']", "sensor.serial=Ü𝄞 \\", "sweep.max_duration_s=3", "trigger.active_low=true"]
+    sets = [
+        "output.class_bits=['A', 'B']",
+        "sensor.serial=Ü𝄞 \\",
+        "sweep.max_duration_s=3",
+        "trigger.active_low=true",
+    ]
     c = _load(folder, "a", *sets)
     lines = config.describe(c).splitlines()
     assert len(lines) == len(c.sources)
     shown = {" ".join(line.split()) for line in lines}
-    assert shown > {'board = "a" # --board', "sensor.vendor_id = 0x1209 # code", 'trigger.start = "L1" # board-a.toml'}
+    assert shown > {
+        'board = "a" # --board',
+        "sensor.vendor_id = 0x1209 # code",
+        'trigger.start = "L1" # board-a.toml',
+    }
     (folder / "palpate.toml").write_text("\n".join(lines))
     assert _load(folder) == c
 
 
-@pytest.mark.parametrize("section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")])
+@pytest.mark.parametrize(
+    "section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")]
+)
 def test_each_field_is_explained(section: str) -> None:
     """Every field's name stands in the docstring of its group."""
     group = type(getattr(_shipped(), section))
-    assert [f.name for f in dataclasses.fields(group) if not re.search(rf"\b{f.name}\b", group.__doc__)] == []
+    assert [
+        f.name for f in dataclasses.fields(group) if not re.search(rf"\b{f.name}\b", group.__doc__)
+    ] == []
 
 
 def test_sensor_toml_shows_every_sensor_setting_as_the_code_has_it() -> None:
@@ -231,13 +287,38 @@ def test_sensor_toml_shows_every_sensor_setting_as_the_code_has_it() -> None:
 
 
 HEADER = {
-    3: "GPIO2", 5: "GPIO3", 7: "GPIO4", 8: "GPIO14", 10: "GPIO15", 11: "GPIO17", 12: "GPIO18", 13: "GPIO27",
-    15: "GPIO22", 16: "GPIO23", 18: "GPIO24", 19: "GPIO10", 21: "GPIO9", 22: "GPIO25", 23: "GPIO11", 24: "GPIO8",
-    26: "GPIO7", 27: "ID_SD", 28: "ID_SC", 29: "GPIO5", 31: "GPIO6", 32: "GPIO12", 33: "GPIO13", 35: "GPIO19",
-    36: "GPIO16", 37: "GPIO26", 38: "GPIO20", 40: "GPIO21",
-    **dict.fromkeys((1, 17), "3V3"), **dict.fromkeys((2, 4), "5V"),
+    3: "GPIO2",
+    5: "GPIO3",
+    7: "GPIO4",
+    8: "GPIO14",
+    10: "GPIO15",
+    11: "GPIO17",
+    12: "GPIO18",
+    13: "GPIO27",
+    15: "GPIO22",
+    16: "GPIO23",
+    18: "GPIO24",
+    19: "GPIO10",
+    21: "GPIO9",
+    22: "GPIO25",
+    23: "GPIO11",
+    24: "GPIO8",
+    26: "GPIO7",
+    27: "ID_SD",
+    28: "ID_SC",
+    29: "GPIO5",
+    31: "GPIO6",
+    32: "GPIO12",
+    33: "GPIO13",
+    35: "GPIO19",
+    36: "GPIO16",
+    37: "GPIO26",
+    38: "GPIO20",
+    40: "GPIO21",
+    **dict.fromkeys((1, 17), "3V3"),
+    **dict.fromkeys((2, 4), "5V"),
     **dict.fromkeys((6, 9, 14, 20, 25, 30, 34, 39), "GND"),
-}  # fmt: skip
+}
 
 
 def _page(board: str) -> str:
@@ -245,7 +326,8 @@ def _page(board: str) -> str:
 
 
 def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
-    """What the comment of a board file draws: {pin: name}, {role: name}, a role with its arrow as seen from the box."""
+    """What the comment of a board file draws: {pin: name}, {role: name}, a role with its arrow as
+    seen from the box."""
     rows = re.findall(
         r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w ]+))?$",
         _page(board),
@@ -254,7 +336,10 @@ def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
     pins, roles = {}, {}
     for left_role, left_way, left, odd, even, right, right_way, right_role in rows:
         pins |= {int(odd): left, int(even): right}
-        for role, way, inward, line in ((left_role, left_way, ">", left), (right_role, right_way, "<", right)):
+        for role, way, inward, line in (
+            (left_role, left_way, ">", left),
+            (right_role, right_way, "<", right),
+        ):
             if role:
                 roles[f"{'in' if way == inward else 'out'} {role}"] = line
     return pins, roles
@@ -262,12 +347,16 @@ def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str) -> None:
-    """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role is at its line."""
+    """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role
+    is at its line."""
     c = _shipped(board)
     pins, roles = _drawing(board)
     assert pins == HEADER
     wired = {f"in {name}": getattr(c.trigger, name) for name in ("start", "stop", "new_object")}
-    wired |= {f"out {name}": getattr(c.output, name) for name in ("ready", "busy", "result_valid", "fault", "decided")}
+    wired |= {
+        f"out {name}": getattr(c.output, name)
+        for name in ("ready", "busy", "result_valid", "fault", "decided")
+    }
     wired |= {f"out class_bits {i}": name for i, name in enumerate(c.output.class_bits)}
     assert roles == wired | {"out serial TXD": "GPIO14", "in serial RXD": "GPIO15"}
     beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", _page(board), re.MULTILINE)
@@ -277,7 +366,8 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str)
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_dead_program_is_not_ready(board: str) -> None:
-    """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the pull-down."""
+    """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the
+    pull-down."""
     assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
     for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
         assert words in _page(board)
@@ -290,11 +380,18 @@ def test_one_cable_fits_both_boards() -> None:
 
 
 def test_rules_and_unit_agree_with_the_settings() -> None:
-    """The udev rules carry the sensor's ids, and the unit's groups are those that sysusers makes and the rules use."""
+    """The udev rules carry the sensor's ids, and the unit's groups are those that sysusers makes
+    and the rules use."""
     sensor = config.SensorConfig()
     rules = (FIRMWARE / "70-palpate.rules").read_text()
-    assert rules.count(f'=="{sensor.vendor_id:04x}"') == rules.count(f'=="{sensor.product_id:04x}"') == 2
-    unit, users = ((ROOT / "systemd" / f"palpate.{kind}").read_text() for kind in ("service", "sysusers"))
+    assert (
+        rules.count(f'=="{sensor.vendor_id:04x}"')
+        == rules.count(f'=="{sensor.product_id:04x}"')
+        == 2
+    )
+    unit, users = (
+        (ROOT / "systemd" / f"palpate.{kind}").read_text() for kind in ("service", "sysusers")
+    )
     groups = set(re.findall(r"^SupplementaryGroups=(.*)$", unit, re.MULTILINE)[0].split())
     assert groups == set(re.findall(r"^g (\w+)", users, re.MULTILINE))
     assert set(re.findall(r'GROUP="(\w+)"', rules)) <= groups

@@ -1,4 +1,5 @@
-"""Ctrl-C during the imports of both programs: real processes, and a library that waits to be interrupted while it loads."""
+"""Ctrl-C during the imports of both programs: real processes, and a library that waits to be
+interrupted while it loads."""
 
 from __future__ import annotations
 
@@ -22,24 +23,35 @@ except BaseException as e:  # as extension modules do
 """
 
 
-def _loading(module: str, argv: list[str], library: str, folder: Path, ignored: bool = False) -> subprocess.Popen[str]:
-    """A process of `python -m module` that has begun to import `library`. ignored: it was started with SIGINT ignored."""
+def _loading(
+    module: str, argv: list[str], library: str, folder: Path, ignored: bool = False
+) -> subprocess.Popen[str]:
+    """A process of `python -m module` that has begun to import `library`. ignored: it was started
+    with SIGINT ignored."""
     (folder / f"{library}.py").write_text(LOADING)
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
     process = subprocess.Popen(
-        [sys.executable, "-m", module, *argv], env=env, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None,
-    )  # fmt: skip
+        [sys.executable, "-m", module, *argv],
+        env=env,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None,
+    )
     assert process.stdout
     assert process.stdout.read(len("loading")) == "loading"
     return process
 
 
-@pytest.mark.parametrize(("program", "module", "argv", "library"), [
-    ("palpate", "appliance", ["skin", "list"], "onnxruntime"),
-    ("palpate-train", "train", ["methods"], "numpy"),  # while the program is imported
-    ("palpate-train", "train", ["methods"], "sklearn"),  # while the command is
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("program", "module", "argv", "library"),
+    [
+        ("palpate", "appliance", ["skin", "list"], "onnxruntime"),
+        ("palpate-train", "train", ["methods"], "numpy"),  # while the program is imported
+        ("palpate-train", "train", ["methods"], "sklearn"),  # while the command is
+    ],
+)
 def test_ctrl_c_during_the_imports_is_one_line(
     program: str, module: str, argv: list[str], library: str, tmp_path: Path
 ):

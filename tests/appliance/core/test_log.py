@@ -1,4 +1,5 @@
-"""The log: lines for a terminal and for the journal, levels, a full disk, and trouble that is logged once."""
+"""The log: lines for a terminal and for the journal, levels, a full disk, and trouble that is
+logged once."""
 
 from __future__ import annotations
 
@@ -15,11 +16,14 @@ from appliance.core.log import LineHandler, TroubleLog, in_journal, log, to_stde
 
 def line(text: str, level: int = logging.INFO, *, journal: bool) -> str:
     """A record as it is printed."""
-    return LineHandler(journal=journal).format(logging.LogRecord("palpate", level, "", 0, text, None, None))
+    return LineHandler(journal=journal).format(
+        logging.LogRecord("palpate", level, "", 0, text, None, None)
+    )
 
 
 def test_priorities_are_for_the_journal_alone():
-    """A terminal shows who speaks and no priority; the journal knows the former and wants the latter."""
+    """A terminal shows who speaks and no priority; the journal knows the former and wants the
+    latter."""
     assert line("skin: gone", logging.WARNING, journal=True) == "<4>skin: gone"
     assert line("skin: gone", logging.WARNING, journal=False) == "palpate: skin: gone"
     assert line("skin: streaming", journal=True) == "<6>skin: streaming"
@@ -31,7 +35,8 @@ def test_priorities_are_for_the_journal_alone():
 
 
 def test_the_journal_is_known_by_its_stream(tmp_path: Path):
-    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the journal."""
+    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the
+    journal."""
     with (tmp_path / "out").open("w") as f:
         status = os.fstat(f.fileno())
         environ = {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
@@ -69,9 +74,13 @@ def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
     for now in ("full", "", "full"):
         quiet.update(now)
     assert logged == [
-        "<4>skin: gone; look at the cable", "<4>skin: busy; look at the cable", "skin: streaming",
-        "<4>skin: gone; look at the cable", "<4>disk: full", "<4>disk: full",
-    ]  # fmt: skip
+        "<4>skin: gone; look at the cable",
+        "<4>skin: busy; look at the cable",
+        "skin: streaming",
+        "<4>skin: gone; look at the cable",
+        "<4>disk: full",
+        "<4>disk: full",
+    ]
 
 
 def test_the_first_state_is_logged_where_it_is_not_known(logged: list[str]):

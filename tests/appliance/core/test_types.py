@@ -22,9 +22,15 @@ def test_a_format_with_axes():
     """Text, shape and JSON have the axes where there are several; with one all is as it was."""
     plain = SweepFormat(3, 3, 1000.0, 2000, "float32")
     assert (str(PILLARS), PILLARS.shape, PILLARS.channels) == (
-        "3x3x3 float32 at 1000 Hz, window 2000", (3, 3, 3), 27,
-    )  # fmt: skip
-    assert (str(plain), plain.shape, plain.channels) == ("3x3 float32 at 1000 Hz, window 2000", (3, 3), 9)
+        "3x3x3 float32 at 1000 Hz, window 2000",
+        (3, 3, 3),
+        27,
+    )
+    assert (str(plain), plain.shape, plain.channels) == (
+        "3x3 float32 at 1000 Hz, window 2000",
+        (3, 3),
+        9,
+    )
     assert list(plain.json()) == ["rows", "cols", "rate_hz", "window", "dtype"]
     assert list(PILLARS.json()) == [*plain.json(), "axes"]
     assert PILLARS.skin != plain.skin
@@ -36,7 +42,9 @@ def test_a_format_with_axes():
 @pytest.mark.parametrize("axes", [0, 9, -1])
 def test_axes_out_of_range(axes: int):
     """The message names the number and the limits."""
-    with pytest.raises(FormatError, match=f"{axes} axes of each taxel are out of range; use 1 to 8"):
+    with pytest.raises(
+        FormatError, match=f"{axes} axes of each taxel are out of range; use 1 to 8"
+    ):
         SweepFormat(3, 3, 1000.0, 2000, "float32", axes)
 
 

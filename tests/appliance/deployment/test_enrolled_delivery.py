@@ -1,4 +1,5 @@
-"""A bundle with an enrolled label in the store: on trial, gone back from, older, and every way in which it is refused."""
+"""A bundle with an enrolled label in the store: on trial, gone back from, older, and every way in
+which it is refused."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def grown(box: Delivery, label: str = "cork") -> dict[str, bytes]:
 
 
 def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
-    """Enrolled into a delivered bundle: it runs on trial, is committed, and `rollback` leads to the one without it."""
+    """Enrolled into a delivered bundle: it runs on trial, is committed, and `rollback` leads to the
+    one without it."""
     one = box.committed(1)
     with_cork = box.store.enrol(grown(box))
     chosen = box.store.choose()
@@ -43,7 +45,8 @@ def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
 
 
 def test_a_second_label_and_the_packaged_bundle(box: Delivery):
-    """The packaged bundle is believed like the program; a second label is enrolled into the same bundle."""
+    """The packaged bundle is believed like the program; a second label is enrolled into the same
+    bundle."""
     first = box.store.enrol(grown(box))
     second = box.store.enrol(grown(box, "felt"))
     running = box.store.running()
@@ -61,8 +64,8 @@ def test_three_bad_starts_lead_back_to_the_bundle_without_the_label(box: Deliver
 
 
 def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery):
-    """A newer bundle is taken; then what was enrolled into the older one is older, too. The one that runs may lose its label
-    by being delivered again."""
+    """A newer bundle is taken; then what was enrolled into the older one is older, too. The one
+    that runs may lose its label by being delivered again."""
     box.committed(1)
     old = grown(box)
     with_cork = box.store.enrol(old)
@@ -76,8 +79,11 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery)
     assert box.store.enrol(grown(box, "felt"))
 
 
-def check_refused(box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError) -> None:
-    """The box does not take these files, neither from a folder nor from itself, and runs what it ran."""
+def check_refused(
+    box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
+) -> None:
+    """The box does not take these files, neither from a folder nor from itself, and runs what it
+    ran."""
     before = box.store.current
     for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.enrol(files)):
         with pytest.raises(kind, match=why):
@@ -86,22 +92,36 @@ def check_refused(box: Delivery, files: dict[str, bytes], why: str, kind: type[E
 
 
 def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
-    """Without its signature, by another box's key, by a signer of bundles; labels of another bundle, other labels of this one;
-    a base that nobody signed, of an unknown signer, or altered."""
+    """Without its signature, by another box's key, by a signer of bundles; labels of another
+    bundle, other labels of this one; a base that nobody signed, of an unknown signer, or
+    altered."""
     box.committed(1)
     good, unsigned = grown(box), deliveries.enrolled(dict(box.store.running().files), None)
     other_box = install_scripts.enrolment_key(tmp_path / "other")
     check_refused(box, unsigned, "enrolment.npz is not signed; enrol again on this box")
-    for signed in (other_box.sign(good[bundle.ENROLMENT]), deliveries.signature.sign(good[bundle.ENROLMENT], box.key)):
+    for signed in (
+        other_box.sign(good[bundle.ENROLMENT]),
+        deliveries.signature.sign(good[bundle.ENROLMENT], box.key),
+    ):
         check_refused(box, good | {bundle.ENROLMENT_SIGNATURE: signed}, "not enrolled on this box")
     labels = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
     other = deliveries.files(1, box.key, version="other")
-    check_refused(box, other | {name: good[name] for name in labels}, "enrolment.npz belongs to bundle")
+    check_refused(
+        box, other | {name: good[name] for name in labels}, "enrolment.npz belongs to bundle"
+    )
     felt = grown(box, "felt")
-    check_refused(box, good | {bundle.ENROLMENT: felt[bundle.ENROLMENT]}, "not enrolled on this box, or altered")
+    check_refused(
+        box,
+        good | {bundle.ENROLMENT: felt[bundle.ENROLMENT]},
+        "not enrolled on this box, or altered",
+    )
     nobody = deliveries.files(9, None)
     by_nobody = deliveries.enrolled(nobody, box.enrolment_key)
-    check_refused(box, by_nobody, "is not signed, and is not the one that this version of the program has; enrol again")
+    check_refused(
+        box,
+        by_nobody,
+        "is not signed, and is not the one that this version of the program has; enrol again",
+    )
     unknown = deliveries.files(9, deliveries.key(tmp_path, "unknown"))
     check_refused(box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of those")
     check_refused(box, good | {bundle.MEANS: good[bundle.MEANS] + b"\0"}, "means.npz was altered")
@@ -109,7 +129,8 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
 
 
 def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
-    """Whoever has the box's private key cannot pass off another model, threshold or class mean as enrolled."""
+    """Whoever has the box's private key cannot pass off another model, threshold or class mean as
+    enrolled."""
     box.committed(1)
     good = grown(box)
     evil = deliveries.signed(deliveries.files(1, None, name="evil"), box.enrolment_key.folder / KEY)
@@ -120,7 +141,8 @@ def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
 
 
 def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Delivery):
-    """Without the private key the box goes on; without the signer it says what to do, and goes on once it is made again."""
+    """Without the private key the box goes on; without the signer it says what to do, and goes on
+    once it is made again."""
     box.committed(1)
     box.store.enrol(grown(box))
     assert box.store.commit()
@@ -134,13 +156,19 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     assert box.start() == box.store.current
 
 
-def test_a_program_with_another_packaged_bundle_does_not_take_the_label(box: Delivery, monkeypatch: pytest.MonkeyPatch):
-    """The base was replaced by an upgrade: it is told, with what to do, and `rollback` leads to the new packaged bundle."""
+def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
+    box: Delivery, monkeypatch: pytest.MonkeyPatch
+):
+    """The base was replaced by an upgrade: it is told, with what to do, and `rollback` leads to the
+    new packaged bundle."""
     box.store.enrol(grown(box))
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
     monkeypatch.setattr(bundle, "DEFAULT", newer)
-    with pytest.raises(BundleError, match=r"not the one that this version of the program has; enrol again.*rollback"):
+    with pytest.raises(
+        BundleError,
+        match=r"not the one that this version of the program has; enrol again.*rollback",
+    ):
         box.store.choose()
     assert box.store.rollback() == PACKAGED
     assert box.store.running().bundle.manifest.version == "99"

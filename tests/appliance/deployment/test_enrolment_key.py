@@ -1,4 +1,5 @@
-"""The box's key for enrolments: made at the install, private, for nothing else; what is said where it is missing or damaged."""
+"""The box's key for enrolments: made at the install, private, for nothing else; what is said where
+it is missing or damaged."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def key(tmp_path: Path) -> EnrolmentKey:
 
 
 def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
-    """Nobody else may read it, it signs, the signer believes it; another install changes nothing."""
+    """Nobody else may read it, it signs, the signer believes it; another install changes
+    nothing."""
     assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
     assert (key.folder / SIGNER).stat().st_mode & 0o777 == 0o644
     assert key.folder.stat().st_mode & 0o777 == 0o750
@@ -51,13 +53,16 @@ def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
         (DATA, good[:80]),
         (DATA, b""),
     ):
-        with pytest.raises(BundleError, match=r"not enrolled on this box, or altered since .*palpate enrol"):
+        with pytest.raises(
+            BundleError, match=r"not enrolled on this box, or altered since .*palpate enrol"
+        ):
             key.verify(data, signed)
     key.verify(DATA, good)
 
 
 def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
-    """Even an administrator who puts its line among the signers of bundles makes none of its signatures one of a bundle."""
+    """Even an administrator who puts its line among the signers of bundles makes none of its
+    signatures one of a bundle."""
     signers = tmp_path / "allowed_signers"
     signers.write_text((key.folder / SIGNER).read_text())
     for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):
@@ -111,13 +116,17 @@ def unsigned(key: EnrolmentKey) -> None:
         (cut, "key is damaged; take it and signer away, run make install again"),
         (empty, "key is damaged"),
         (of_another, "is not the key of .*enrolled again"),
-        (unsigned, "cannot be checked: .*signer cannot be read.*make install makes it again from key"),
+        (
+            unsigned,
+            "cannot be checked: .*signer cannot be read.*make install makes it again from key",
+        ),
     ],
 )
 def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
     key: EnrolmentKey, spoil: Callable[[EnrolmentKey], None], why: str
 ):
-    """Missing, open to others, damaged, another box's, without a signer: before the robot sweeps, in one line."""
+    """Missing, open to others, damaged, another box's, without a signer: before the robot sweeps,
+    in one line."""
     spoil(key)
     with pytest.raises(ConfigError, match=why) as e:
         key.check()
@@ -125,7 +134,8 @@ def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
 
 
 def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey):
-    """Where the key is lost the box goes on with what it has; the next install makes no other one, which would end that."""
+    """Where the key is lost the box goes on with what it has; the next install makes no other one,
+    which would end that."""
     signed = key.sign(DATA)
     lost(key)
     install_scripts.enrolment_key(key.folder)

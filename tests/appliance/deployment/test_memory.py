@@ -30,7 +30,8 @@ def limit() -> int:
 
 
 def test_the_service_may_have_what_the_check_allows():
-    """The largest model that passes, or two of them where a candidate runs beside, and the program without: below the limit."""
+    """The largest model that passes, or two of them where a candidate runs beside, and the program
+    without: below the limit."""
     measured = json.loads((ROOT / "docs" / "bench.json").read_text())["rss_mb"]["without_board"]
     program = round(measured * MB)
     assert program + check.MOST_MEMORY + OWN < limit()
@@ -43,15 +44,22 @@ def large(numbers: int) -> dict[str, bytes]:
     model = onnx.load_from_string(toy_bundle.model(("logits",)))
     rng = np.random.default_rng(1)
     for name, shape in (("wide", (3, numbers)), ("back", (numbers, 3))):
-        model.graph.initializer.append(onnx.numpy_helper.from_array(rng.normal(size=shape).astype(np.float32), name))
+        model.graph.initializer.append(
+            onnx.numpy_helper.from_array(rng.normal(size=shape).astype(np.float32), name)
+        )
     product = onnx.helper.make_node
     last = next(node for node in model.graph.node if "logits" in node.output)
     last.output[0] = "small"
-    after = [product("MatMul", ["small", "wide"], ["large"]), product("MatMul", ["large", "back"], ["logits"])]
+    after = [
+        product("MatMul", ["small", "wide"], ["large"]),
+        product("MatMul", ["large", "back"], ["logits"]),
+    ]
     kept = [node for node in model.graph.node if not {"row", "early"} & set(node.output)]
     del model.graph.node[:]
     model.graph.node.extend([*kept, *after])
-    files = toy_bundle.files(known=None, outputs=("logits",)) | {bundle.MODEL: model.SerializeToString()}
+    files = toy_bundle.files(known=None, outputs=("logits",)) | {
+        bundle.MODEL: model.SerializeToString()
+    }
     manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
     entries = manifest.files | {bundle.MODEL: bundle.file_entry(files[bundle.MODEL])}
     return files | {bundle.MANIFEST: toy_bundle.replace(manifest, files=entries).json()}
@@ -76,10 +84,15 @@ print(made.memory, next(line.split()[1] for line in open("/proc/self/status") if
 
 @pytest.mark.slow
 def test_a_bundle_near_the_limit_leaves_the_service_alive(tmp_path: Path):
-    """As large as the check lets through: the program with it, opened and run, stays below what the unit gives it."""
+    """As large as the check lets through: the program with it, opened and run, stays below what the
+    unit gives it."""
     folder = toy_bundle.put(tmp_path / "large", large(1_640_000))
     done = subprocess.run(
-        [sys.executable, "-c", MEASURE, folder], capture_output=True, text=True, cwd=ROOT, check=False
+        [sys.executable, "-c", MEASURE, folder],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     counted, most_kb = map(int, done.stdout.split())

@@ -1,4 +1,5 @@
-"""Shadow mode: how a candidate is compared with the bundle in service, and that it cannot affect the robot."""
+"""Shadow mode: how a candidate is compared with the bundle in service, and that it cannot affect
+the robot."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ class Side:
         self.current = Classifier(current, self.clock, **how)
         self.shadow = Shadow(
             candidate, current, folder, self.clock, lambda b: Classifier(b, self.clock, **how)
-        )  # fmt: skip
+        )
 
     def judge(self, *sweeps: Sweep) -> None:
         """Let both judge each sweep, with the end of its turn."""
@@ -67,7 +68,9 @@ class Side:
 def renamed(old: Bundle, name: str = "aaaaaaaa") -> Bundle:
     """The same bundle with its labels in another order, so that it names every material wrongly."""
     return replace(
-        old, id=name, manifest=replace(old.manifest, labels=(*old.manifest.labels[1:], old.manifest.labels[0]))
+        old,
+        id=name,
+        manifest=replace(old.manifest, labels=(*old.manifest.labels[1:], old.manifest.labels[0])),
     )
 
 
@@ -75,7 +78,9 @@ def renamed(old: Bundle, name: str = "aaaaaaaa") -> Bundle:
 def side(tmp_path: Path) -> Callable[..., Side]:
     """Makes a toy bundle with a candidate: the same bundle, or what `change` returns for it."""
 
-    def make(change: Callable[[Bundle], Bundle] = lambda b: replace(b, id="bbbbbbbb"), **how: Any) -> Side:
+    def make(
+        change: Callable[[Bundle], Bundle] = lambda b: replace(b, id="bbbbbbbb"), **how: Any
+    ) -> Side:
         current = toy_bundle.load(tmp_path / "toy", known=None)
         return Side(current, change(current), tmp_path / "shadow", **how)
 
@@ -86,7 +91,8 @@ A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
 
 
 def test_two_that_agree_are_counted_and_nothing_is_kept(side):
-    """They are written after a minute and at the end, not with each sweep; the text has a Wilson interval."""
+    """They are written after a minute and at the end, not with each sweep; the text has a Wilson
+    interval."""
     pair = side()
     pair.judge(A, B)
     assert pair.written().compared == 0
@@ -102,8 +108,8 @@ def test_two_that_agree_are_counted_and_nothing_is_kept(side):
 
 
 def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
-    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both verdicts bit for
-    bit."""
+    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both
+    verdicts bit for bit."""
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
@@ -114,14 +120,25 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     for name, run in (("verdict", pair.current), ("candidate", pair.shadow._classifier)):
         assert run(again).scores.tolist() == told[name]["scores"]
     written = pair.written()
-    assert (written.compared, written.agreed, written.kept, written.pairs) == (1, 0, 1, {"a": {"b": 1}})
-    assert written.lines(pair.folder)[1:] == ["  a -> b: 1", f"  1 of these are kept in {pair.folder}"]
+    assert (written.compared, written.agreed, written.kept, written.pairs) == (
+        1,
+        0,
+        1,
+        {"a": {"b": 1}},
+    )
+    assert written.lines(pair.folder)[1:] == [
+        "  a -> b: 1",
+        f"  1 of these are kept in {pair.folder}",
+    ]
 
 
 def test_another_status_is_another_answer(side):
-    """The label is the same, but the robot is asked to sweep once more: that counts as a difference."""
+    """The label is the same, but the robot is asked to sweep once more: that counts as a
+    difference."""
     pair = side(
-        lambda b: replace(b, manifest=replace(b.manifest, thresholds=replace(toy_bundle.LIMITS, unsure=0.9999999)))
+        lambda b: replace(
+            b, manifest=replace(b.manifest, thresholds=replace(toy_bundle.LIMITS, unsure=0.9999999))
+        )
     )
     pair.judge(toy_bundle.sweep(2.5, 0))
     assert pair.written().pairs == {"a": {"(unsure) a": 1}}
@@ -169,8 +186,11 @@ def test_it_judges_with_the_box_s_tare(side):
 
 
 def test_without_a_tare_each_bundle_has_its_own(side):
-    """The candidate knows another unloaded skin: it is judged from that, until the robot sends a TARE."""
-    pair = side(lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, unloaded=(1e4,) * 4)))
+    """The candidate knows another unloaded skin: it is judged from that, until the robot sends a
+    TARE."""
+    pair = side(
+        lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, unloaded=(1e4,) * 4))
+    )
     pair.judge(A)
     assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1}}
     pair.tare = pair.current.tare = np.ones((2, 2))
@@ -186,15 +206,24 @@ def test_what_has_no_window_is_not_compared(side):
 
 
 def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
-    """If the candidate has no heads for it, or would wait for more, the sweep is counted but not compared."""
+    """If the candidate has no heads for it, or would wait for more, the sweep is counted but not
+    compared."""
     files = {"outputs": ("logits", "early"), "known": None}
     eager, slow = (
         toy_bundle.load(tmp_path / name, early=Early((least,) * 3, 1), **files)
         for name, least in (("eager", 0.5), ("slow", 2.0))
     )
     plain = toy_bundle.load(tmp_path / "plain", known=None)
-    half = replace(A, share=0.5, frames=types.Frames(*(v[:10] for v in (A.frames.t_ns, A.frames.seq, A.frames.taxels))))
-    for candidate, counts in ((replace(eager, id="e"), (1, 1, 0)), (slow, (0, 0, 1)), (plain, (0, 0, 1))):
+    half = replace(
+        A,
+        share=0.5,
+        frames=types.Frames(*(v[:10] for v in (A.frames.t_ns, A.frames.seq, A.frames.taxels))),
+    )
+    for candidate, counts in (
+        (replace(eager, id="e"), (1, 1, 0)),
+        (slow, (0, 0, 1)),
+        (plain, (0, 0, 1)),
+    ):
         pair = Side(eager, candidate, tmp_path / f"shadow-{candidate.id}")
         verdict = shadow.Decider(pair.current)(half)
         assert verdict
@@ -204,10 +233,19 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Pat
 
 
 class FailingClassifier:
-    """A candidate whose model fails on some sweeps, as onnxruntime does: with an exception of its own."""
+    """A candidate whose model fails on some sweeps, as onnxruntime does: with an exception of its
+    own."""
 
-    def __init__(self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]) -> None:
-        self.bundle, self.self_test, self._run, self._fails, self._act = run.bundle, run.self_test, run, fails, act
+    def __init__(
+        self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
+    ) -> None:
+        self.bundle, self.self_test, self._run, self._fails, self._act = (
+            run.bundle,
+            run.self_test,
+            run,
+            fails,
+            act,
+        )
 
     def __call__(self, one: Sweep):
         """Fail, or judge."""
@@ -222,10 +260,12 @@ def strange() -> None:
 
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
-    """Three failures in a row are logged once, and the candidate is not asked any more; a success starts the count
-    anew."""
+    """Three failures in a row are logged once, and the candidate is not asked any more; a success
+    starts the count anew."""
     pair = side()
-    pair.shadow._classifier = FailingClassifier(pair.shadow._classifier, lambda s: s.id != 3, strange)
+    pair.shadow._classifier = FailingClassifier(
+        pair.shadow._classifier, lambda s: s.id != 3, strange
+    )
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 10)))
     found = pair.shadow.agreement
     assert (found.compared, found.failed) == (1, 5)
@@ -248,8 +288,8 @@ def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
-    """The same pair continues its counts; for another candidate, or another current bundle, counts and sweeps start
-    anew."""
+    """The same pair continues its counts; for another candidate, or another current bundle, counts
+    and sweeps start anew."""
     pair = side(renamed)
     pair.judge(A)
     pair.shadow.stopping()
@@ -268,8 +308,8 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
 
 @pytest.mark.slow
 def test_a_candidate_that_kills_the_program_stays_away(side):
-    """After three starts without an orderly end within a minute there is no fourth; an orderly end, or a minute, resets
-    the count."""
+    """After three starts without an orderly end within a minute there is no fourth; an orderly end,
+    or a minute, resets the count."""
 
     def start(judged_s: float) -> Shadow:
         pair = side()
@@ -290,7 +330,9 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
             start(1)
 
 
-def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
+def test_a_full_disk_costs_the_record_alone(
+    side, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
     """It is logged once; verdicts are still compared."""
     pair = side(renamed)
 
@@ -301,16 +343,19 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch: pytest.MonkeyPatc
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     pair.shadow.stopping()
     assert pair.shadow.agreement.compared == 4
-    assert [line.split(": ")[2] for line in logged] == ["No space left on device; make room there; classifying goes on"]
+    assert [line.split(": ")[2] for line in logged] == [
+        "No space left on device; make room there; classifying goes on"
+    ]
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, more memory than there is for two, golden sweeps with other results, a folder that is a file: each is an error that says what to
-    try."""
+    """Another format, more memory than there is for two, golden sweeps with other results, a folder
+    that is a file: each is an error that says what to try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
     with pytest.raises(
-        BundleError, match=r"bbbbbbbb may need 179 MB and the bundle in service \d+, .* without a shadow"
+        BundleError,
+        match=r"bbbbbbbb may need 179 MB and the bundle in service \d+, .* without a shadow",
     ):
         side(lambda b: replace(b, id="bbbbbbbb", memory=shadow.MOST_MEMORY - b.memory + 1))
     with pytest.raises(BundleError, match="golden sweeps"):
@@ -322,7 +367,9 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
         side()
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}']
+)
 def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged: list[str]):
     """The log names it, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
@@ -334,21 +381,27 @@ def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged:
 
 def test_the_interval_is_wilson_s():
     """It is the one of scipy."""
-    stats = pytest.importorskip("scipy.stats", reason="scipy comes with the desktop's tools (make test)")
+    stats = pytest.importorskip(
+        "scipy.stats", reason="scipy comes with the desktop's tools (make test)"
+    )
     for k, n in ((0, 1), (118, 120), (7, 9), (20, 20)):
         want = stats.binomtest(k, n).proportion_ci(method="wilson")
         assert statistics.wilson(k, n) == pytest.approx((want.low, want.high), abs=1e-6)
 
 
 def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Path):
-    """With a candidate that is always wrong, the simulated box sends the same sentences, and each sweep is kept."""
+    """With a candidate that is always wrong, the simulated box sends the same sentences, and each
+    sweep is kept."""
     heard = []
     for beside in (False, True):
         clock = rig.VirtualClock()
         ghost = Shadow(
-            renamed(default_bundle), default_bundle, tmp_path / "shadow", clock,
+            renamed(default_bundle),
+            default_bundle,
+            tmp_path / "shadow",
+            clock,
             lambda b, clock=clock: Classifier(b, clock),
-        )  # fmt: skip
+        )
         made = rigged(observers=[ghost] if beside else [])
         verdicts = made.until(lambda made=made: made.box.answered >= 3)
         heard.append([line for line in made.heard if ",RES," in line])

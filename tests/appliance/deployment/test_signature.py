@@ -1,4 +1,5 @@
-"""Signatures: which signers a box trusts, and the errors where a signature is wrong or cannot be checked."""
+"""Signatures: which signers a box trusts, and the errors where a signature is wrong or cannot be
+checked."""
 
 from __future__ import annotations
 
@@ -50,20 +51,30 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
     """The file has several signers, comments, empty lines, and the namespace in an option."""
     own, other = deliveries.key(tmp_path, "own", kind), deliveries.key(tmp_path, "other")
     file = tmp_path / "signers"
-    file.write_text("# who may\n\n" + line(other, "ben") + line(own, "anna", 'namespaces="git,palpate-bundle" '))
+    file.write_text(
+        "# who may\n\n" + line(other, "ben") + line(own, "anna", 'namespaces="git,palpate-bundle" ')
+    )
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, own), file) == "anna"
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
 
 
 @pytest.mark.slow
 def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
-    """Another key, namespace or message, a cut, empty or huge signature: each is refused with its reason."""
+    """Another key, namespace or message, a cut, empty or huge signature: each is refused with its
+    reason."""
     good = signature.sign(MESSAGE, signers.ours)
     other = subprocess.run(
-        ["ssh-keygen", "-q", "-Y", "sign", "-n", "git", "-f", signers.ours], input=MESSAGE, stdout=-1, check=True
+        ["ssh-keygen", "-q", "-Y", "sign", "-n", "git", "-f", signers.ours],
+        input=MESSAGE,
+        stdout=-1,
+        check=True,
     )
     for signed, message, why in (
-        (signature.sign(MESSAGE, signers.theirs), MESSAGE, "signed by none of those in .*No principal matched"),
+        (
+            signature.sign(MESSAGE, signers.theirs),
+            MESSAGE,
+            "signed by none of those in .*No principal matched",
+        ),
         (other.stdout, MESSAGE, f"signature of {SIGNER} does not fit .*namespace does not match"),
         (good, MESSAGE + b" ", f"signature of {SIGNER} does not fit .*incorrect signature"),
         (good[:100], MESSAGE, "signed by none"),
@@ -87,8 +98,14 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
     [
         ("", "names nobody"),
         ("# nobody\n\n", "names nobody"),
-        ("anna valid-before=20300101 {key}", "line 1: valid-before is not used here, a box may not know the time"),
-        ('{line}anna namespaces="git",Valid-After="20200101" {key}', "line 2: Valid-After is not used here"),
+        (
+            "anna valid-before=20300101 {key}",
+            "line 1: valid-before is not used here, a box may not know the time",
+        ),
+        (
+            '{line}anna namespaces="git",Valid-After="20200101" {key}',
+            "line 2: Valid-After is not used here",
+        ),
         ("anna cert-authority {key}", "cert-authority is not used here"),
         ("*@lab {key}", "line 1: it is not understood"),
         ("anna,ben {key}", "line 1: it is not understood"),
@@ -105,10 +122,16 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
         ("#" * 300_000, "more than 262144 bytes"),
     ],
 )
-def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers: Signers, text: str, why: str):
+def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(
+    signers: Signers, text: str, why: str
+):
     """A line that ssh-keygen would skip without a message, or would need the time for, is named."""
     key = line(signers.ours).removeprefix(f"{SIGNER} ")
-    text = text.replace("{key}", key).replace("{line}", line(signers.ours)).replace("{blob}", key.split()[1])
+    text = (
+        text.replace("{key}", key)
+        .replace("{line}", line(signers.ours))
+        .replace("{blob}", key.split()[1])
+    )
     signers.file.write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(ConfigError, match=why):
         signers.verify()
@@ -121,7 +144,9 @@ def test_a_missing_file_of_signers_is_named(signers: Signers):
         signers.verify()
 
 
-def test_a_box_without_ssh_keygen_says_what_to_install(signers: Signers, monkeypatch: pytest.MonkeyPatch):
+def test_a_box_without_ssh_keygen_says_what_to_install(
+    signers: Signers, monkeypatch: pytest.MonkeyPatch
+):
     """If ssh-keygen hangs, the box does not."""
     good = signature.sign(MESSAGE, signers.ours)
     monkeypatch.setenv("PATH", str(signers.file.parent))
@@ -143,13 +168,18 @@ def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFi
 
 
 def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, signers: Signers):
-    """`palpate-train sign` makes an ordinary bundle of one with an enrolment: the same labels and answers, another signer."""
-    folder = deliveries.put(tmp_path / "bundle", deliveries.enrolled(deliveries.files(1, None), None))
+    """`palpate-train sign` makes an ordinary bundle of one with an enrolment: the same labels and
+    answers, another signer."""
+    folder = deliveries.put(
+        tmp_path / "bundle", deliveries.enrolled(deliveries.files(1, None), None)
+    )
     before = bundle.load(folder)
     made = sign.sign(folder, signers.ours, 2)
     after, text = bundle.load(folder), (folder / bundle.MANIFEST).read_bytes()
     assert signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
-    assert sorted(path.name for path in folder.iterdir()) == sorted([*made.files, bundle.MANIFEST, bundle.SIGNATURE])
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [*made.files, bundle.MANIFEST, bundle.SIGNATURE]
+    )
     assert (after.added, after.enrolled, made.labels) == (None, {"cork": 1}, before.manifest.labels)
     assert before.classes
     assert after.classes
@@ -160,8 +190,8 @@ def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, sig
 
 
 def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):
-    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without a counter it
-    refuses."""
+    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without
+    a counter it refuses."""
     folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))
     with pytest.raises(BundleError, match="counter 0, which no box takes"):
         sign.sign(folder, signers.ours)
@@ -171,9 +201,13 @@ def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.Captu
         text = (folder / bundle.MANIFEST).read_bytes()
         assert Manifest.parse(text) == made
         assert made.counter == (counter if again else 7)
-        assert signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
+        assert (
+            signature.verify(text, (folder / bundle.SIGNATURE).read_bytes(), signers.file) == SIGNER
+        )
     text = (folder / bundle.MANIFEST).read_bytes()
-    with pytest.raises(BundleError, match=r"has counter 9 already, .* takes no 8; use --counter 10, or export"):
+    with pytest.raises(
+        BundleError, match=r"has counter 9 already, .* takes no 8; use --counter 10, or export"
+    ):
         sign.sign(folder, signers.ours, 8)
     assert (folder / bundle.MANIFEST).read_bytes() == text
     bundle.load(folder)

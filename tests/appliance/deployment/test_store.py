@@ -33,13 +33,16 @@ def box(tmp_path: Path) -> Delivery:
 
 
 def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
-    """Nothing was deployed: no current bundle, nothing to commit, nothing to go back to, no store folder needed."""
+    """Nothing was deployed: no current bundle, nothing to commit, nothing to go back to, no store
+    folder needed."""
     assert box.start() == PACKAGED
     assert not box.store.commit()
     with pytest.raises(BundleError, match="no committed bundle to go back to"):
         box.store.rollback()
     nowhere = store.Store(StoreConfig(folder=str(box.folder / "none")), prove=lambda b: None)
-    assert nowhere.choose().bundle.id == nowhere.running().bundle.id == bundle.load(bundle.DEFAULT).id
+    assert (
+        nowhere.choose().bundle.id == nowhere.running().bundle.id == bundle.load(bundle.DEFAULT).id
+    )
     assert nowhere.candidate() is None
 
 
@@ -63,7 +66,8 @@ def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery,
 
 @pytest.mark.slow
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
-    """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed one again."""
+    """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed
+    one again."""
     one = box.installed(1)
     assert box.store.rollback() == PACKAGED == box.start()
     assert box.installed(1) == one
@@ -74,7 +78,8 @@ def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
 
 @pytest.mark.slow
 def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
-    """The fourth start runs the committed bundle and logs one line; `palpate bundles` has the reason."""
+    """The fourth start runs the committed bundle and logs one line; `palpate bundles` has the
+    reason."""
     one, two = box.committed(1), box.installed(2)
     assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
     logged.clear()
@@ -83,7 +88,10 @@ def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
         f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 times without being committed"
     ]
     told = {e.sha: e for e in bundle_commands.entries(box.store)}
-    assert (told[two].role, told[two].detail) == ("left", "it was started 3 times without being committed")
+    assert (told[two].role, told[two].detail) == (
+        "left",
+        "it was started 3 times without being committed",
+    )
     assert told[one].role == "current"
 
 
@@ -110,7 +118,8 @@ def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
 
 @pytest.mark.slow
 def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
-    """A bundle was committed, rolled back by hand, deployed again and failed: a rollback does not lead to it."""
+    """A bundle was committed, rolled back by hand, deployed again and failed: a rollback does not
+    lead to it."""
     one, two = box.committed(1), box.committed(2)
     assert box.store.rollback() == one
     assert box.installed(2) == two
@@ -142,12 +151,14 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
 
 @pytest.mark.slow
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
-    """The counter must be above all committed ones, also after a rollback; the newest bundle itself may be installed
-    again."""
+    """The counter must be above all committed ones, also after a rollback; the newest bundle itself
+    may be installed again."""
     one, two = box.committed(1), box.committed(2)
     box.store.rollback()
     for counter in (1, 2):
-        with pytest.raises(BundleError, match=f"counter {counter}, and 2 was committed here before"):
+        with pytest.raises(
+            BundleError, match=f"counter {counter}, and 2 was committed here before"
+        ):
             box.store.install(box.made(counter, version="other"))
     assert box.store.current == one
     assert box.installed(2) == two
@@ -182,7 +193,9 @@ def unsigned(box: Delivery) -> Path:
 
 def strange(box: Delivery) -> Path:
     """A bundle signed with a key that nobody knows."""
-    return deliveries.put(box.folder / "in", deliveries.files(1, deliveries.key(box.folder / "theirs")))
+    return deliveries.put(
+        box.folder / "in", deliveries.files(1, deliveries.key(box.folder / "theirs"))
+    )
 
 
 def linked(box: Delivery) -> Path:
@@ -226,7 +239,8 @@ BAD: dict[str, tuple[Ways, str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
-    """Refused with its reason; the current bundle, the state and the folder of bundles are as before."""
+    """Refused with its reason; the current bundle, the state and the folder of bundles are as
+    before."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
     before = box.store.state
     make, why = BAD[name]
@@ -246,7 +260,8 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
 
 
 def test_what_was_checked_is_what_is_written(box: Delivery):
-    """A folder whose owner changes it after the check: the installed bundle is the one that was checked."""
+    """A folder whose owner changes it after the check: the installed bundle is the one that was
+    checked."""
     folder = box.made(1)
 
     def change(held: Bundle) -> None:
@@ -261,13 +276,18 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
 @pytest.mark.parametrize(
     ("does", "why"),
     [
-        (lambda b: os.kill(os.getpid(), signal.SIGKILL), "killed the process that tried it .SIGKILL"),
+        (
+            lambda b: os.kill(os.getpid(), signal.SIGKILL),
+            "killed the process that tried it .SIGKILL",
+        ),
         (lambda b: bytearray(1 << 30), "asks for more than 256 MB"),
         (lambda b: [][0], "cannot be run: IndexError"),
     ],
     ids=["dies", "asks for memory", "raises"],
 )
-def test_a_model_that_kills_its_runtime_is_refused(tmp_path: Path, does: Callable[[Bundle], object], why: str):
+def test_a_model_that_kills_its_runtime_is_refused(
+    tmp_path: Path, does: Callable[[Bundle], object], why: str
+):
     """It is tried in a child process: this process goes on, and reports what the child died of."""
     box = Delivery(tmp_path, does)
     with pytest.raises(BundleError, match=why):
@@ -288,14 +308,20 @@ def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box: Delivery, logged: list[str]):
-    """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle runs."""
+def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(
+    box: Delivery, logged: list[str]
+):
+    """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle
+    runs."""
     one = box.committed(1)
     two = box.installed(2)
     (box.store.bundles.at(two) / bundle.MODEL).write_bytes(b"rotten")
     assert box.start() == one
     assert "was altered" in logged[-1]
-    for counter, error in ((3, BundleError("golden sweeps differ")), (4, ConfigError("no early heads"))):
+    for counter, error in (
+        (3, BundleError("golden sweeps differ")),
+        (4, ConfigError("no early heads")),
+    ):
 
         def prove(held: Bundle, error: Exception = error) -> None:
             raise error
@@ -340,7 +366,11 @@ def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
     left.mkdir()
     (left / "model.onnx").write_bytes(b"half")
     five = box.installed(5)
-    assert set(os.listdir(box.store.bundles.folder)) == {five, *shas[2:]} == set(box.store.state.standings)
+    assert (
+        set(os.listdir(box.store.bundles.folder))
+        == {five, *shas[2:]}
+        == set(box.store.state.standings)
+    )
     assert box.store.rollback() == shas[3]
     assert box.store.rollback() == shas[2]
 
@@ -381,7 +411,8 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
 def test_a_disk_that_takes_no_note_runs_what_was_committed(
     box: Delivery, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """A bundle on trial is not started if the start cannot be counted: a loop of crashes would go unnoticed."""
+    """A bundle on trial is not started if the start cannot be counted: a loop of crashes would go
+    unnoticed."""
 
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
@@ -417,12 +448,15 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
 
 @pytest.mark.slow
 def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Delivery):
-    """Fields that it does not know, of the store and of each bundle, are nothing to it: bundle, trial and counter are as they
-    were, and the newer program reads what this one writes."""
+    """Fields that it does not know, of the store and of each bundle, are nothing to it: bundle,
+    trial and counter are as they were, and the newer program reads what this one writes."""
     one, two = box.committed(1), box.installed(2)
     ledger = Path(box.how.folder, "ledger.json")
     newer = json.loads(ledger.read_text()) | {"format": 9, "kept": {"a": [1]}}
-    newer["standings"] = {sha: held | {"heat": 4.5, "owner": {"name": "x"}} for sha, held in newer["standings"].items()}
+    newer["standings"] = {
+        sha: held | {"heat": 4.5, "owner": {"name": "x"}}
+        for sha, held in newer["standings"].items()
+    }
     assert two in newer["standings"]
     ledger.write_text(json.dumps(newer))
     assert box.start() == two
@@ -455,10 +489,12 @@ def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
 
 @pytest.mark.slow
 def test_no_altered_bundle_is_accepted(tmp_path: Path):
-    """A sample of `make flips`: bits of each file, files swapped with another signed bundle's, cut, unsigned, older; the same
-    of a bundle with an enrolled label."""
+    """A sample of `make flips`: bits of each file, files swapped with another signed bundle's, cut,
+    unsigned, older; the same of a bundle with an enrolled label."""
     found = flips.campaign(tmp_path, 50, seed=2)
     assert found[flips.FLIPPED]["tried"] == 50
     assert sum(kind.startswith(flips.ENROLLED) for kind in found) >= 14
     assert len(found) >= 28
-    assert not any(count["accepted"] or count["believed"] or count["changed"] for count in found.values())
+    assert not any(
+        count["accepted"] or count["believed"] or count["changed"] for count in found.values()
+    )

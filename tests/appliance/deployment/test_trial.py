@@ -1,4 +1,5 @@
-"""A bundle on trial: which starts count, what ends the trial, and that classifying goes on whatever the disk does."""
+"""A bundle on trial: which starts count, what ends the trial, and that classifying goes on whatever
+the disk does."""
 
 from __future__ import annotations
 
@@ -28,10 +29,26 @@ SECOND = 1_000_000_000
 def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
     """Health of the box at this time."""
     return Health(
-        time_ns=round(time_s * SECOND), skin="streaming" if streams else "absent", trouble="", streams=streams,
-        sweeping=sweeping, answered=0, frames=0, lost_frames=0, garbage_bytes=0, enumerations=1, dropped=0,
-        bundle="", source="sim", stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
-    )  # fmt: skip
+        time_ns=round(time_s * SECOND),
+        skin="streaming" if streams else "absent",
+        trouble="",
+        streams=streams,
+        sweeping=sweeping,
+        answered=0,
+        frames=0,
+        lost_frames=0,
+        garbage_bytes=0,
+        enumerations=1,
+        dropped=0,
+        bundle="",
+        source="sim",
+        stale_frames=0,
+        overflows=0,
+        fifo_overflows=0,
+        glitches=0,
+        lost_edges=0,
+        storms=0,
+    )
 
 
 def verdict(label: str = "Canvas") -> Verdict:
@@ -41,7 +58,8 @@ def verdict(label: str = "Canvas") -> Verdict:
 
 
 class Trying(Delivery):
-    """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600 s."""
+    """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600
+    s."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -73,7 +91,8 @@ def booted(box: Trying, name: str) -> None:
 
 
 def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
-    """Nine in its trial: it is still the one that runs; a crash within one boot counts as before, whatever came between."""
+    """Nine in its trial: it is still the one that runs; a crash within one boot counts as before,
+    whatever came between."""
     for cut in range(9):
         booted(box, f"boot {cut}")
         assert box.start() == box.two
@@ -94,7 +113,9 @@ def test_an_orderly_end_before_the_power_goes_is_not_taken_back_twice(box: Tryin
     assert (box.standing.starts, box.standing.cuts) == (1, 0)
 
 
-def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box: Trying, logged: list[str]):
+def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(
+    box: Trying, logged: list[str]
+):
     """After ten times: else one that resets it would stay for ever."""
     for cut in range(10):
         booted(box, f"boot {cut}")
@@ -150,7 +171,8 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
 
 
 def test_enough_sweeps_commit(box: Trying, logged: list[str]):
-    """Sweeps with a label count, and no commit comes while a sweep is open; afterwards older bundles are refused."""
+    """Sweeps with a label count, and no commit comes while a sweep is open; afterwards older
+    bundles are refused."""
     trial = box.tried()
     for _ in range(box.how.trial_sweeps - 1):
         trial.answered(verdict())
@@ -187,7 +209,8 @@ def test_enough_time_commits(box: Trying):
 
 
 def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
-    """A robot that is switched off each evening commits its bundle as well; progress of a crashed start is lost."""
+    """A robot that is switched off each evening commits its bundle as well; progress of a crashed
+    start is lost."""
     for n in range(2):
         trial = box.tried()
         trial.turn(health(0))
@@ -204,19 +227,29 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
 
 @pytest.mark.parametrize(
     ("error", "counts"),
-    [(None, 0), (LineError("no chip"), 0), (KeyboardInterrupt(), 0), (BundleError("bad"), 1), (IndexError("bug"), 1)],
+    [
+        (None, 0),
+        (LineError("no chip"), 0),
+        (KeyboardInterrupt(), 0),
+        (BundleError("bad"), 1),
+        (IndexError("bug"), 1),
+    ],
     ids=repr,
 )
-def test_what_ends_the_program_decides_whether_the_start_counts(box: Trying, error: BaseException | None, counts: int):
-    """Missing hardware and a person who stops the program do not count; an error that the bundle may have caused
-    does."""
+def test_what_ends_the_program_decides_whether_the_start_counts(
+    box: Trying, error: BaseException | None, counts: int
+):
+    """Missing hardware and a person who stops the program do not count; an error that the bundle
+    may have caused does."""
     with suppress(type(error)), box.tried():
         if error:
             raise error
     assert box.standing.starts == counts
 
 
-def test_a_full_disk_is_told_once_and_tried_again(box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
+def test_a_full_disk_is_told_once_and_tried_again(
+    box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
     """Nothing is raised; the commit comes when the disk can be written again."""
     trial = box.tried()
     calls: list[float] = []

@@ -1,4 +1,5 @@
-"""Bundle and classifier: altered files are refused with the reason, and fusion follows the paper and Bayes."""
+"""Bundle and classifier: altered files are refused with the reason, and fusion follows the paper
+and Bayes."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ def test_no_sweep_can_veto():
 
 
 def test_vote_is_the_papers():
-    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first decides."""
+    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first
+    decides."""
     a, b, c = np.eye(3) * 0.8 + 0.1
     assert fuse([b, a], "vote").argmax() == 1
     assert fuse([a, b, b], "vote").argmax() == 1
@@ -71,7 +73,8 @@ def test_golden_sweeps_can_fail(default_bundle: Bundle):
 
 
 def test_verdict_carries_what_is_known(default_bundle: Bundle):
-    """Label, probability, margin, fused, bundle id of a classified sweep; probabilities add up to one."""
+    """Label, probability, margin, fused, bundle id of a classified sweep; probabilities add up to
+    one."""
     clock = VirtualClock()
     v = Classifier(default_bundle, clock)(sweep_of(default_bundle.golden[0], lost=1))
     assert v.status in (Status.OK, Status.UNSURE)
@@ -84,8 +87,12 @@ def test_verdict_carries_what_is_known(default_bundle: Bundle):
 
 def test_below_the_threshold_is_unsure(default_bundle: Bundle):
     """The label is still reported, but not as `ok`."""
-    strict = replace(default_bundle.manifest, thresholds=replace(default_bundle.manifest.thresholds, unsure=1.1))
-    v = Classifier(replace(default_bundle, manifest=strict), VirtualClock())(sweep_of(default_bundle.golden[0]))
+    strict = replace(
+        default_bundle.manifest, thresholds=replace(default_bundle.manifest.thresholds, unsure=1.1)
+    )
+    v = Classifier(replace(default_bundle, manifest=strict), VirtualClock())(
+        sweep_of(default_bundle.golden[0])
+    )
     assert v.status is Status.UNSURE
     assert v.label
 
@@ -102,22 +109,28 @@ def of_features(weights: np.ndarray) -> dict[str, bytes]:
     """The files of the default bundle with another model: input L [1, n] times weights [n, 6]."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("MatMul", ["features", "W"], ["logits"])], "g",
+        [onnx.helper.make_node("MatMul", ["features", "W"], ["logits"])],
+        "g",
         [onnx.helper.make_tensor_value_info("features", 1, [1, len(weights)])],
         [onnx.helper.make_tensor_value_info("logits", 1, [1, 6])],
         [onnx.numpy_helper.from_array(weights.astype(np.float32), "W")],
-    )  # fmt: skip
-    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    )
+    made = onnx.helper.make_model(
+        graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9
+    )
     files = bundle.files(bundle.DEFAULT) | {bundle.MODEL: made.SerializeToString()}
     entries = {name: bundle.file_entry(files[name]) for name in (bundle.MODEL, bundle.GOLDEN)}
     manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
     return files | {
-        bundle.MANIFEST: replace(manifest, input="L", early=None, known=None, moved=None, files=entries).json()
+        bundle.MANIFEST: replace(
+            manifest, input="L", early=None, known=None, moved=None, files=entries
+        ).json()
     }
 
 
 def test_features_go_through_the_same_runtime():
-    """A bundle with input L gets features, not counts: a linear model on them gives the logits that numpy gives."""
+    """A bundle with input L gets features, not counts: a linear model on them gives the logits that
+    numpy gives."""
     from appliance.signal import features
 
     weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
@@ -128,7 +141,9 @@ def test_features_go_through_the_same_runtime():
 
 def test_as_many_features_as_the_manifest_computes():
     """A model of four features is refused, since input L has three."""
-    with pytest.raises(BundleError, match=r"takes float32 \[1, 4\], the manifest has float32 \[1, 3\]"):
+    with pytest.raises(
+        BundleError, match=r"takes float32 \[1, 4\], the manifest has float32 \[1, 3\]"
+    ):
         bundle.from_files(of_features(np.ones((4, 6))), "here")
 
 
@@ -175,7 +190,10 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
         ({"files": {}, "early": None, "known": None, "moved": None}, "does not name model.onnx"),
         ({"format": {"rows": 4}}, "manifest cannot be read"),
         ({"extra": 1}, "extra"),
-        ({"unloaded": [1.0, 2.0]}, "gives 2 counts of the unloaded skin, its frames have 16; export"),
+        (
+            {"unloaded": [1.0, 2.0]},
+            "gives 2 counts of the unloaded skin, its frames have 16; export",
+        ),
         ({"unloaded": 16}, "manifest cannot be read"),
         ({"unloaded": ["1"] * 16}, "manifest cannot be read"),
         (
@@ -189,7 +207,8 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
     ],
 )
 def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):
-    """Unknown schema, input, key; labels that cannot be sent; files that are not named; labels that do not fit."""
+    """Unknown schema, input, key; labels that cannot be sent; files that are not named; labels that
+    do not fit."""
     folder = copy(tmp_path)
     edit(folder, **changes)
     with pytest.raises(BundleError, match=hint):
@@ -197,7 +216,8 @@ def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):
 
 
 def test_a_bundle_may_know_the_unloaded_skin(tmp_path: Path):
-    """The box starts from it as its tare; the manifest of a bundle that does not know it is what it always was."""
+    """The box starts from it as its tare; the manifest of a bundle that does not know it is what it
+    always was."""
     folder = copy(tmp_path)
     before = bundle.load(folder)
     assert Classifier(before, VirtualClock()).tare.tolist() == np.zeros((4, 4)).tolist()
@@ -220,7 +240,8 @@ def test_no_bundle(tmp_path: Path):
 
 
 def test_golden_sweeps_of_another_format(tmp_path: Path):
-    """Golden sweeps that do not fit the manifest's format are refused before the model is opened."""
+    """Golden sweeps that do not fit the manifest's format are refused before the model is
+    opened."""
     folder = copy(tmp_path)
     manifest = json.loads((folder / bundle.MANIFEST).read_text())
     edit(folder, format=manifest["format"] | {"rows": 2})
@@ -231,7 +252,8 @@ def test_golden_sweeps_of_another_format(tmp_path: Path):
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 @pytest.mark.parametrize("axes", [1, 3])
 def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
-    """Every number of every type comes back as it was, also where changes wrap; smooth sweeps take less room."""
+    """Every number of every type comes back as it was, also where changes wrap; smooth sweeps take
+    less room."""
     fmt = SweepFormat(2, 3, 100.0, 50, dtype, axes)
     rng = np.random.default_rng(1)
     any_bits = rng.integers(0, 256, (2, 50, *fmt.shape, fmt.numpy_type.itemsize), np.uint8)
@@ -264,7 +286,10 @@ def test_a_golden_file_without_sweeps():
     packed = io.BytesIO()
     np.savez_compressed(packed, logits=np.zeros((2, 2)))
     with pytest.raises(BundleError, match="holds no sweeps; export the bundle again"):
-        bundle._golden(packed.getvalue(), SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a",)))
+        bundle._golden(
+            packed.getvalue(),
+            SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a",)),
+        )
 
 
 def test_pickles_are_not_opened(tmp_path: Path):
@@ -281,7 +306,10 @@ def test_pickles_are_not_opened(tmp_path: Path):
 def test_a_model_that_is_none(default_bundle: Bundle):
     """One that onnxruntime cannot open, if the bundle's check had accepted it."""
     with pytest.raises(BundleError, match="refuses the model"):
-        Classifier(replace(default_bundle, model=default_bundle.model.replace(b"Gemm", b"Gemn")), VirtualClock())
+        Classifier(
+            replace(default_bundle, model=default_bundle.model.replace(b"Gemm", b"Gemn")),
+            VirtualClock(),
+        )
 
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
@@ -296,7 +324,9 @@ def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **chang
     if arrays is not None:
         (folder / bundle.MEANS).write_bytes(toy_bundle.npz(**arrays))
         files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
-        changes["files"] = files | {bundle.MEANS: bundle.file_entry((folder / bundle.MEANS).read_bytes())}
+        changes["files"] = files | {
+            bundle.MEANS: bundle.file_entry((folder / bundle.MEANS).read_bytes())
+        }
     edit(folder, **changes)
     return folder
 
@@ -307,13 +337,24 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
     old = json.loads((folder / bundle.MANIFEST).read_text())
     (folder / bundle.MANIFEST).write_text(
         json.dumps(
-            {k: v for k, v in old.items() if k not in ("early", "known", "place", "moved", "runtime", "counter")}
+            {
+                k: v
+                for k, v in old.items()
+                if k not in ("early", "known", "place", "moved", "runtime", "counter")
+            }
             | {"schema": 1, "files": {k: v for k, v in old["files"].items() if k != bundle.MEANS}}
         )
     )
     read = bundle.load(folder)
-    assert (read.manifest.early, read.manifest.known, read.classes, read.enrolled) == (None, None, None, {})
-    new = toy_bundle.load(tmp_path / "toy", early=Early((0.9, 0.8, 2.0), 2), outputs=(*toy_bundle.OUTPUTS, "early"))
+    assert (read.manifest.early, read.manifest.known, read.classes, read.enrolled) == (
+        None,
+        None,
+        None,
+        {},
+    )
+    new = toy_bundle.load(
+        tmp_path / "toy", early=Early((0.9, 0.8, 2.0), 2), outputs=(*toy_bundle.OUTPUTS, "early")
+    )
     assert new.manifest.schema == SCHEMA
     assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
     assert new.manifest.early == Early((0.9, 0.8, 2.0), 2)
@@ -361,7 +402,8 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
     ],
 )
 def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
-    """Numbers out of range, fields that are missing or unknown, `known` without means.npz and the reverse."""
+    """Numbers out of range, fields that are missing or unknown, `known` without means.npz and the
+    reverse."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(spoiled(tmp_path, **changes))
 
@@ -383,9 +425,14 @@ def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: s
         (toy_bundle.means(shapes=np.ones((2, 1, 1), np.float16)), "shapes float16 .2, 1, 1."),
         (toy_bundle.means(shapes=np.ones((3, 1, 2), np.float16)), "shapes float16 .3, 1, 2."),
         (toy_bundle.means(shapes=np.ones((3, 3, 3), np.float16)), "shapes float16 .3, 3, 3."),
-        (toy_bundle.means(shapes=np.full((3, 1, 1), np.inf, np.float16)), "shapes that are not finite"),
         (
-            toy_bundle.means(**toy_bundle.moved_arrays() | {"moved_turn": np.eye(3, dtype=np.float32)}),
+            toy_bundle.means(shapes=np.full((3, 1, 1), np.inf, np.float16)),
+            "shapes that are not finite",
+        ),
+        (
+            toy_bundle.means(
+                **toy_bundle.moved_arrays() | {"moved_turn": np.eye(3, dtype=np.float32)}
+            ),
             "moved_turn float32 .3",
         ),
         (
@@ -435,12 +482,18 @@ def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
         ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 3, 1)}, True),
         ({"outputs": ("logits",)}, False),  # known without embedding
         ({"early": Early((0.9,) * 3, 1)}, False),  # no early
-        ({"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 2, 1)}, False),  # another D
+        (
+            {"outputs": ("logits", "embedding", "early"), "early": Early((0.9,) * 2, 1)},
+            False,
+        ),  # another D
         ({"known": None, "outputs": ("embedding",)}, False),  # no logits
         ({"known": None, "outputs": ("logits", "more")}, False),
         ({"known": None, "outputs": ("logits",), "labels": 2}, False),  # another K
         ({"arrays": toy_bundle.means(means=np.eye(3, 5, dtype=np.float32))}, False),  # another r
-        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5]))}, False),  # K0 = 2, the model knows 3
+        (
+            {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5]))},
+            False,
+        ),  # K0 = 2, the model knows 3
         ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, True),
     ],
 )
@@ -452,11 +505,19 @@ def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: di
 
 
 def test_a_far_sweep_is_unknown(tmp_path: Path):
-    """Squared distance to the nearest mean against the limit: at 3 deviations known, beyond not; no label, no score."""
+    """Squared distance to the nearest mean against the limit: at 3 deviations known, beyond not; no
+    label, no score."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
     assert it(toy_bundle.sweep(-3, 0)).label == "a"
     v = it(toy_bundle.sweep(-3, -0.5))
-    assert (v.status, v.label, v.probability, v.margin, v.fused, len(v.scores)) == (Status.UNKNOWN, "", 0, 0, 0, 0)
+    assert (v.status, v.label, v.probability, v.margin, v.fused, len(v.scores)) == (
+        Status.UNKNOWN,
+        "",
+        0,
+        0,
+        0,
+        0,
+    )
     assert v.detail == "squared distance 9.25 from a, limit 9"
     assert it(toy_bundle.sweep(6, 6)).status is Status.UNKNOWN
     assert it(toy_bundle.sweep(9, 0)).label == "b"
@@ -479,28 +540,40 @@ def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
 
 
 def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
-    """Huge float32 counts overflow the network: no label, no NaN, and the object's other sweeps are unaffected."""
+    """Huge float32 counts overflow the network: no label, no NaN, and the object's other sweeps are
+    unaffected."""
     fmt = replace(toy_bundle.FORMAT, dtype="float32")
     made = toy_bundle.files(fmt=fmt, outputs=("logits",), known=None)
     limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
-    made[bundle.MANIFEST] = replace(bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits).json()
+    made[bundle.MANIFEST] = replace(
+        bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits
+    ).json()
     it = Classifier(bundle.load(toy_bundle.put(tmp_path / "toy", made)), VirtualClock())
     far = toy_bundle.sweep(0, 0, object=1, fmt=fmt)
     far.frames.taxels[::2, 0, :] = 2e38
     with np.errstate(invalid="ignore"):
         v = it(far)
-    assert (v.status, v.label, v.probability, v.detail) == (Status.UNKNOWN, "", 0, "the model gives no number")
+    assert (v.status, v.label, v.probability, v.detail) == (
+        Status.UNKNOWN,
+        "",
+        0,
+        "the model gives no number",
+    )
     assert it(toy_bundle.sweep(0, 0, object=1, fmt=fmt)).fused == 1
 
 
 def borderline(**more) -> tuple[Sweep, float]:
-    """A sweep that is "a" with a probability of 1 / (1 + exp(-.6)) = .65 (two labels count), and that probability."""
+    """A sweep that is "a" with a probability of 1 / (1 + exp(-.6)) = .65 (two labels count), and
+    that probability."""
     return toy_bundle.sweep(2.8, -1, **more), 1 / (1 + np.exp(-0.6))
 
 
 def test_sweeps_are_requested_until_the_probability_suffices(tmp_path: Path):
-    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is fused, too."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=5)
+    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is
+    fused, too."""
+    it = Classifier(
+        toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=5
+    )
     given = [it(borderline(object=1)[0]) for _ in range(4)]
     p = borderline()[1]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNSURE, Status.OK, Status.OK]
@@ -513,8 +586,11 @@ def test_sweeps_are_requested_until_the_probability_suffices(tmp_path: Path):
 
 
 def test_at_the_limit_the_answer_is_final(tmp_path: Path):
-    """Undecided with label and probability; a robot that continues is answered by the same rule, and may get ok."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=2)
+    """Undecided with label and probability; a robot that continues is answered by the same rule,
+    and may get ok."""
+    it = Classifier(
+        toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=2
+    )
     given = [it(borderline(object=1)[0]) for _ in range(3)]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
     assert given[1].label == "a"
@@ -525,9 +601,16 @@ def test_at_the_limit_the_answer_is_final(tmp_path: Path):
 
 @pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "fusion": "none"}])
 def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
-    """Without NEW OBJECT, or without fusion, each sweep is its own; a limit of one makes it final."""
+    """Without NEW OBJECT, or without fusion, each sweep is its own; a limit of one makes it
+    final."""
     fusion = more.pop("fusion", "product")
-    it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock(), fusion, min_probability=0.85, max_sweeps=2)
+    it = Classifier(
+        toy_bundle.load(tmp_path / "toy"),
+        VirtualClock(),
+        fusion,
+        min_probability=0.85,
+        max_sweeps=2,
+    )
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNSURE] * 3
     it = Classifier(it.bundle, VirtualClock(), fusion, min_probability=0.85, max_sweeps=1)
     assert [it(borderline(**more)[0]).status for _ in range(3)] == [Status.UNDECIDED] * 3
@@ -550,7 +633,9 @@ def test_what_is_not_ok_need_not_count(tmp_path: Path):
         half = replace(toy_bundle.sweep(0, 0), object=object, share=0.5)
         assert it.conclude_if_ok(half, np.array([0.6, 0.4, 0.0])) is None
     assert it(borderline(object=1)[0]).fused == 2
-    v = it.conclude_if_ok(replace(toy_bundle.sweep(0, 0), object=1, share=0.5), np.array([0.9, 0.1, 0.0]))
+    v = it.conclude_if_ok(
+        replace(toy_bundle.sweep(0, 0), object=1, share=0.5), np.array([0.9, 0.1, 0.0])
+    )
     assert v is not None
     assert (v.status, v.label, v.fused, v.share) == (Status.OK, "a", 3, 0.5)
     assert it(borderline(object=1)[0]).fused == 4
@@ -559,7 +644,9 @@ def test_what_is_not_ok_need_not_count(tmp_path: Path):
 
 def test_early_logits(tmp_path: Path):
     """One row a step."""
-    it = toy_bundle.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=("logits", "early", "embedding"))
+    it = toy_bundle.load(
+        tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=("logits", "early", "embedding")
+    )
     rows = Classifier(it, VirtualClock()).early(toy_bundle.window(1, 0))
     assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
 
@@ -572,7 +659,9 @@ def test_early_logits(tmp_path: Path):
         ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ("embedding",)),
     ],
 )
-def test_only_needed_outputs_are_requested(tmp_path: Path, more: dict, asked: tuple[str, ...], monkeypatch):
+def test_only_needed_outputs_are_requested(
+    tmp_path: Path, more: dict, asked: tuple[str, ...], monkeypatch
+):
     """No unused output is requested from onnxruntime."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
     seen = []
@@ -587,7 +676,8 @@ def test_only_needed_outputs_are_requested(tmp_path: Path, more: dict, asked: tu
 
 
 def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
-    """(means . z + bias) / temperature for every label; the nearest one wins, and its spread is wider by 1 + 1 / n."""
+    """(means . z + bias) / temperature for every label; the nearest one wins, and its spread is
+    wider by 1 + 1 / n."""
     bias = np.float32([0, -18, -18 + 2 / 4])
     arrays = toy_bundle.means(bias=bias, sweeps=np.array([0, 0, 2]))
     it = Classifier(toy_bundle.load(tmp_path / "toy", arrays=arrays, labels=2), VirtualClock())
@@ -600,7 +690,9 @@ def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
     assert it(toy_bundle.sweep(0, 6 + 3.6)).label == "c"
     v = it(toy_bundle.sweep(0, 6 + 3.7))
     assert (v.status, v.detail) == (Status.UNKNOWN, "squared distance 9.127 from c, limit 9")
-    wide = toy_bundle.load(tmp_path / "wide", arrays=arrays | {"spread": np.float32([1, 1, 4])}, labels=2)
+    wide = toy_bundle.load(
+        tmp_path / "wide", arrays=arrays | {"spread": np.float32([1, 1, 4])}, labels=2
+    )
     it = Classifier(wide, VirtualClock())
     assert it(toy_bundle.sweep(0, 6 + 7.3)).label == "c"
     assert it(toy_bundle.sweep(0, 6 + 7.4)).status is Status.UNKNOWN
@@ -617,14 +709,19 @@ def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
 def test_means_of_another_training_are_found(tmp_path: Path, arrays: dict):
     """Class means that give a golden sweep another label than the model's logits are refused."""
     it = Classifier(bundle.load(spoiled(tmp_path, arrays)), VirtualClock())
-    with pytest.raises(BundleError, match=r"means\.npz and the model's own logits call a golden sweep"):
+    with pytest.raises(
+        BundleError, match=r"means\.npz and the model's own logits call a golden sweep"
+    ):
         it.self_test()
 
 
 def test_of_equal_probabilities_the_first_label_is_reported(default_bundle: Bundle):
-    """As argmax: equal votes of neighbours, or coarse logits, must give the same label as at export."""
+    """As argmax: equal votes of neighbours, or coarse logits, must give the same label as at
+    export."""
     it = Classifier(default_bundle, VirtualClock())
     window = default_bundle.golden[0]
-    sweep = Sweep(1, 0, 0, Status.OK, Frames(np.arange(len(window)), np.arange(len(window)), window))
+    sweep = Sweep(
+        1, 0, 0, Status.OK, Frames(np.arange(len(window)), np.arange(len(window)), window)
+    )
     verdict = it.conclude(sweep, np.array([0.0, 0.4, 0.0, 0.4, 0.1, 0.1]))
     assert (verdict.label, verdict.margin) == (default_bundle.manifest.labels[1], 0.0)

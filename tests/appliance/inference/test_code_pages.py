@@ -22,7 +22,9 @@ LIBRARY = os.path.realpath(onnxruntime_pybind11_state.__file__)
 def resident_code() -> int:
     """KiB of onnxruntime's code in memory."""
     found = re.findall(
-        rf"^\S+ r-xp .*{re.escape(LIBRARY)}\n(?:\S+:.*\n)*?Rss: *(\d+)", Path("/proc/self/smaps").read_text(), re.M
+        rf"^\S+ r-xp .*{re.escape(LIBRARY)}\n(?:\S+:.*\n)*?Rss: *(\d+)",
+        Path("/proc/self/smaps").read_text(),
+        re.M,
     )
     return sum(map(int, found))
 
@@ -54,12 +56,17 @@ def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
 
 
 def test_nothing_else_is_touched(tmp_path: Path):
-    """No file of this name, no list of mappings: nothing is given back. Data, and code that may be written, stays."""
+    """No file of this name, no list of mappings: nothing is given back. Data, and code that may be
+    written, stays."""
     assert give_back("/no/such/library.so") == 0
     assert give_back(LIBRARY, tmp_path / "maps") == 0
-    lines = [line for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith(LIBRARY)]
+    lines = [
+        line for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith(LIBRARY)
+    ]
     other = [line for line in lines if " r-xp " not in line]
-    (tmp_path / "maps").write_text("\n".join([*other, *(line.replace(" r-xp ", " rwxp ") for line in lines)]))
+    (tmp_path / "maps").write_text(
+        "\n".join([*other, *(line.replace(" r-xp ", " rwxp ") for line in lines)])
+    )
     assert len(other) > 1
     assert give_back(LIBRARY, tmp_path / "maps") == 0
 

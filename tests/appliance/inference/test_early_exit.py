@@ -1,4 +1,5 @@
-"""Early exit: a toy graph whose heads can be computed by hand, on simulated devices; each way in which it can fail."""
+"""Early exit: a toy graph whose heads can be computed by hand, on simulated devices; each way in
+which it can fail."""
 
 from __future__ import annotations
 
@@ -43,30 +44,44 @@ WEIGHTS = (
 
 
 def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool = True) -> Bundle:
-    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean; that of "right" is 0.
+    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean; that of
+    "right" is 0.
 
     Head d gets the mean of exactly the frames of its step.
     """
     share = np.zeros((STEPS, FMT.window), np.float32)
     for row, n in zip(share, NEEDS, strict=True):
         row[:n] = 1 / n
-    nodes = [helper.make_node("Cast", ["sweep"], ["float"], to=onnx.TensorProto.FLOAT),
-             helper.make_node("Reshape", ["float", "series"], ["x"])]  # fmt: skip
+    nodes = [
+        helper.make_node("Cast", ["sweep"], ["float"], to=onnx.TensorProto.FLOAT),
+        helper.make_node("Reshape", ["float", "series"], ["x"]),
+    ]
     for name, row in (("early", "share"), ("logits", "all")):
-        nodes += [helper.make_node("MatMul", [row, "x"], [f"{name}_mean"]),
-                  helper.make_node("MatMul", [f"{name}_mean", "weights"], [f"{name}_flat"]),
-                  helper.make_node("Reshape", [f"{name}_flat", f"{name}_shape"], [name])]  # fmt: skip
+        nodes += [
+            helper.make_node("MatMul", [row, "x"], [f"{name}_mean"]),
+            helper.make_node("MatMul", [f"{name}_mean", "weights"], [f"{name}_flat"]),
+            helper.make_node("Reshape", [f"{name}_flat", f"{name}_shape"], [name]),
+        ]
     constants = {
-        "series": np.array([FMT.window, 4]), "share": share, "all": np.full((1, FMT.window), 0.01, np.float32),
-        "weights": WEIGHTS, "early_shape": np.array([1, STEPS, 2]), "logits_shape": np.array([1, 2]),
-    }  # fmt: skip
+        "series": np.array([FMT.window, 4]),
+        "share": share,
+        "all": np.full((1, FMT.window), 0.01, np.float32),
+        "weights": WEIGHTS,
+        "early_shape": np.array([1, STEPS, 2]),
+        "logits_shape": np.array([1, 2]),
+    }
     outputs = [helper.make_tensor_value_info("logits", onnx.TensorProto.FLOAT, [1, 2])]
     if early:
-        outputs.append(helper.make_tensor_value_info("early", onnx.TensorProto.FLOAT, [1, STEPS, 2]))
+        outputs.append(
+            helper.make_tensor_value_info("early", onnx.TensorProto.FLOAT, [1, STEPS, 2])
+        )
     graph = helper.make_graph(
-        nodes, "toy", [helper.make_tensor_value_info("sweep", onnx.TensorProto.UINT8, [1, FMT.window, 2, 2])], outputs,
+        nodes,
+        "toy",
+        [helper.make_tensor_value_info("sweep", onnx.TensorProto.UINT8, [1, FMT.window, 2, 2])],
+        outputs,
         [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )  # fmt: skip
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     golden = slid(20)[None, LEAD : LEAD + FMT.window]
     manifest = Manifest(
@@ -79,23 +94,32 @@ def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool =
         {},
         early=Early(least, agree) if early else None,
     )
-    return Bundle(manifest, "0" * 8, model.SerializeToString(), golden, np.array([[2, 0]], np.float32))
+    return Bundle(
+        manifest, "0" * 8, model.SerializeToString(), golden, np.array([[2, 0]], np.float32)
+    )
 
 
 def slid(*differences: int) -> np.ndarray:
-    """A slide [SLIDE, 2, 2]: left minus right is as given in each fifth of the window, the last one to the end."""
+    """A slide [SLIDE, 2, 2]: left minus right is as given in each fifth of the window, the last one
+    to the end."""
     diff = np.repeat(differences, FMT.window // 5)[: FMT.window]
     diff = np.concatenate([diff[:1].repeat(LEAD), diff, diff[-1:].repeat(SLIDE)])[:SLIDE]
     frames = np.empty((SLIDE, 2, 2))
     frames[:, :, 0], frames[:, :, 1] = 100 + diff[:, None], 100
-    return (frames + np.arange(SLIDE)[:, None, None] % 2).astype(np.uint8)  # all taxels move, by the same
+    return (frames + np.arange(SLIDE)[:, None, None] % 2).astype(
+        np.uint8
+    )  # all taxels move, by the same
 
 
-def acts(*slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] = ()) -> list[rig.Act]:
-    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts that are named."""
+def acts(
+    *slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] = ()
+) -> list[rig.Act]:
+    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts that are
+    named."""
     off = np.zeros((40, 2, 2), np.uint8)
     return [
-        rig.Act(np.concatenate([off, s, off]), 40, 40 + SLIDE, label, i in new_object) for i, s in enumerate(slides)
+        rig.Act(np.concatenate([off, s, off]), 40, 40 + SLIDE, label, i in new_object)
+        for i, s in enumerate(slides)
     ]
 
 
@@ -103,8 +127,12 @@ def simulated_slides(
     *slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more
 ) -> devices.SimDevices:
     """Simulated devices on which the finger slides like this."""
-    simulated = devices.build(FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops)
-    simulated.backend.board = rig.Board(FMT, simulated.robot, simulated.clock, packet_frames=packet_frames)
+    simulated = devices.build(
+        FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops
+    )
+    simulated.backend.board = rig.Board(
+        FMT, simulated.robot, simulated.clock, packet_frames=packet_frames
+    )
     return simulated
 
 
@@ -141,14 +169,15 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
     ],
 )
 def test_the_rule(scores: list[float], agree: int, want: bool):
-    """The step's own least probability, and the same label in the last `agree` steps; a least above 1 is never
-    reached."""
+    """The step's own least probability, and the same label in the last `agree` steps; a least above
+    1 is never reached."""
     rule = Early((0.9, 0.8, 1.1, 0.5), agree)
     assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
 
 
 def test_an_early_answer(rigged: Callable[..., Rigged]):
-    """Left less right: -10, then 60. After 0.4 of the window the mean is 25, so sigmoid(2.5): more than 0.9."""
+    """Left less right: -10, then 60. After 0.4 of the window the mean is 25, so sigmoid(2.5): more
+    than 0.9."""
     simulated = simulated_slides(slid(-10, 60))
     box = rigged(simulated, SETS, toy())
     (verdict,) = all_of(box)
@@ -161,13 +190,19 @@ def test_an_early_answer(rigged: Callable[..., Rigged]):
 
 
 def test_steps_must_agree(rigged: Callable[..., Rigged]):
-    """The same slide where two steps must agree: the first named "right", so the third step answers."""
-    assert summary(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [("ok", "left", 0.6)]
+    """The same slide where two steps must agree: the first named "right", so the third step
+    answers."""
+    assert summary(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [
+        ("ok", "left", 0.6)
+    ]
 
 
 @pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
-def test_otherwise_the_answer_is_the_usual_one(rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float):
-    """Off by default; or if no step is sufficient: the middle window, once, bit for bit the same."""
+def test_otherwise_the_answer_is_the_usual_one(
+    rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float
+):
+    """Off by default; or if no step is sufficient: the middle window, once, bit for bit the
+    same."""
     (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
     simulated = simulated_slides(slid(20, 20))
     (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
@@ -177,29 +212,37 @@ def test_otherwise_the_answer_is_the_usual_one(rigged: Callable[..., Rigged], se
 
 
 def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
-    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the robot's
-    reaction."""
+    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the
+    robot's reaction."""
     simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
     assert box.box.newest_frame().any()
     box.seconds(0.1)
     assert not box.box.newest_frame().any()
-    assert summary(verdicts + all_of(box)) == [("ok", "left", 0.2), ("ok", "left", 0.4), ("ok", "left", 1.0)]
+    assert summary(verdicts + all_of(box)) == [
+        ("ok", "left", 0.2),
+        ("ok", "left", 0.4),
+        ("ok", "left", 1.0),
+    ]
     touched = [a.stop - a.start for a in simulated.robot.played]
     for frames, n in zip(touched, (20, 40), strict=False):
-        assert LEAD + n < frames <= LEAD + n + 3 + 3  # the rest of a packet, 20 ms to react, and up to the next frame
+        assert (
+            LEAD + n < frames <= LEAD + n + 3 + 3
+        )  # the rest of a packet, 20 ms to react, and up to the next frame
     assert touched[2] == SLIDE
     assert box.box.counters.lost_frames == 0
 
 
 def test_lines_change_in_order(rigged: Callable[..., Rigged]):
-    """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the next sweep
-    starts."""
+    """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the
+    next sweep starts."""
     simulated = simulated_slides(slid(60), slid(10))
     heard_before: list[bool] = []
     kept_after: list[bool] = []
-    keep = OnSweep(lambda sweep, verdict: kept_after.append(bool(heard_before)))  # a disk may be slow
+    keep = OnSweep(
+        lambda sweep, verdict: kept_after.append(bool(heard_before))
+    )  # a disk may be slow
     box = rigged(simulated, SETS, toy(), observers=[keep])
     stop = simulated.gpio.watchers[devices.DECIDED]
 
@@ -211,19 +254,37 @@ def test_lines_change_in_order(rigged: Callable[..., Rigged]):
     simulated.gpio.watchers[devices.DECIDED] = watch
     all_of(box)
     names = devices.READY, devices.BUSY, devices.DECIDED, devices.RESULT_VALID, devices.BITS[0]
-    start, free = [(devices.READY, False), (devices.BUSY, True)], [(devices.READY, True), (devices.BUSY, False)]
-    first = [*start, (devices.BITS[0], True), (devices.RESULT_VALID, True), *free, (devices.DECIDED, True)]
-    second = [(devices.RESULT_VALID, False), *start, (devices.DECIDED, False), (devices.RESULT_VALID, True), *free]
+    start, free = (
+        [(devices.READY, False), (devices.BUSY, True)],
+        [(devices.READY, True), (devices.BUSY, False)],
+    )
+    first = [
+        *start,
+        (devices.BITS[0], True),
+        (devices.RESULT_VALID, True),
+        *free,
+        (devices.DECIDED, True),
+    ]
+    second = [
+        (devices.RESULT_VALID, False),
+        *start,
+        (devices.DECIDED, False),
+        (devices.RESULT_VALID, True),
+        *free,
+    ]
     assert levels(simulated, *names) == [(devices.READY, True), *first, *second]
     assert heard_before == [True]
     assert kept_after == [True, True]
 
 
 def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
-    """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were high, and fall."""
+    """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were high, and
+    fall."""
     simulated = simulated_slides(slid(60), stops=False, packet_frames=30)
     box = rigged(simulated, SETS, toy())
-    simulated.gpio.drive(devices.START, True, simulated.backend.board.frame_ns(85))  # frame 69 comes with frame 89
+    simulated.gpio.drive(
+        devices.START, True, simulated.backend.board.frame_ns(85)
+    )  # frame 69 comes with frame 89
     box.until(lambda: box.box.answered == 1)
     assert levels(simulated, devices.DECIDED, devices.RESULT_VALID) == [
         (name, level) for level in (True, False) for name in (devices.RESULT_VALID, devices.DECIDED)
@@ -232,7 +293,8 @@ def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
 
 
 def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Callable[..., Rigged]):
-    """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as usual."""
+    """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as
+    usual."""
     simulated = simulated_slides(slid(60), slid(60), stops=False)
     assert summary(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
     assert [a.stop - a.start for a in simulated.robot.played] == [SLIDE] * 2
@@ -240,7 +302,8 @@ def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Callable[..., Rigg
 
 @pytest.mark.parametrize("packet_frames", [1, 7, 30])
 def test_how_frames_come_changes_nothing(rigged: Callable[..., Rigged], packet_frames: int):
-    """Single frames, or packets that hold a step and a half: the same steps, the same scores bit for bit."""
+    """Single frames, or packets that hold a step and a half: the same steps, the same scores bit
+    for bit."""
     slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
     want = all_of(rigged(simulated_slides(*slides), SETS, toy()))
     have = all_of(rigged(simulated_slides(*slides, packet_frames=packet_frames), SETS, toy()))
@@ -248,16 +311,25 @@ def test_how_frames_come_changes_nothing(rigged: Callable[..., Rigged], packet_f
     assert [v.scores.tobytes() for v in have] == [v.scores.tobytes() for v in want]
 
 
-def test_one_run_of_the_graph_at_each_step(rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
-    """The heads run four times for a sweep without early answer, twice for one answered at step two, never when idle.
+def test_one_run_of_the_graph_at_each_step(
+    rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch
+):
+    """The heads run four times for a sweep without early answer, twice for one answered at step
+    two, never when idle.
 
     The begin of the window is searched once for the steps, and once for the middle.
     """
     asked: list[int] = []
     looked: list[int] = []
     heads, look = Classifier.early, SweepCutter._seq_at
-    monkeypatch.setattr(SweepCutter, "_seq_at", lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns))
-    monkeypatch.setattr(Classifier, "early", lambda self, x: asked.append(box.box.answered) or heads(self, x))
+    monkeypatch.setattr(
+        SweepCutter,
+        "_seq_at",
+        lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns),
+    )
+    monkeypatch.setattr(
+        Classifier, "early", lambda self, x: asked.append(box.box.answered) or heads(self, x)
+    )
     box = rigged(simulated_slides(slid(10), slid(-10, 60)), SETS, toy())
     all_of(box)
     assert [asked.count(k) for k in (0, 1, 2)] == [4, 2, 0]
@@ -300,9 +372,14 @@ def spoiled(fault: str) -> np.ndarray:
 
 @pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
 def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], fault: str):
-    """For any output of the heads the whole sweep reports the fault; without the fault the answer is early."""
-    assert summary(all_of(rigged(simulated_slides(spoiled(fault)), SETS, toy((0.5,) * STEPS)))) == [(fault, "", 1.0)]
-    assert summary(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [("ok", "left", 0.2)]
+    """For any output of the heads the whole sweep reports the fault; without the fault the answer
+    is early."""
+    assert summary(all_of(rigged(simulated_slides(spoiled(fault)), SETS, toy((0.5,) * STEPS)))) == [
+        (fault, "", 1.0)
+    ]
+    assert summary(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [
+        ("ok", "left", 0.2)
+    ]
 
 
 def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
@@ -331,12 +408,16 @@ def test_a_tare_counts(rigged: Callable[..., Rigged]):
         (NEEDS[1], 3, 0, ("ok", "left", 0.4)),
     ],
 )
-def test_missing_frames(rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]):
-    """Two lost frames, also the last of a step, are interpolated and counted; after a wider gap there is no early
-    answer."""
+def test_missing_frames(
+    rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]
+):
+    """Two lost frames, also the last of a step, are interpolated and counted; after a wider gap
+    there is no early answer."""
     simulated = simulated_slides(slid(-10, 60), packet_frames=1)
     count = itertools.count()
-    simulated.backend.mangle = lambda data: b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
+    simulated.backend.mangle = lambda data: (
+        b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
+    )
     box = rigged(simulated, SETS, toy())
     assert summary(all_of(box)) == [want]
     assert [s.lost for s in box.kept] == [counted]
@@ -344,10 +425,19 @@ def test_missing_frames(rigged: Callable[..., Rigged], at: int, lost: int, count
 
 @pytest.mark.parametrize(
     ("what", "want"),
-    [("unplug", []), ("start", ["ok"]), ("abort", []), ("lost", ["edges-lost"]), ("stop", ["no-start"])],
+    [
+        ("unplug", []),
+        ("start", ["ok"]),
+        ("abort", []),
+        ("lost", ["edges-lost"]),
+        ("stop", ["no-start"]),
+    ],
 )
-def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: str, want: list[str]):
-    """Unplugged, started again, aborted, edges lost: the early answer stays the only one to its trigger."""
+def test_what_goes_wrong_after_the_answer(
+    rigged: Callable[..., Rigged], what: str, want: list[str]
+):
+    """Unplugged, started again, aborted, edges lost: the early answer stays the only one to its
+    trigger."""
     simulated = simulated_slides(slid(60), stops=False)
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
@@ -356,7 +446,9 @@ def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: s
     elif what == "abort":
         assert "no sweep is open" in box.ask("$PPLP,ABORT")
     elif what == "start":
-        box.pulse(devices.START, 0.1)  # while the finger still slides: a sweep with an early answer of its own
+        box.pulse(
+            devices.START, 0.1
+        )  # while the finger still slides: a sweep with an early answer of its own
     elif what == "lost":
         for i in range(3000):
             box.edge(devices.START, 0.1 + i * 1e-4, i % 2 == 0)
@@ -367,7 +459,8 @@ def test_what_goes_wrong_after_the_answer(rigged: Callable[..., Rigged], what: s
 
 
 def test_what_goes_wrong_before_the_answer(rigged: Callable[..., Rigged]):
-    """Unplugged before an early answer: `sensor-lost` at once, and no early answer after it is plugged in again."""
+    """Unplugged before an early answer: `sensor-lost` at once, and no early answer after it is
+    plugged in again."""
     simulated = simulated_slides(slid(-10, 60), stops=False)
     box = rigged(simulated, SETS, toy())
     box.until(lambda: box.box.format == FMT and ("BUSY", True) in levels(simulated, "BUSY"))
@@ -378,7 +471,8 @@ def test_what_goes_wrong_before_the_answer(rigged: Callable[..., Rigged]):
 
 
 def test_a_trigger_while_not_ready_is_not_decided(rigged: Callable[..., Rigged]):
-    """The start edge comes while the skin is away: `not-ready`, though the slide that follows is clear."""
+    """The start edge comes while the skin is away: `not-ready`, though the slide that follows is
+    clear."""
     simulated = simulated_slides(slid(60), stops=False)
     box = rigged(simulated, SETS, toy())
     start = simulated.backend.board.frame_ns(40)
@@ -388,20 +482,26 @@ def test_a_trigger_while_not_ready_is_not_decided(rigged: Callable[..., Rigged])
 
 
 def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[..., Rigged]):
-    """Three sweeps of an object, the second whole: fused 1, 2, 3, with the product of their probabilities."""
+    """Three sweeps of an object, the second whole: fused 1, 2, 3, with the product of their
+    probabilities."""
     simulated = simulated_slides(slid(60), slid(20), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, SETS, toy()))
     assert [(v.fused, v.share) for v in verdicts] == [(1, 0.2), (2, 1.0), (3, 0.2)]
-    logits = np.cumsum([6.0, 2.0, 3.0])  # sigmoid(2) is below 0.9: the rule is about the sweep itself
+    logits = np.cumsum(
+        [6.0, 2.0, 3.0]
+    )  # sigmoid(2) is below 0.9: the rule is about the sweep itself
     assert [v.probability for v in verdicts] == pytest.approx(1 / (1 + np.exp(-logits)), abs=1e-6)
 
 
 def test_without_ok_the_sweep_goes_on(rigged: Callable[..., Rigged]):
-    """`min_probability` is not reached by one sweep: no early answer, the whole one requests another sweep; fused with
-    that, the answer is early."""
+    """`min_probability` is not reached by one sweep: no early answer, the whole one requests
+    another sweep; fused with that, the answer is early."""
     simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
-    assert [(str(v.status), v.fused, v.share) for v in verdicts] == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
+    assert [(str(v.status), v.fused, v.share) for v in verdicts] == [
+        ("unsure", 1, 1.0),
+        ("ok", 2, 0.2),
+    ]
 
 
 def test_a_bundle_without_heads_says_so(rigged: Callable[..., Rigged]):
@@ -411,7 +511,8 @@ def test_a_bundle_without_heads_says_so(rigged: Callable[..., Rigged]):
 
 
 class Ticking(rig.VirtualClock):
-    """Each call takes a microsecond, so that the events of one turn have different times, as on a real machine."""
+    """Each call takes a microsecond, so that the events of one turn have different times, as on a
+    real machine."""
 
     def now_ns(self) -> int:
         """A little later than before."""
@@ -421,11 +522,16 @@ class Ticking(rig.VirtualClock):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 30])
-def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_path: Path, packet_frames: int):
-    """Lost packets, early and whole answers, fused ones, a stop edge beside a step: replayed, all is the same."""
+def test_a_capture_gives_the_same_answers(
+    rigged: Callable[..., Rigged], tmp_path: Path, packet_frames: int
+):
+    """Lost packets, early and whole answers, fused ones, a stop edge beside a step: replayed, all
+    is the same."""
     rng = np.random.default_rng(7)
     slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]
-    simulated = simulated_slides(*slides, stops=False, packet_frames=packet_frames, clock=Ticking(), new_object=(5, 9))
+    simulated = simulated_slides(
+        *slides, stops=False, packet_frames=packet_frames, clock=Ticking(), new_object=(5, 9)
+    )
     played = acts(*slides, new_object=(5, 9))
     for i in range(10, 20):  # stopped too early on purpose, anywhere near the last step
         played[i] = replace(played[i], stop=played[i].start + LEAD + NEEDS[-1] + i - 12)
@@ -439,9 +545,13 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
     classifier = Classifier(toy((0.97, 0.95, 0.93, 0.7)), play)
     again, kept = [], []
     replayed = Box(
-        Pipeline(play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, Decider(classifier)), play,
-        port=StdoutPort("replay", play.commands), observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
-    )  # fmt: skip
+        Pipeline(
+            play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, Decider(classifier)
+        ),
+        play,
+        port=StdoutPort("replay", play.commands),
+        observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
+    )
     while not play.finished:
         again += replayed.step()
     assert {v.share for v in first} >= {0.4, 0.6, 1.0}
@@ -450,11 +560,14 @@ def test_a_capture_gives_the_same_answers(rigged: Callable[..., Rigged], tmp_pat
         (v.sweep, v.fused, v.lost, *summary([v])) for v in first
     ]
     assert [v.scores.tobytes() for v in again] == [v.scores.tobytes() for v in first]
-    assert [s.frames.taxels.tobytes() for s in kept] == [s.frames.taxels.tobytes() for s in box.kept]
+    assert [s.frames.taxels.tobytes() for s in kept] == [
+        s.frames.taxels.tobytes() for s in box.kept
+    ]
 
 
 def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_path: Path):
-    """The frames of an early answer are kept; replayed they give the same answer with the same scores."""
+    """The frames of an early answer are kept; replayed they give the same answer with the same
+    scores."""
     box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
     save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
@@ -469,36 +582,58 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
 
 
 def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`palpate run` on a set with a capture and kept sweeps, then `palpate replay` of each: the same answers."""
+    """`palpate run` on a set with a capture and kept sweeps, then `palpate replay` of each: the
+    same answers."""
     model = toy()
     (tmp_path / "toy").mkdir()
     np.savez(tmp_path / "toy" / bundle.GOLDEN, samples=model.golden, logits=model.golden_logits)
     (tmp_path / "toy" / bundle.MODEL).write_bytes(model.model)
-    files = {n: bundle.file_entry((tmp_path / "toy" / n).read_bytes()) for n in (bundle.MODEL, bundle.GOLDEN)}
+    files = {
+        n: bundle.file_entry((tmp_path / "toy" / n).read_bytes())
+        for n in (bundle.MODEL, bundle.GOLDEN)
+    }
     (tmp_path / "toy" / bundle.MANIFEST).write_bytes(replace(model.manifest, files=files).json())
     windows = np.stack([slid(*d)[LEAD : LEAD + FMT.window] for d in ((60,), (10,), (-10, 60))])
-    np.savez(tmp_path / "s.npz", samples=windows, labels=[0, 0, 0], materials=["left", "right"], rate_hz=100.0)
+    np.savez(
+        tmp_path / "s.npz",
+        samples=windows,
+        labels=[0, 0, 0],
+        materials=["left", "right"],
+        rate_hz=100.0,
+    )
     sets = ["--set", f"classifier.bundle={tmp_path / 'toy'}", "--set", "classifier.early=true"]
 
     def printed(*args: str) -> list[list[str]]:
         assert main([*args, *sets]) == 0
-        answers = [line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line]
+        answers = [
+            line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line
+        ]
         return [[a[2], *a[4:10], a[13]] for a in answers]
 
     kept, capture = tmp_path / "black-box", tmp_path / "capture"
     sets += ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
-    first = printed("run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture))
+    first = printed(
+        "run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture)
+    )
     assert [(a[1], a[-1]) for a in first] == [("ok", "0.20"), ("ok", "1.00"), ("ok", "0.40")]
     assert printed("replay", str(capture)) == first
     assert [printed("replay", str(path))[0] for path in sorted(kept.glob("*.npy"))] == first
 
 
 def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
-    """The share beside an early answer, and the mean touch time below; neither without early answers."""
+    """The share beside an early answer, and the mean touch time below; neither without early
+    answers."""
     for slides, early in (((slid(60), slid(10)), 1), ((slid(10), slid(10)), 0)):
         simulated = simulated_slides(*slides)
         box, out = rigged(simulated, SETS, toy()), io.StringIO()
-        show = demo.Demo(simulated.robot.played, box.far_end, simulated.clock, out, toy().manifest.labels, raw=False)
+        show = demo.Demo(
+            simulated.robot.played,
+            box.far_end,
+            simulated.clock,
+            out,
+            toy().manifest.labels,
+            raw=False,
+        )
         show.run(box.box, 2, lambda: False)
         assert out.getvalue().count("after 20% of the window") == early
         want = [(a.stop - a.start) / 100 for a in simulated.robot.played]
@@ -508,10 +643,19 @@ def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
 
 
 def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
-    """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in the middle."""
+    """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in
+    the middle."""
     windows = np.random.default_rng(0).integers(0, 256, (2, 100, 2, 2)).astype(np.uint8)
-    np.savez(tmp_path / "s.npz", samples=windows, labels=[0, 1], materials=["left", "right"], rate_hz=100.0)
-    for act, window in zip(script.play(script.load(tmp_path / "s.npz", FMT), range(2)), windows, strict=True):
+    np.savez(
+        tmp_path / "s.npz",
+        samples=windows,
+        labels=[0, 1],
+        materials=["left", "right"],
+        rate_hz=100.0,
+    )
+    for act, window in zip(
+        script.play(script.load(tmp_path / "s.npz", FMT), range(2)), windows, strict=True
+    ):
         first = act.start + round(SweepConfig().lead_ms / 1000 * FMT.rate_hz)
         assert (act.frames[first:][:100] == window).all()
         assert (act.start + act.stop) // 2 - 50 == first
@@ -519,7 +663,8 @@ def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
 
 @pytest.mark.parametrize("stop", ["STOP", ""])
 def test_the_simulated_robot_stops_once(stop: str):
-    """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction, frames are omitted."""
+    """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction,
+    frames are omitted."""
     clock = rig.VirtualClock(0)
     lines = gpio.SimGpio(clock, {"/dev/gpiochip0": ["START", "STOP"]})
     robot = rig.Robot(iter(acts(slid(60))), lines, start="START", stop=stop)
@@ -531,7 +676,11 @@ def test_the_simulated_robot_stops_once(stop: str):
     robot.react(start_ns + 400_000_000)
     assert robot.skipped == (100 + 40 + 32, 100 + 40 + SLIDE)
     planned = sorted((t_ns - start_ns, name, level) for t_ns, _, name, level in lines._plan)
-    stopped = [(320_000_000, "STOP", True), (340_000_000, "STOP", False)] if stop else [(320_000_000, "START", False)]
+    stopped = (
+        [(320_000_000, "STOP", True), (340_000_000, "STOP", False)]
+        if stop
+        else [(320_000_000, "START", False)]
+    )
     assert planned[-len(stopped) :] == stopped
     assert len(planned) == (4 if stop else 2)
     assert (robot.played[0].stop, len(robot.played[0].frames)) == (72, 40 + 32 + 40)

@@ -1,4 +1,5 @@
-"""Enrolment: a label added by arithmetic, warnings about unsuitable sweeps, a bundle that is complete or absent."""
+"""Enrolment: a label added by arithmetic, warnings about unsuitable sweeps, a bundle that is
+complete or absent."""
 
 from __future__ import annotations
 
@@ -61,7 +62,9 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
     assert new.bundle.enrolled == {"felt": 5}
     assert new.bundle.golden[:2].tolist() == old.golden.tolist()
     assert new.bundle.golden_logits.shape == (3, 4)
-    assert enrolment.files(toy_bundle.files(), new, None) == toy_bundle.files() | {bundle.ENROLMENT: new.file}
+    assert enrolment.files(toy_bundle.files(), new, None) == toy_bundle.files() | {
+        bundle.ENROLMENT: new.file
+    }
 
 
 def test_a_label_for_a_skin_with_axes(tmp_path: Path):
@@ -74,12 +77,15 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
     it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
     assert it(toy_bundle.sweep(7, 8, fmt=toy_bundle.THREE_AXES)).label == "felt"
     for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
-        with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"):
+        with pytest.raises(
+            FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"
+        ):
             enrolment.enrol(old, "felt", wrong)
 
 
 def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
-    """Written, read, self-tested: equal to what `enrol` gave; it gives the new label, the old ones, and unknown."""
+    """Written, read, self-tested: equal to what `enrol` gave; it gives the new label, the old ones,
+    and unknown."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
     enrolment.write(enrolment.files(toy_bundle.files(), new, None), tmp_path / "new", False)
     read = bundle.load(tmp_path / "new")
@@ -88,18 +94,27 @@ def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
         assert getattr(read, name).tolist() == getattr(new.bundle, name).tolist()
     it = Classifier(read, VirtualClock())
     assert it.self_test() < 1e-5
-    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (0, 0), (6, 0), (0, 6)]] == ["felt", "a", "b", "c"]
+    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (0, 0), (6, 0), (0, 6)]] == [
+        "felt",
+        "a",
+        "b",
+        "c",
+    ]
     assert Classifier(old, VirtualClock())(toy_bundle.sweep(7, 8)).status is Status.UNKNOWN
     assert it(toy_bundle.sweep(-30, 0)).status is Status.UNKNOWN
 
 
 def test_same_sweeps_same_bytes(old: Bundle):
     """The files depend on neither clock nor random numbers."""
-    assert enrolment.enrol(old, "felt", counts(*FELT)).file == enrolment.enrol(old, "felt", counts(*FELT)).file
+    assert (
+        enrolment.enrol(old, "felt", counts(*FELT)).file
+        == enrolment.enrol(old, "felt", counts(*FELT)).file
+    )
 
 
 def test_a_material_that_scatters_is_kept(old: Bundle):
-    """Its spread is that of its sweeps and one assumed sweep at the trained distance: (2 + 4 * 9) / (2 * 4)."""
+    """Its spread is that of its sweeps and one assumed sweep at the trained distance: (2 + 4 * 9) /
+    (2 * 4)."""
     new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
     assert new.bundle.classes is not None
     assert new.bundle.classes.spread[3] == pytest.approx(38 / 8, abs=1e-4)
@@ -131,31 +146,44 @@ def test_one_sweep_is_enough_and_labels_add_up(old: Bundle):
     assert second.manifest.made["enrolled"] == {"felt": 1, "cork": 2}
     it = Classifier(second, VirtualClock())
     assert it.self_test() < 1e-5
-    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (-8.5, 0), (0, 0)]] == ["felt", "cork", "a"]
+    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (-8.5, 0), (0, 0)]] == [
+        "felt",
+        "cork",
+        "a",
+    ]
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 10])
 def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n: int):
-    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or one of n sweeps."""
+    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or one
+    of n sweeps."""
     rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, limit=4.0)
     kept = []
     for _ in range(100):
         mean = rng.normal(size=(n, 2)).mean(axis=0)
         classes = bundle.Classes(
-            np.vstack([toy_bundle.MEANS + 100, mean]), np.zeros(4), np.array([0, 0, 0, n]), np.ones(4),
+            np.vstack([toy_bundle.MEANS + 100, mean]),
+            np.zeros(4),
+            np.array([0, 0, 0, n]),
+            np.ones(4),
             np.zeros((4, 0, 0), np.float16),
-        )  # fmt: skip
+        )
         means = Means(classes, known, ("a", "b", "c", "felt"))
         kept += [not means.novelty(z) for z in rng.normal(size=(40, 2))]
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
 
 
 def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
-    """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained labels' means are."""
+    """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained
+    labels' means are."""
     arrays = toy_bundle.means(**toy_bundle.moved_arrays())
     signed = toy_bundle.files(arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE)
-    new = enrolment.enrol(bundle.load(toy_bundle.put(tmp_path / "old", signed)), "felt", counts(*FELT))
-    classes = bundle.load(toy_bundle.put(tmp_path / "new", enrolment.files(signed, new, None))).classes
+    new = enrolment.enrol(
+        bundle.load(toy_bundle.put(tmp_path / "old", signed)), "felt", counts(*FELT)
+    )
+    classes = bundle.load(
+        toy_bundle.put(tmp_path / "new", enrolment.files(signed, new, None))
+    ).classes
     assert classes is not None
     assert classes.moved is not None
     assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
@@ -166,7 +194,9 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
 
 def test_early_answers_end_with_an_enrolment(tmp_path: Path):
     """Its heads do not know the label; the command says so."""
-    quick = toy_bundle.load(tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early"))
+    quick = toy_bundle.load(
+        tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early")
+    )
     new = enrolment.enrol(quick, "felt", counts(*FELT))
     assert new.bundle.manifest.early is None
     assert len(new.warnings) == 1
@@ -186,7 +216,9 @@ def test_early_answers_end_with_an_enrolment(tmp_path: Path):
         ([(0, 0), (6.2, 0)], ["disagree", "close to"]),
     ],
 )
-def test_unsuitable_sweeps_are_told_with_numbers(old: Bundle, at: list[tuple[float, float]], hints: list[str]):
+def test_unsuitable_sweeps_are_told_with_numbers(
+    old: Bundle, at: list[tuple[float, float]], hints: list[str]
+):
     """Like a trained material, or unlike one another: told, and enrolled all the same."""
     new = enrolment.enrol(old, "felt", counts(*at))
     found = [text for text in (new.disagreement, *new.warnings) if text]
@@ -197,8 +229,11 @@ def test_unsuitable_sweeps_are_told_with_numbers(old: Bundle, at: list[tuple[flo
 
 
 def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
-    """Closer than the limit, but no closer than two trained materials are, which the bundle accepts already."""
-    arrays = toy_bundle.means(means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2]))
+    """Closer than the limit, but no closer than two trained materials are, which the bundle accepts
+    already."""
+    arrays = toy_bundle.means(
+        means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2])
+    )
     made = toy_bundle.load(tmp_path / "x", arrays=arrays)
     assert enrolment.enrol(made, "felt", counts((8.2, 0), (8.2, 0), (8.2, 0))).warnings == ()
     assert len(enrolment.enrol(made, "felt", counts((7.8, 0), (7.8, 0), (7.8, 0))).warnings) == 1
@@ -206,7 +241,12 @@ def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("label", "hint"),
-    [("b", "label 'b' is taken"), ("a,b", "cannot be sent"), ("", "cannot be sent"), ("x" * 25, "cannot be sent")],
+    [
+        ("b", "label 'b' is taken"),
+        ("a,b", "cannot be sent"),
+        ("", "cannot be sent"),
+        ("x" * 25, "cannot be sent"),
+    ],
 )
 def test_labels_that_cannot_be_enrolled(old: Bundle, label: str, hint: str):
     """Already used, or not allowed in a sentence; reported before the first sweep."""
@@ -224,7 +264,8 @@ def test_a_bundle_without_embedding(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "sweeps", [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)]
+    "sweeps",
+    [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)],
 )
 def test_sweeps_of_another_form(old: Bundle, sweeps: np.ndarray):
     """One dimension short, none, another window, another type."""
@@ -252,7 +293,8 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def test_an_old_bundle_is_replaced_only_on_request(tmp_path: Path, made: dict[str, bytes]):
-    """Refused without `swap`; with it the folder holds exactly the new files, and nothing is left beside it."""
+    """Refused without `swap`; with it the folder holds exactly the new files, and nothing is left
+    beside it."""
     target = toy_bundle.put(tmp_path / "there", toy_bundle.files())
     (target / "extra").write_text("")
     before = content(target)
@@ -268,7 +310,11 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path: Path, made: dict[str, byt
     """Another folder, a file, a path in a missing folder."""
     (tmp_path / "home").mkdir()
     (tmp_path / "file").write_text("")
-    for place, hint in (("home", "is no bundle"), ("file", "is no bundle"), ("none/new", "is no folder that you may")):
+    for place, hint in (
+        ("home", "is no bundle"),
+        ("file", "is no bundle"),
+        ("none/new", "is no folder that you may"),
+    ):
         with pytest.raises(BundleError, match=hint):
             enrolment.write(made, tmp_path / place, True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "home", "old"]
@@ -280,7 +326,8 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path: Path, made: dict[str, byt
 def test_complete_or_unchanged(
     tmp_path: Path, made: dict[str, bytes], there: bool, call: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """A full disk at a sync, a filesystem that cannot swap: the target is unchanged, and nothing is left beside it."""
+    """A full disk at a sync, a filesystem that cannot swap: the target is unchanged, and nothing is
+    left beside it."""
     target = tmp_path / "t"
     if there:
         toy_bundle.put(target, toy_bundle.files())
@@ -302,8 +349,11 @@ def test_complete_or_unchanged(
     assert sorted(p.name for p in tmp_path.iterdir()) == (["old", "t"] if there else ["old"])
 
 
-def test_the_disk_has_it_before_the_name(tmp_path: Path, made: dict[str, bytes], monkeypatch: pytest.MonkeyPatch):
-    """Each file and its folder are synced, then the name changes in one step, then the folder above is synced."""
+def test_the_disk_has_it_before_the_name(
+    tmp_path: Path, made: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+):
+    """Each file and its folder are synced, then the name changes in one step, then the folder above
+    is synced."""
     target, steps = toy_bundle.put(tmp_path / "t", toy_bundle.files()), []
     sync, swap = os.fsync, storage.exchange
 
@@ -348,19 +398,32 @@ def test_a_bundle_that_does_not_run_is_not_written(tmp_path: Path, old: Bundle):
 
 @pytest.fixture
 def rig(tmp_path: Path, old: Bundle):
-    """`palpate enrol felt` on simulated devices that play these windows, with the toy bundle; its exit code."""
+    """`palpate enrol felt` on simulated devices that play these windows, with the toy bundle; its
+    exit code."""
 
     def play(windows: np.ndarray, *more: str, out: str = "new") -> int:
         n = len(windows)
-        np.savez(tmp_path / "s.npz", samples=windows, labels=np.zeros(n, int), materials=np.array(["x"]), rate_hz=100.0)
-        chosen = ["--set", f"classifier.bundle={tmp_path / 'old'}", "--sim", f"replay:{tmp_path / 's.npz'}"]
+        np.savez(
+            tmp_path / "s.npz",
+            samples=windows,
+            labels=np.zeros(n, int),
+            materials=np.array(["x"]),
+            rate_hz=100.0,
+        )
+        chosen = [
+            "--set",
+            f"classifier.bundle={tmp_path / 'old'}",
+            "--sim",
+            f"replay:{tmp_path / 's.npz'}",
+        ]
         return main(["enrol", "felt", "--out", str(tmp_path / out), *chosen, "--virtual", *more])
 
     return play
 
 
 def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Faulty sweeps are reported and not counted; good ones give the bundle of `enrol`; every sweep is answered."""
+    """Faulty sweeps are reported and not counted; good ones give the bundle of `enrol`; every sweep
+    is answered."""
     silent = np.zeros((1, 20, 2, 2), np.int16)
     assert rig(np.concatenate([counts(*FELT[:2]), silent, counts(*FELT[2:], (0, 0))])) == 0
     output = capsys.readouterr()
@@ -372,22 +435,40 @@ def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.Cap
     assert "sweep 6 taken: 5 of 5" in output.err
     assert "toy 1+felt, " in output.err
     assert "warning" not in output.err
-    assert main(["check", "--set", f"classifier.bundle={tmp_path / 'new'}", "--virtual", "--sim",
-                 f"replay:{tmp_path / 's.npz'}"]) == 0  # fmt: skip
+    assert (
+        main(
+            [
+                "check",
+                "--set",
+                f"classifier.bundle={tmp_path / 'new'}",
+                "--virtual",
+                "--sim",
+                f"replay:{tmp_path / 's.npz'}",
+            ]
+        )
+        == 0
+    )
     assert "4 labels, felt enrolled from 5" in capsys.readouterr().out
 
 
-def test_sweeps_of_several_materials_are_not_enrolled(rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_sweeps_of_several_materials_are_not_enrolled(
+    rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """Nothing is written, unless the person says that the material scatters."""
     unlike = counts((20, 20), (20, 20), (30, 20), (20, 20), (20, 20))
     assert rig(unlike) == BundleError.exit_code
-    assert "number 3 most of all; take others, or give --scattered if all are of 'felt'" in capsys.readouterr().err
+    assert (
+        "number 3 most of all; take others, or give --scattered if all are of 'felt'"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "new").exists()
     assert rig(unlike, "--scattered") == 0
     assert "warning: the sweeps of 'felt' disagree" in capsys.readouterr().err
 
 
-def test_the_command_takes_the_requested_number_of_sweeps(rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_takes_the_requested_number_of_sweeps(
+    rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """--sweeps 1; a material like a trained one gives a warning and is enrolled."""
     assert rig(counts((1, 0), (50, 50)), "--sweeps", "1") == 0
     assert "warning: 'felt' lies close to 'a'" in capsys.readouterr().err
@@ -451,16 +532,26 @@ def test_one_to_ten_sweeps(rig, n: str):
     assert e.value.code == 2
 
 
-def test_enrolled_sweeps_are_whole_despite_early_answers(rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """classifier.early is ignored during an enrolment, though `run` would stop at a quarter of this sweep."""
+def test_enrolled_sweeps_are_whole_despite_early_answers(
+    rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """classifier.early is ignored during an enrolment, though `run` would stop at a quarter of this
+    sweep."""
     toy_bundle.put(
-        tmp_path / "old", toy_bundle.files(early=Early((0.01,) * 3, 1), outputs=("logits", "embedding", "early"))
+        tmp_path / "old",
+        toy_bundle.files(early=Early((0.01,) * 3, 1), outputs=("logits", "embedding", "early")),
     )
     early = ["--set", "classifier.early=true"]
     assert rig(counts((7, 8)), *early, "--sweeps", "1") == 0
     assert ",1.00," in capsys.readouterr().out
     assert bundle.load(tmp_path / "new").golden[2].tolist() == toy_bundle.window(7, 8).tolist()
-    chosen = ["--set", f"classifier.bundle={tmp_path / 'old'}", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual"]
+    chosen = [
+        "--set",
+        f"classifier.bundle={tmp_path / 'old'}",
+        "--sim",
+        f"replay:{tmp_path / 's.npz'}",
+        "--virtual",
+    ]
     assert main(["run", *chosen, *early]) == 0
     assert ",ok,c,0.95" in capsys.readouterr().out
 
@@ -474,8 +565,11 @@ def test_an_unsuitable_bundle_is_reported_before_the_robot_sweeps(rig, tmp_path:
     assert output.out == ""
 
 
-def test_class_bits_that_cannot_represent_the_new_label(rig, monkeypatch: pytest.MonkeyPatch, capsys):
-    """Two class bits have codes for three labels and 0, not four: reported now, since `run` would refuse the bundle."""
+def test_class_bits_that_cannot_represent_the_new_label(
+    rig, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    """Two class bits have codes for three labels and 0, not four: reported now, since `run` would
+    refuse the bundle."""
     monkeypatch.setattr(devices, "BITS", devices.BITS[:2])
     assert rig(counts(*FELT)) == ConfigError.exit_code
     output = capsys.readouterr()

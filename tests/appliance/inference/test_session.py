@@ -40,10 +40,15 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         ({"early": EARLY, "outputs": OUTPUTS}, ["logits", "embedding"]),
         ({"known": None, "outputs": OUTPUTS}, ["logits"]),
         ({}, ["logits", "embedding"]),
-        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ["logits", "embedding"]),
+        (
+            {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2},
+            ["logits", "embedding"],
+        ),
     ],
 )
-def test_a_classifier_opens_what_its_answers_need(tmp_path, opened: list[list[str]], more: dict, wanted: list[str]):
+def test_a_classifier_opens_what_its_answers_need(
+    tmp_path, opened: list[list[str]], more: dict, wanted: list[str]
+):
     """Self-test and sweep run on one session, whatever else the model gives."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
     it.self_test()
@@ -62,12 +67,17 @@ def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
 
 
 def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundle):
-    """Logits of golden sweeps and noise, to the bit, from a classifier that answers early, one that does not, and from
-    all outputs of the delivered model at once."""
-    plain, early = Classifier(default_bundle, VirtualClock()), Classifier(default_bundle, VirtualClock())
+    """Logits of golden sweeps and noise, to the bit, from a classifier that answers early, one that
+    does not, and from all outputs of the delivered model at once."""
+    plain, early = (
+        Classifier(default_bundle, VirtualClock()),
+        Classifier(default_bundle, VirtualClock()),
+    )
     Decider(early)
     whole = session.session(default_bundle.model)
-    noise = np.random.default_rng(1).integers(0, 256, (3, *default_bundle.golden.shape[1:]), np.uint8)
+    noise = np.random.default_rng(1).integers(
+        0, 256, (3, *default_bundle.golden.shape[1:]), np.uint8
+    )
     for window in (*default_bundle.golden, *noise):
         want = dict(zip(OUTPUTS, session.run(whole, OUTPUTS, {"sweep": window[None]}), strict=True))
         assert early.early(window).tobytes() == want["early"].tobytes()
@@ -76,8 +86,11 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundl
             assert it.embedding(window).tobytes() == want["embedding"].tobytes()
 
 
-def test_an_enrolled_bundle_runs_without_the_early_heads(default_bundle: Bundle, opened: list[list[str]]):
-    """The bundle keeps the delivered model; the heads in it, which do not know the label, are not computed."""
+def test_an_enrolled_bundle_runs_without_the_early_heads(
+    default_bundle: Bundle, opened: list[list[str]]
+):
+    """The bundle keeps the delivered model; the heads in it, which do not know the label, are not
+    computed."""
     new = enrol(default_bundle, "cork", default_bundle.golden[:1]).bundle
     assert new.model == default_bundle.model
     del opened[:]

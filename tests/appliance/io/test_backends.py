@@ -1,7 +1,9 @@
-"""One contract, many backends: the drivers' behaviour on the simulator, umockdev, the virtual box and a real board.
+"""One contract, many backends: the drivers' behaviour on the simulator, umockdev, the virtual box
+and a real board.
 
-PALPATE_BACKEND chooses one backend per process, the simulator by default (`backends`). Details of bus, chip and port,
-to the microsecond, are tested in virtual time by test_usb_sensor.py, test_gpio.py and test_robot_link.py.
+PALPATE_BACKEND chooses one backend per process, the simulator by default (`backends`). Details of
+bus, chip and port, to the microsecond, are tested in virtual time by test_usb_sensor.py,
+test_gpio.py and test_robot_link.py.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ from tests.backends import Backend, Skin, mocks, remote, skins
 SECOND = 1_000_000_000
 LIMIT_S = 10
 SETTLE_S = 2.2
-"""Until the skin's clock is known well (DeviceClock), stamps may be set right by the delays of a busy machine."""
+"""Until the skin's clock is known well (DeviceClock), stamps may be set right by the delays of a
+busy machine."""
 RETRIED_S = 0.6
 """A skin that was lost is looked for within this time."""
 Need = Callable[..., Backend]
@@ -122,7 +125,9 @@ class SensorReader:
         """Read until the sensor is in this state."""
         end_ns = limit(self._u)
         while self.sensor.state != wanted:
-            assert now(self._u) < end_ns, f"{self.sensor.state}, not {wanted}: {self.sensor.trouble}"
+            assert now(self._u) < end_ns, (
+                f"{self.sensor.state}, not {wanted}: {self.sensor.trouble}"
+            )
             self.once()
 
     def __enter__(self) -> SensorReader:
@@ -139,8 +144,8 @@ def check_content(u: Backend, frames: Frames) -> None:
 
 
 def test_streams_without_a_gap(need: Need):
-    """Every frame once and in order, its time later than the one before and never in the future; then the skin is
-    released."""
+    """Every frame once and in order, its time later than the one before and never in the future;
+    then the skin is released."""
     u = need("skin")
     with SensorReader(u) as reader:
         reader.seconds(SETTLE_S)
@@ -153,7 +158,8 @@ def test_streams_without_a_gap(need: Need):
         check_content(u, frames)
         assert reader.sensor.counters.lost_frames == reader.sensor.counters.garbage_bytes == 0
         assert reader.sensor.identity
-        # an emulator may be too late with a first answer, so what matters is that it streamed unbroken once it did
+        # an emulator may be too late with a first answer, so what matters is that it streamed
+        # unbroken once it did
         assert reader.states[-1] == "streaming"
         assert reader.sensor.counters.enumerations == 1
     with SensorReader(u) as reader:  # closing has let go of all that the first one held
@@ -173,7 +179,8 @@ def test_absent_then_plugged(need: Need):
 
 
 def test_unplugged_in_mid_read(need: Need):
-    """The cable is pulled while frames come: lost, then absent; plugged in again, a new epoch with correct frames."""
+    """The cable is pulled while frames come: lost, then absent; plugged in again, a new epoch with
+    correct frames."""
     u = need("plug")
     with SensorReader(u) as reader:
         first = reader.frames(100)
@@ -195,8 +202,8 @@ def test_unplugged_in_mid_read(need: Need):
 
 
 def test_driver_taken_and_given_back(need: Need):
-    """The skin fails as if it had gone, and is there again without having been plugged in: it streams again each time, and
-    nothing is left open."""
+    """The skin fails as if it had gone, and is there again without having been plugged in: it
+    streams again each time, and nothing is left open."""
     u = need("unbind")
     with SensorReader(u) as reader:
         reader.frames(100)
@@ -214,11 +221,15 @@ def test_driver_taken_and_given_back(need: Need):
 
 def timers() -> int:
     """Timers of the kernel that this process holds; a context of libusb has one."""
-    return sum(os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]") for fd in os.listdir("/proc/self/fd"))
+    return sum(
+        os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]")
+        for fd in os.listdir("/proc/self/fd")
+    )
 
 
 def test_serial_number_chooses(need: Need):
-    """Only the skin with the configured serial number is used; for another the message says what was found."""
+    """Only the skin with the configured serial number is used; for another the message says what
+    was found."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
     with SensorReader(u, serial="0043") as reader:
@@ -242,7 +253,8 @@ def test_serial_number_chooses(need: Need):
     ],
 )
 def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: str):
-    """A skin with another protocol or format is refused, naming both sides; a matching one is used after it."""
+    """A skin with another protocol or format is refused, naming both sides; a matching one is used
+    after it."""
     u = need("plug")
     u.plug(Skin(**change))
     with SensorReader(u) as reader:
@@ -258,7 +270,8 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     [("hold", "busy", 16, "another program"), ("deny", "denied", 13, "udev rule")],
 )
 def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code: int, hint: str):
-    """Held by another program, or not allowed: its own state, advice, and frames once that is over."""
+    """Held by another program, or not allowed: its own state, advice, and frames once that is
+    over."""
     u = need("skin", control)
     refuse = getattr(u, control)
     refuse(True)
@@ -275,7 +288,8 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
 
 
 def test_a_silent_skin_is_started_again(need: Need):
-    """A connected skin that sends nothing: silent after `silence_ms`, then it is started again automatically."""
+    """A connected skin that sends nothing: silent after `silence_ms`, then it is started again
+    automatically."""
     u = need("silence")
     with SensorReader(u, silence_ms=300) as reader:
         reader.frames(100)
@@ -315,8 +329,8 @@ class Watcher:
         self._u = u
 
     def look(self) -> None:
-        """One call. The edges that it reports have held their level for `glitch_us`, and have the time of the edge
-        itself."""
+        """One call. The edges that it reports have held their level for `glitch_us`, and have the
+        time of the edge itself."""
         now_ns = now(self._u)
         for edge in self.trigger.edges(now_ns):
             if edge.kind is not EdgeKind.LOST:
@@ -361,11 +375,15 @@ def pulse(u: Backend, line: str) -> tuple[int, int]:
 
 
 def test_start_and_stop(need: Need):
-    """NEW OBJECT, START, STOP as they were driven, in order, each with a time while it was driven; falls have no
-    meaning."""
+    """NEW OBJECT, START, STOP as they were driven, in order, each with a time while it was driven;
+    falls have no meaning."""
     u = need("lines")
     t = u.trigger
-    roles = [(t.new_object, EdgeKind.NEW_OBJECT), (t.start, EdgeKind.START), (t.stop, EdgeKind.STOP)]
+    roles = [
+        (t.new_object, EdgeKind.NEW_OBJECT),
+        (t.start, EdgeKind.START),
+        (t.stop, EdgeKind.STOP),
+    ]
     wired = [(line, kind) for line, kind in roles if line]
     with Watcher(u) as watcher:
         spans = [pulse(u, line) for line, _ in wired]
@@ -413,7 +431,8 @@ def test_high_at_the_start(need: Need):
 
 
 def test_more_edges_than_the_kernel_keeps(need: Need):
-    """Edges that the queue dropped are one LOST, and counted; when the line is quiet, edges are reported again."""
+    """Edges that the queue dropped are one LOST, and counted; when the line is quiet, edges are
+    reported again."""
     u = need("lines", "overrun")
     with Watcher(u) as watcher:
         u.storm(u.trigger.start, 3000)
@@ -426,7 +445,8 @@ def test_more_edges_than_the_kernel_keeps(need: Need):
 
 
 def test_lines_that_are_held(need: Need):
-    """A second holder is refused with errno 16; the lines are free again once the first has closed."""
+    """A second holder is refused with errno 16; the lines are free again once the first has
+    closed."""
     u = need("lines")
     with Watcher(u), pytest.raises(LineError, match=r"cannot request gpio lines .*errno 16"):
         GpioTrigger(u.trigger, u.gpio)
@@ -450,7 +470,11 @@ def test_a_line_that_is_not_there(need: Need):
 def seen(u: Backend) -> set[str]:
     """The outputs that are high."""
     o = u.output
-    return {n for n in (o.ready, o.busy, o.result_valid, o.fault, o.decided, *o.class_bits) if n and u.level(n)}
+    return {
+        n
+        for n in (o.ready, o.busy, o.result_valid, o.fault, o.decided, *o.class_bits)
+        if n and u.level(n)
+    }
 
 
 def check_seen(u: Backend, *wanted: str) -> None:
@@ -471,7 +495,12 @@ def test_outputs(need: Need):
         lines.show(ready=True, busy=False, fault=False)
         for code in range(lines.capacity):
             lines.result(code)
-            check_seen(u, o.ready, o.result_valid, *(n for i, n in enumerate(o.class_bits) if code >> i & 1))
+            check_seen(
+                u,
+                o.ready,
+                o.result_valid,
+                *(n for i, n in enumerate(o.class_bits) if code >> i & 1),
+            )
         lines.result(None)
         until(u, lambda: not u.level(o.result_valid))
         lines.result(lines.capacity - 1)
@@ -542,7 +571,8 @@ def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
-    """Commands as a program and as a person sends them, cut anywhere; a wrong one says what is wrong."""
+    """Commands as a program and as a person sends them, cut anywhere; a wrong one says what is
+    wrong."""
     u = need("serial")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -556,13 +586,16 @@ def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink]):
-    """Sentences are dropped, the oldest first, and counted; no call waits, and sentences that are sent are complete."""
+    """Sentences are dropped, the oldest first, and counted; no call waits, and sentences that are
+    sent are complete."""
     u = need("serial", "stall")
     sink = sink_on(u, queue=8)
     total = 2000
 
     def numbered(i: int) -> bytes:
-        return sentence("ANS", i, "x" * (i % 59))  # of many lengths: the line fills up within one, behind its number
+        return sentence(
+            "ANS", i, "x" * (i % 59)
+        )  # of many lengths: the line fills up within one, behind its number
 
     for i in range(total):
         began_ns = now(u)
@@ -581,7 +614,8 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
 
 @pytest.mark.slow
 def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
-    """Unplugged while open: the next sentence fails and `trouble` says so; plugged in again, it is sent completely."""
+    """Unplugged while open: the next sentence fails and `trouble` says so; plugged in again, it is
+    sent completely."""
     u = need("serial", "pull")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -602,7 +636,8 @@ def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSin
 
 
 def test_controls_over_a_wire():
-    """Each control of the virtual box reaches the bench outside, with arguments and results; a failure is reported."""
+    """Each control of the virtual box reaches the bench outside, with arguments and results; a
+    failure is reported."""
     asked: list[tuple[Any, ...]] = []
 
     class FakeControls:
@@ -633,12 +668,18 @@ def test_controls_over_a_wire():
         here.shutdown(socket.SHUT_RDWR)
         outside.join(10)
     assert asked == [
-        ("able",),         ("plug", Skin(serial="0042")), ("drive", "START", True), ("say", b"\r\n"), ("level", "READY"), ("hear",),
-    ]  # fmt: skip
+        ("able",),
+        ("plug", Skin(serial="0042")),
+        ("drive", "START", True),
+        ("say", b"\r\n"),
+        ("level", "READY"),
+        ("hear",),
+    ]
 
 
 @pytest.mark.parametrize(
-    ("name", "there", "hint"), [("wired", "/dev/gpiochip0", "wired as tests"), ("remote", remote.PORT, "make test-rig")]
+    ("name", "there", "hint"),
+    [("wired", "/dev/gpiochip0", "wired as tests"), ("remote", remote.PORT, "make test-rig")],
 )
 def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
     """If a backend is not available, one line says what to do."""
@@ -651,20 +692,38 @@ def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
 def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
     """An unknown name is refused, and the known names are listed."""
     monkeypatch.setenv(backends.VARIABLE, "real")
-    with pytest.raises(backends.BackendMissing, match="'real' is unknown; known are simulated, mocked, remote, wired"):
+    with pytest.raises(
+        backends.BackendMissing,
+        match="'real' is unknown; known are simulated, mocked, remote, wired",
+    ):
         backends.chosen()
 
 
 @pytest.mark.slow
 def test_over_umockdev():
-    """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its own."""
+    """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its
+    own."""
     if os.environ.get(backends.VARIABLE):
         pytest.skip("one backend is chosen")
     if lacking := mocks.lacking():
         pytest.fail(lacking) if os.environ.get("PALPATE_MOCKS") else pytest.skip(lacking)
     done = subprocess.run(
-        ["umockdev-wrapper", sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", __file__],
-        env=os.environ | {backends.VARIABLE: "mocked"}, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+        [
+            "umockdev-wrapper",
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-rs",
+            "-p",
+            "no:cacheprovider",
+            __file__,
+        ],
+        env=os.environ | {backends.VARIABLE: "mocked"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     print(done.stdout)
     assert done.returncode == 0, done.stdout + done.stderr

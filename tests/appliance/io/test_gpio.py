@@ -1,4 +1,5 @@
-"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms in; outputs in their order."""
+"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms in; outputs
+in their order."""
 
 from __future__ import annotations
 
@@ -47,10 +48,16 @@ def output_config(**changes: Any) -> OutputConfig:
 
 
 class TriggerSetup:
-    """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is high from then on."""
+    """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is
+    high from then on."""
 
     def __init__(
-        self, chips: dict[str, tuple[str, ...]] | None = None, *, high: str = "", queue: int = 1024, **changes: Any
+        self,
+        chips: dict[str, tuple[str, ...]] | None = None,
+        *,
+        high: str = "",
+        queue: int = 1024,
+        **changes: Any,
     ) -> None:
         self.clock = VirtualClock()
         self.t0 = self.clock.now_ns()
@@ -68,32 +75,42 @@ class TriggerSetup:
     def poll(self, t_ns: int) -> list[tuple[EdgeKind, int]]:
         """The edges that one call at `t_ns` returns."""
         self.clock.sleep_until(self.t0 + t_ns)
-        return [(edge.kind, edge.t_ns - self.t0) for edge in self.trigger.edges(self.clock.now_ns())]
+        return [
+            (edge.kind, edge.t_ns - self.t0) for edge in self.trigger.edges(self.clock.now_ns())
+        ]
 
     def run(self, until_ns: int, step_ns: int = MS) -> list[tuple[EdgeKind, int]]:
         """The edges that calls at every step until `until_ns` return."""
         now_ns = self.clock.now_ns() - self.t0
-        return [edge for t_ns in range(now_ns, until_ns + step_ns, step_ns) for edge in self.poll(t_ns)]
+        return [
+            edge for t_ns in range(now_ns, until_ns + step_ns, step_ns) for edge in self.poll(t_ns)
+        ]
 
     def queue(self, *events: tuple[bool, int, int]) -> None:
         """Put (rise, t_ns, number) into the kernel's queue for the first line of the first chip."""
         kinds = gpiod.EdgeEvent.Type
         for rise, t_ns, number in events:
             kind = kinds.RISING_EDGE if rise else kinds.FALLING_EDGE
-            self.gpio.requests[0].queue.append(gpiod.EdgeEvent(kind.value, self.t0 + t_ns, 1, number, number))
+            self.gpio.requests[0].queue.append(
+                gpiod.EdgeEvent(kind.value, self.t0 + t_ns, 1, number, number)
+            )
 
 
 # ---------------------------------------------------------------- clean edges
 
 
 def test_two_lines() -> None:
-    """A rise of START is START, a rise of STOP is STOP, with the kernel's time stamps; a rise of NEW is NEW OBJECT,
-    falls have no meaning."""
+    """A rise of START is START, a rise of STOP is STOP, with the kernel's time stamps; a rise of
+    NEW is NEW OBJECT, falls have no meaning."""
     setup = TriggerSetup(new_object="NEW")
     setup.drive("NEW", 3 * MS + 1, 5 * MS)
     setup.drive("START", 10 * MS + 7, 30 * MS)
     setup.drive("STOP", 200 * MS + 13, 220 * MS)
-    assert setup.run(300 * MS) == [(NEW_OBJECT, 3 * MS + 1), (START, 10 * MS + 7), (STOP, 200 * MS + 13)]
+    assert setup.run(300 * MS) == [
+        (NEW_OBJECT, 3 * MS + 1),
+        (START, 10 * MS + 7),
+        (STOP, 200 * MS + 13),
+    ]
 
 
 def test_one_line() -> None:
@@ -107,18 +124,29 @@ def test_reported_when_settled() -> None:
     """A clean edge is reported exactly `glitch_us` after it, and once."""
     setup = TriggerSetup()
     setup.drive("START", MS)
-    assert [setup.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [[], [], [(START, MS)], []]
+    assert [setup.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [
+        [],
+        [],
+        [(START, MS)],
+        [],
+    ]
 
 
 def test_start_and_stop_in_one_call() -> None:
     """Complete sweeps between two calls are reported by the second one, in order."""
     setup = TriggerSetup(mode="one-line", stop="")
     setup.drive("START", 10 * MS, 200 * MS, 300 * MS, 400 * MS)
-    assert setup.poll(500 * MS) == [(START, 10 * MS), (STOP, 200 * MS), (START, 300 * MS), (STOP, 400 * MS)]
+    assert setup.poll(500 * MS) == [
+        (START, 10 * MS),
+        (STOP, 200 * MS),
+        (START, 300 * MS),
+        (STOP, 400 * MS),
+    ]
 
 
 def test_both_edges_undebounced() -> None:
-    """The request is for both edges on the monotonic clock, without debouncing, and with a long queue."""
+    """The request is for both edges on the monotonic clock, without debouncing, and with a long
+    queue."""
     for request in TriggerSetup().gpio.requests:
         (settings,) = request.settings.values()
         assert settings.direction is gpiod.line.Direction.INPUT
@@ -129,14 +157,24 @@ def test_both_edges_undebounced() -> None:
 
 
 def test_a_request_for_each_line() -> None:
-    """Each input has its own request, also on one chip: the kernel then numbers its events without gaps."""
+    """Each input has its own request, also on one chip: the kernel then numbers its events without
+    gaps."""
     setup = TriggerSetup(new_object="NEW")
-    assert [request.names for request in setup.gpio.requests] == [{1: "START"}, {2: "STOP"}, {3: "NEW"}]
+    assert [request.names for request in setup.gpio.requests] == [
+        {1: "START"},
+        {2: "STOP"},
+        {3: "NEW"},
+    ]
 
 
 @pytest.mark.parametrize(
     ("bias", "wanted"),
-    [("pull-down", "PULL_DOWN"), ("pull-up", "PULL_UP"), ("disabled", "DISABLED"), ("as-is", "AS_IS")],
+    [
+        ("pull-down", "PULL_DOWN"),
+        ("pull-up", "PULL_UP"),
+        ("disabled", "DISABLED"),
+        ("as-is", "AS_IS"),
+    ],
 )
 def test_bias(bias: str, wanted: str) -> None:
     """Each bias of the configuration reaches the request."""
@@ -151,7 +189,8 @@ def test_active_low() -> None:
 
 
 def test_high_at_start_up() -> None:
-    """A line that is high when the box comes up makes no START; its fall is a STOP and its next rise a START."""
+    """A line that is high when the box comes up makes no START; its fall is a STOP and its next
+    rise a START."""
     setup = TriggerSetup(high="START", mode="one-line", stop="")
     assert setup.run(50 * MS) == []
     setup.drive("START", 100 * MS, 200 * MS, level=False)
@@ -188,7 +227,8 @@ def test_pulse_of_glitch_us() -> None:
 
 
 def test_level_seen_too_late() -> None:
-    """The kernel may read the level too late: the same edge twice is one edge, and a return to the level is none."""
+    """The kernel may read the level too late: the same edge twice is one edge, and a return to the
+    level is none."""
     setup = TriggerSetup()
     setup.queue((False, MS, 1), (False, MS + US, 2))
     assert setup.poll(3 * MS) == []
@@ -212,7 +252,8 @@ def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
 
 
 def test_interrupts_overtake() -> None:
-    """An edge that the kernel's thread delivers late, but within `glitch_us`, is reported in order and is no loss."""
+    """An edge that the kernel's thread delivers late, but within `glitch_us`, is reported in order
+    and is no loss."""
     setup = TriggerSetup()
     setup.drive("START", MS)
     setup.drive("STOP", MS + 5 * US)
@@ -228,12 +269,17 @@ def test_interrupts_overtake() -> None:
 
 
 def test_edges_that_the_kernel_joins() -> None:
-    """Two interrupts before their thread has run are one event with the level after both: no loss, whether it is a
-    glitch or not."""
+    """Two interrupts before their thread has run are one event with the level after both: no loss,
+    whether it is a glitch or not."""
     setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
-    reported = (fall, MS + 20 * US, 2, 1), (rise, 5 * MS + 20 * US, 5, 2)  # kind, stamp, edges so far, events so far
-    setup.gpio.requests[0].queue.extend(gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in reported)
+    reported = (
+        (fall, MS + 20 * US, 2, 1),
+        (rise, 5 * MS + 20 * US, 5, 2),
+    )  # kind, stamp, edges so far, events so far
+    setup.gpio.requests[0].queue.extend(
+        gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in reported
+    )
     assert setup.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
     assert (setup.trigger.edge_counters.lost_edges, setup.trigger.edge_counters.glitches) == (0, 1)
 
@@ -251,7 +297,8 @@ def test_event_numbers_wrap() -> None:
 
 
 def test_overrun() -> None:
-    """Dropped events are counted and reported as one LOST; no edge is derived from the rest or from the level."""
+    """Dropped events are counted and reported as one LOST; no edge is derived from the rest or from
+    the level."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", 5 * MS)
     assert setup.run(6 * MS) == [(START, 5 * MS)]
@@ -264,7 +311,8 @@ def test_overrun() -> None:
 
 
 def test_blind_until_quiet() -> None:
-    """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels are read again."""
+    """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels
+    are read again."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
     assert (setup.poll(14_500 * US), setup.trigger.blind) == ([(LOST, 12 * MS)], True)
@@ -276,7 +324,8 @@ def test_blind_until_quiet() -> None:
 
 
 def test_loss_upon_loss() -> None:
-    """A loss is reported as soon as it is certain; further losses before the lines are quiet are only counted."""
+    """A loss is reported as soon as it is certain; further losses before the lines are quiet are
+    only counted."""
     setup = TriggerSetup(queue=32)
     setup.drive("START", *(10 * MS + i * US for i in range(100)))
     assert setup.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
@@ -286,7 +335,8 @@ def test_loss_upon_loss() -> None:
 
 
 def test_loss_ends_what_is_open() -> None:
-    """A loss discards bursts that are still open; a settled edge that waited for them is reported before it."""
+    """A loss discards bursts that are still open; a settled edge that waited for them is reported
+    before it."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
     setup.drive("START", *(t * 100 * US for t in (50, 54, 58, 62, 66, 70, 74, 78)))
     setup.drive("STOP", 5_100 * US)
@@ -296,7 +346,8 @@ def test_loss_ends_what_is_open() -> None:
 
 
 def test_nothing_between_loss_and_quiet() -> None:
-    """An edge of another chip that came after the loss is not reported: its STOP might be among the lost events."""
+    """An edge of another chip that came after the loss is not reported: its STOP might be among the
+    lost events."""
     setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
     setup.drive("STOP", *(t * MS for t in range(10, 15)))
     setup.drive("START", 15 * MS, 17 * MS)
@@ -306,7 +357,8 @@ def test_nothing_between_loss_and_quiet() -> None:
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
 def test_storm(step_ns: int) -> None:
-    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again when it is quiet."""
+    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again
+    when it is quiet."""
     setup = TriggerSetup(mode="one-line", stop="")
     setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
     assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
@@ -323,7 +375,8 @@ def test_storm_of_just_storm_edges() -> None:
 
 
 def test_storm_between_two_calls() -> None:
-    """Of 10,000 edges between two calls the kernel keeps the last 1024: one LOST, and all the others counted."""
+    """Of 10,000 edges between two calls the kernel keeps the last 1024: one LOST, and all the
+    others counted."""
     setup = TriggerSetup()
     setup.drive("START", *(10 * MS + i * US for i in range(10_000)))
     assert setup.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
@@ -344,7 +397,9 @@ def test_reading_is_bounded() -> None:
 
 def test_unread_rest_of_a_burst() -> None:
     """A burst with events still in the queue is not settled, though the call is long after it."""
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)  # one event of each chip a call
+    setup = TriggerSetup(
+        {CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3
+    )  # one event of each chip a call
     setup.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
     setup.drive("STOP", 11 * MS)
     reported = [setup.poll((50 + i) * MS) for i in range(5)]
@@ -354,8 +409,11 @@ def test_unread_rest_of_a_burst() -> None:
 
 
 def test_unread_edges_of_another_chip() -> None:
-    """While one chip's queue is being read, edges are reported as they become certain, and later ones wait."""
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)  # one event of each chip a call
+    """While one chip's queue is being read, edges are reported as they become certain, and later
+    ones wait."""
+    setup = TriggerSetup(
+        {CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2
+    )  # one event of each chip a call
     setup.drive("START", 10 * MS, 20 * MS)
     setup.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
     reported = [setup.poll((50 + i) * MS) for i in range(6)]
@@ -365,14 +423,17 @@ def test_unread_edges_of_another_chip() -> None:
 def test_three_chips() -> None:
     """Each chip is read in each call, however few edges make a storm."""
     setup = TriggerSetup(
-        {CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)}, new_object="NEW", storm_edges=2
+        {CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)},
+        new_object="NEW",
+        storm_edges=2,
     )
     setup.drive("START", MS)
     assert setup.run(5 * MS) == [(START, MS)]
 
 
 def test_chip_pulled_out() -> None:
-    """A chip that is unplugged while it is read is a LineError that names its line and the errno."""
+    """A chip that is unplugged while it is read is a LineError that names its line and the
+    errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
     with pytest.raises(LineError, match=r"cannot read gpio lines START: .*errno 19.*plug it in"):
@@ -390,7 +451,8 @@ def toggles(gaps_us: list[int]) -> list[int]:
 
 
 def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
-    """Reference implementation: (first edge, level) of each burst that changes the level of a line that was low."""
+    """Reference implementation: (first edge, level) of each burst that changes the level of a line
+    that was low."""
     bursts: list[list[int]] = []
     for t_ns in times_ns:
         if bursts and t_ns - bursts[-1][-1] < GLITCH:
@@ -409,11 +471,13 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 @settings(deadline=None)
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
-    """For any edges on three lines of two chips and any times of calls: the edges of the reference, in order of
-    time."""
+    """For any edges on three lines of two chips and any times of calls: the edges of the reference,
+    in order of time."""
     setup = TriggerSetup({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
     wanted = []
-    for name, kind, gaps_us in zip(("START", "STOP", "NEW"), (START, STOP, NEW_OBJECT), lines, strict=True):
+    for name, kind, gaps_us in zip(
+        ("START", "STOP", "NEW"), (START, STOP, NEW_OBJECT), lines, strict=True
+    ):
         setup.drive(name, *toggles(gaps_us))
         wanted += [(kind, t_ns) for t_ns, level in settled(toggles(gaps_us)) if level]
     reported = setup.run(max(sum(gaps_us) for gaps_us in lines) * US + MS, step_us * US)
@@ -423,9 +487,14 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
 
 @settings(deadline=None)
 @given(gaps, st.integers(20, 5000), st.integers(2, 30), st.sampled_from([2, 8, 64]), st.booleans())
-def test_any_losses(gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool) -> None:
-    """START and STOP alternate unless LOST is between them, times never go back, no short pulse makes an edge."""
-    setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue)
+def test_any_losses(
+    gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool
+) -> None:
+    """START and STOP alternate unless LOST is between them, times never go back, no short pulse
+    makes an edge."""
+    setup = TriggerSetup(
+        high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue
+    )
     times = toggles(gaps_us)
     setup.drive("START", *times, level=not high)
     reported = setup.run((sum(gaps_us) + 1500 + 50 * step_us) * US, step_us * US)
@@ -449,15 +518,21 @@ def sim(chips: dict[str, tuple[str, ...]]) -> SimGpio:
 def test_find_on_two_chips() -> None:
     """Lines are found by name on any chip; chip numbers may have gaps."""
     gpio = sim({"/dev/gpiochip4": ("", "STOP"), "/dev/gpiochip11": ("START",)})
-    assert find_lines(gpio, ["START", "STOP"]) == {"START": ("/dev/gpiochip11", 0), "STOP": ("/dev/gpiochip4", 1)}
+    assert find_lines(gpio, ["START", "STOP"]) == {
+        "START": ("/dev/gpiochip11", 0),
+        "STOP": ("/dev/gpiochip4", 1),
+    }
 
 
 def test_find_through_link() -> None:
-    """A second path to the same chip (Raspberry Pi OS links gpiochip4 to gpiochip0) makes no name ambiguous."""
+    """A second path to the same chip (Raspberry Pi OS links gpiochip4 to gpiochip0) makes no name
+    ambiguous."""
     gpio = sim({CHIP0: ("START",)})
     chip = gpio.Chip
     with (
-        mock.patch.object(gpio, "is_gpiochip_device", lambda path: path in (CHIP0, "/dev/gpiochip4")),
+        mock.patch.object(
+            gpio, "is_gpiochip_device", lambda path: path in (CHIP0, "/dev/gpiochip4")
+        ),
         mock.patch.object(gpio, "Chip", side_effect=lambda _: chip(CHIP0)),
     ):
         assert find_lines(gpio, ["START"]) == {"START": (CHIP0, 0)}
@@ -520,12 +595,17 @@ def test_unreadable_chip() -> None:
 
 def test_no_chip() -> None:
     """A machine without GPIO is an error, unless no line is wanted."""
-    with pytest.raises(LineError, match=r"no /dev/gpiochip.*; without lines leave `board` out and set trigger\.mode"):
+    with pytest.raises(
+        LineError,
+        match=r"no /dev/gpiochip.*; without lines leave `board` out and set trigger\.mode",
+    ):
         find_lines(sim({}), ["START"])
     assert find_lines(sim({}), []) == {}
 
 
-@pytest.mark.parametrize("module", [SimpleNamespace(__version__="1.6.3", Chip=object), SimpleNamespace()])
+@pytest.mark.parametrize(
+    "module", [SimpleNamespace(__version__="1.6.3", Chip=object), SimpleNamespace()]
+)
 def test_binding_of_libgpiod_1(module: Any) -> None:
     """The old binding, or another module of that name, is refused with its version and advice."""
     version = getattr(module, "__version__", "of unknown version")
@@ -545,7 +625,9 @@ def test_busy_line() -> None:
     """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
-        with pytest.raises(LineError, match=r"cannot request gpio lines STOP: .*errno 16.*gpioinfo"):
+        with pytest.raises(
+            LineError, match=r"cannot request gpio lines STOP: .*errno 16.*gpioinfo"
+        ):
             GpioTrigger(trigger_config(), gpio)
         assert [request.names for request in gpio.requests] == [{0: "STOP"}]
     assert gpio.requests == []
@@ -592,7 +674,8 @@ def test_only_changes_are_written(panel: tuple[SimGpio, VirtualClock, Lines]) ->
 
 
 def test_class_bits_settle_first(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """RESULT VALID falls, the bits change (lowest first in the list), and `settle_us` later RESULT VALID rises."""
+    """RESULT VALID falls, the bits change (lowest first in the list), and `settle_us` later RESULT
+    VALID rises."""
     gpio, _, lines = panel
     lines.result(5)
     assert gpio.written == [(0, "C0", True), (0, "C2", True), (200 * US, "VALID", True)]
@@ -612,7 +695,11 @@ def test_same_code_again(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
     gpio, _, lines = panel
     lines.result(0)
     lines.result(0)
-    assert gpio.written == [(200 * US, "VALID", True), (200 * US, "VALID", False), (400 * US, "VALID", True)]
+    assert gpio.written == [
+        (200 * US, "VALID", True),
+        (200 * US, "VALID", False),
+        (400 * US, "VALID", True),
+    ]
 
 
 def test_no_result(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
@@ -638,19 +725,25 @@ def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code
 
 
 def test_not_wired() -> None:
-    """Lines without a name are neither searched nor written; a box without outputs needs no chip."""
+    """Lines without a name are neither searched nor written; a box without outputs needs no
+    chip."""
     gpio = SimGpio(VirtualClock(0), {CHIP0: ("READY",)})
-    lines = Lines(output_config(busy="", result_valid="", fault="", class_bits=()), gpio, VirtualClock(0))
+    lines = Lines(
+        output_config(busy="", result_valid="", fault="", class_bits=()), gpio, VirtualClock(0)
+    )
     lines.show(ready=True, busy=True, fault=True)
     lines.result(0)
     assert gpio.written == [(0, "READY", True)]
     assert lines.capacity == 1
     nothing = output_config(ready="", busy="", result_valid="", fault="", class_bits=())
-    Lines(nothing, SimGpio(VirtualClock(0), {}), VirtualClock(0)).show(ready=True, busy=False, fault=False)
+    Lines(nothing, SimGpio(VirtualClock(0), {}), VirtualClock(0)).show(
+        ready=True, busy=False, fault=False
+    )
 
 
 def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Closing takes READY and all else low by itself, as on a chip that keeps what was driven; twice is fine."""
+    """Closing takes READY and all else low by itself, as on a chip that keeps what was driven;
+    twice is fine."""
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: OUTPUTS})
     monkeypatch.setattr(SimRequest, "release", lambda request: gpio.requests.remove(request))
@@ -658,14 +751,19 @@ def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
         lines.show(ready=True, busy=False, fault=False)
         lines.result(4)
         gpio.written.clear()
-    assert sorted(gpio.written) == [(200 * US, "C2", False), (200 * US, "READY", False), (200 * US, "VALID", False)]
+    assert sorted(gpio.written) == [
+        (200 * US, "C2", False),
+        (200 * US, "READY", False),
+        (200 * US, "VALID", False),
+    ]
     assert gpio.requests == []
     lines.close()
     assert len(gpio.written) == 3
 
 
 def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """A chip that is gone cannot be taken low: LineError, and the other lines are given back all the same."""
+    """A chip that is gone cannot be taken low: LineError, and the other lines are given back all
+    the same."""
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     gpio.refuse[CHIP0] = 19
@@ -692,10 +790,13 @@ def test_double_releases_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None
 
 @pytest.mark.parametrize(("asked", "granted"), [(0, 32), (5, 8), (64, 64), (5000, 1024)])
 def test_double_queues_as_the_kernel(asked: int, granted: int) -> None:
-    """16 events a line unless asked otherwise, rounded up to a power of two, at most 1024; the oldest is dropped."""
+    """16 events a line unless asked otherwise, rounded up to a power of two, at most 1024; the
+    oldest is dropped."""
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: INPUTS})
-    request = gpio.request_lines(CHIP0, {(1, 2): gpiod.LineSettings(edge_detection=gpiod.line.Edge.RISING)}, "", asked)
+    request = gpio.request_lines(
+        CHIP0, {(1, 2): gpiod.LineSettings(edge_detection=gpiod.line.Edge.RISING)}, "", asked
+    )
     for t_ns in range(2 * granted + 2):
         gpio.drive("START", t_ns % 2 == 0, t_ns)
     clock.sleep_until(MS)
@@ -706,7 +807,8 @@ def test_double_queues_as_the_kernel(asked: int, granted: int) -> None:
 
 
 def test_double_never_waits() -> None:
-    """Reading from an empty queue, where gpiod would wait for ever, and driving an unknown line are mistakes."""
+    """Reading from an empty queue, where gpiod would wait for ever, and driving an unknown line are
+    mistakes."""
     gpio = SimGpio(VirtualClock(), {CHIP0: INPUTS})
     with pytest.raises(RuntimeError, match="empty queue"):
         gpio.request_lines(CHIP0, {(1,): gpiod.LineSettings()}).read_edge_events(1)

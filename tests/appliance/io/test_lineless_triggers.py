@@ -1,4 +1,5 @@
-"""Sweeps without lines: commands, the space bar of a real pseudo-terminal, the clock; and what each refuses."""
+"""Sweeps without lines: commands, the space bar of a real pseudo-terminal, the clock; and what each
+refuses."""
 
 from __future__ import annotations
 
@@ -15,7 +16,13 @@ import pytest
 from appliance.core.config import TriggerConfig
 from appliance.core.errors import ConfigError, PortError
 from appliance.core.types import Edge, EdgeKind, Status, Verdict
-from appliance.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger, standard_input
+from appliance.io.lineless_triggers import (
+    AnswerWatch,
+    CommandTrigger,
+    KeyTrigger,
+    TimedTrigger,
+    standard_input,
+)
 from appliance.sim import devices, rig, script, skin
 from tests.factories.simulated_box import SECOND, Rigged
 
@@ -53,17 +60,23 @@ def test_a_command_is_an_edge_at_the_time_of_its_arrival():
     trigger.commands["STOP"]("")
     assert trigger.edges(20) == [Edge(START, 5), Edge(STOP, 9)]
     assert trigger.edges(30) == []
-    assert (trigger.blind, trigger.about) == (False, {"mode": "serial", "times": "arrival of the command"})
+    assert (trigger.blind, trigger.about) == (
+        False,
+        {"mode": "serial", "times": "arrival of the command"},
+    )
 
 
 def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
-    """The whole box with `trigger.mode = "serial"`: START, STOP and NEW as commands; same statuses, no input line is used."""
+    """The whole box with `trigger.mode = "serial"`: START, STOP and NEW as commands; same statuses,
+    no input line is used."""
     off = np.zeros((60 * 750, 4, 4), np.uint8)
-    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
-    box = rigged(simulated, sets=("trigger.mode=serial",))
-    assert {name for request in simulated.gpio.requests for name in request.names.values()}.isdisjoint(
-        {devices.START, devices.STOP, devices.NEW_OBJECT}
+    simulated = devices.build(
+        skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim"
     )
+    box = rigged(simulated, sets=("trigger.mode=serial",))
+    assert {
+        name for request in simulated.gpio.requests for name in request.names.values()
+    }.isdisjoint({devices.START, devices.STOP, devices.NEW_OBJECT})
     box.seconds(0.5)
     assert ",STOP,ok*" in box.ask("$PPLP,STOP")
     box.seconds(0.5)
@@ -88,7 +101,10 @@ def test_commands_of_another_trigger_are_refused(rigged: Callable[..., Rigged]):
     box = rigged(devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"))
     box.seconds(0.5)
     for name in ("START", "STOP"):
-        assert f",{name},error,sweeps are triggered otherwise; set trigger.mode to serial" in box.ask(f"$PPLP,{name}")
+        assert (
+            f",{name},error,sweeps are triggered otherwise; set trigger.mode to serial"
+            in box.ask(f"$PPLP,{name}")
+        )
 
 
 def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
@@ -127,8 +143,8 @@ def test_after_an_answer_the_space_bar_starts(terminal: tuple[int, int]):
 
 
 def test_the_terminal_is_restored(terminal: tuple[int, int]):
-    """While it is open, keys come at once, are not shown, and none stops or kills the program but Ctrl-C; then all is as
-    before."""
+    """While it is open, keys come at once, are not shown, and none stops or kills the program but
+    Ctrl-C; then all is as before."""
     _, near = terminal
     tty.setcbreak(near)  # some settings that are not the default
     before = termios.tcgetattr(near)
@@ -145,7 +161,8 @@ def test_the_terminal_is_restored(terminal: tuple[int, int]):
 
 
 def test_a_terminal_that_is_gone_ends_it(terminal: tuple[int, int]):
-    """Nobody could start a sweep any more: PortError, not a loop for ever; closing does not fail."""
+    """Nobody could start a sweep any more: PortError, not a loop for ever; closing does not
+    fail."""
     far, near = terminal
     with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
         os.close(far)
@@ -158,7 +175,9 @@ def test_what_is_no_terminal_is_refused(what: str):
     """A pipe, or no standard input at all."""
     read, write = os.pipe()
     try:
-        with pytest.raises(ConfigError, match=r'standard input is no terminal; run it in one, or use "serial"'):
+        with pytest.raises(
+            ConfigError, match=r'standard input is no terminal; run it in one, or use "serial"'
+        ):
             KeyTrigger(read if what == "pipe" else -1, rig.VirtualClock(), lambda line: None)
     finally:
         os.close(read)
@@ -171,19 +190,33 @@ def test_standard_input_may_be_missing(monkeypatch: pytest.MonkeyPatch):
     assert standard_input() == -1
 
 
-def timed(every_s: float = 5.0, sweep_s: float = 3.0) -> tuple[TimedTrigger, rig.VirtualClock, list[str]]:
+def timed(
+    every_s: float = 5.0, sweep_s: float = 3.0
+) -> tuple[TimedTrigger, rig.VirtualClock, list[str]]:
     """A trigger by the clock, the clock, and what it says."""
     said: list[str] = []
     clock = rig.VirtualClock(0)
-    return TimedTrigger(TriggerConfig(mode="timed", every_s=every_s, sweep_s=sweep_s), clock, said.append), clock, said
+    return (
+        TimedTrigger(
+            TriggerConfig(mode="timed", every_s=every_s, sweep_s=sweep_s), clock, said.append
+        ),
+        clock,
+        said,
+    )
 
 
 def test_the_clock_starts_and_stops():
-    """A sweep every 5 s: edges have the time at which they were due, however late they are asked for."""
+    """A sweep every 5 s: edges have the time at which they were due, however late they are asked
+    for."""
     trigger, _, said = timed()
     edges = [edge for t in range(0, 13 * SECOND, SECOND // 7) for edge in trigger.edges(t)]
-    assert edges == [Edge(START, 2 * SECOND), Edge(STOP, 5 * SECOND), Edge(START, 7 * SECOND), Edge(STOP, 10 * SECOND),
-                     Edge(START, 12 * SECOND)]  # fmt: skip
+    assert edges == [
+        Edge(START, 2 * SECOND),
+        Edge(STOP, 5 * SECOND),
+        Edge(START, 7 * SECOND),
+        Edge(STOP, 10 * SECOND),
+        Edge(START, 12 * SECOND),
+    ]
     countdown = ["start in 2 s", "start in 1 s", "start: slide for 3 s", "stop"]
     assert said == [*countdown, *countdown, *countdown[:3]]
 
@@ -204,7 +237,8 @@ def test_no_sweep_is_made_up_for_a_pause_of_the_program():
 
 
 def test_no_sweep_is_started_while_it_is_held():
-    """The pause and its countdown begin again afterwards; a sweep that has begun is stopped in time."""
+    """The pause and its countdown begin again afterwards; a sweep that has begun is stopped in
+    time."""
     trigger, _, said = timed()
     trigger.held = True
     assert trigger.edges(9 * SECOND) == []
@@ -218,9 +252,12 @@ def test_no_sweep_is_started_while_it_is_held():
 
 
 def test_nobody_slides_for_a_skin_that_is_away(rigged: Callable[..., Rigged]):
-    """The whole box: it is waited for the skin at the start and after an unplugging, and no sweep is `not-ready`."""
+    """The whole box: it is waited for the skin at the start and after an unplugging, and no sweep
+    is `not-ready`."""
     off = np.zeros((60 * 750, 4, 4), np.uint8)
-    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
+    simulated = devices.build(
+        skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim"
+    )
     simulated.backend.unplug()
     box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
     box.seconds(10)
@@ -241,7 +278,9 @@ def test_a_sweep_must_leave_a_pause():
 def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
     """The whole box: windows are cut in the middle of what the clock started and stopped."""
     off = np.zeros((60 * 750, 4, 4), np.uint8)
-    simulated = devices.build(skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim")
+    simulated = devices.build(
+        skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim"
+    )
     box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
     box.seconds(10)
     assert [(s.stop_ns - s.start_ns, s.status) for s in box.kept] == [(3 * SECOND, Status.OK)] * 2
@@ -252,7 +291,10 @@ def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
 @pytest.mark.parametrize(
     ("sets", "hint"),
     [
-        (("trigger.mode=timed", "trigger.sweep_s=1"), "a sweep of 1 s is shorter than the window of 2 s"),
+        (
+            ("trigger.mode=timed", "trigger.sweep_s=1"),
+            "a sweep of 1 s is shorter than the window of 2 s",
+        ),
         (("trigger.mode=timed", "trigger.sweep_s=6"), "leaves no pause"),
         (("trigger.mode=key",), "is no terminal"),
     ],

@@ -1,6 +1,8 @@
-"""Comparison of a board's clock with its frame count, and faults that end by themselves. In virtual time.
+"""Comparison of a board's clock with its frame count, and faults that end by themselves. In virtual
+time.
 
-In: a board whose packets are altered on the cable. Out: states, and no frame whose host time is wrong.
+In: a board whose packets are altered on the cable. Out: states, and no frame whose host time is
+wrong.
 """
 
 from __future__ import annotations
@@ -43,12 +45,15 @@ def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[
 
 def late_ms(frames: Frames, simulated: SimDevices) -> np.ndarray:
     """Delay in ms [n] of each frame's time stamp after the time at which the board took it."""
-    taken_ns = [simulated.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq]
+    taken_ns = [
+        simulated.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq
+    ]
     return (frames.t_ns - np.array(taken_ns)) / 1e6
 
 
 def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
-    """The next packets get another number and another time, as `change` says of (a packet, the first one)."""
+    """The next packets get another number and another time, as `change` says of (a packet, the
+    first one)."""
     first: list[wire.Packet] = []
 
     def mangle(data: bytes) -> bytes:
@@ -68,17 +73,23 @@ def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
     ("change", "packets"),
     [
         pytest.param(lambda p, first: (p.seq, p.t_us + 3_000_000), 1, id="one packet 3 s ahead"),
-        pytest.param(lambda p, first: (p.seq, p.t_us + 1_000_000), 10**9, id="1 s ahead from then on"),
-        pytest.param(lambda p, first: (p.seq, p.t_us - 1_000_000), 10**9, id="1 s back from then on"),
+        pytest.param(
+            lambda p, first: (p.seq, p.t_us + 1_000_000), 10**9, id="1 s ahead from then on"
+        ),
+        pytest.param(
+            lambda p, first: (p.seq, p.t_us - 1_000_000), 10**9, id="1 s back from then on"
+        ),
         pytest.param(lambda p, first: (p.seq, 2 * first.t_us - p.t_us), 400, id="backwards"),
         pytest.param(lambda p, first: (p.seq, first.t_us), 400, id="stands still"),
         pytest.param(lambda p, first: (p.seq, 2 * p.t_us - first.t_us), 400, id="twice its pace"),
-        pytest.param(lambda p, first: (p.seq, p.t_us + (p.t_us - first.t_us) // 20), 2000, id="5 % fast"),
+        pytest.param(
+            lambda p, first: (p.seq, p.t_us + (p.t_us - first.t_us) // 20), 2000, id="5 % fast"
+        ),
     ],
 )
 def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames: int):
-    """If the board's clock disagrees with its count: mismatch, no frame gets a wrong time, and it streams again
-    afterwards."""
+    """If the board's clock disagrees with its count: mismatch, no frame gets a wrong time, and it
+    streams again afterwards."""
     simulated = idle_devices(packet_frames=packet_frames)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 3)
@@ -95,7 +106,8 @@ def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
-    """A count that jumps ahead while the clock does not is no loss of frames: mismatch, and the board is restarted."""
+    """A count that jumps ahead while the clock does not is no loss of frames: mismatch, and the
+    board is restarted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -110,11 +122,18 @@ def test_a_count_that_jumps(ahead: int):
 @pytest.mark.parametrize("ppm", [-500, 0, 500])
 @pytest.mark.parametrize("packet_frames", [1, 6, 255])
 def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
-    """500 ppm, stamps that waver by half a frame, both counters at their wrap, two seconds lost: nothing to refuse."""
+    """500 ppm, stamps that waver by half a frame, both counters at their wrap, two seconds lost:
+    nothing to refuse."""
     rng = np.random.default_rng(7)
-    simulated = idle_devices(packet_frames=packet_frames, ppm=ppm, first_seq=COUNTS - 2000, fifo_frames=300)
+    simulated = idle_devices(
+        packet_frames=packet_frames, ppm=ppm, first_seq=COUNTS - 2000, fifo_frames=300
+    )
     sensor = sensor_on(simulated, read_bytes=8192)
-    alter(simulated, lambda p, first: (p.seq, p.t_us + COUNTS - 5_000_000 + int(rng.integers(-600, 600))), 10**9)
+    alter(
+        simulated,
+        lambda p, first: (p.seq, p.t_us + COUNTS - 5_000_000 + int(rng.integers(-600, 600))),
+        10**9,
+    )
     states = read_for(sensor, simulated, 8)[1]
     simulated.clock.sleep_until(simulated.clock.now_ns() + 2 * SECOND)
     states |= read_for(sensor, simulated, 4)[1]
@@ -126,20 +145,25 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
 def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
-    """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand or go back: no
-    refusal."""
+    """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand
+    or go back: no refusal."""
     rng = np.random.default_rng(8)
     fmt = SweepFormat(4, 4, rate_hz, 1500, "uint8")
     simulated = idle_devices(60, fmt, packet_frames=packet_frames)
     sensor = UsbSensor(SensorConfig(silence_ms=2000), fmt, simulated.clock, simulated.backend)
-    alter(simulated, lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000), 10**9)
+    alter(
+        simulated,
+        lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000),
+        10**9,
+    )
     frames, states = read_for(sensor, simulated, 8)
     assert states == {"streaming"}
     assert np.abs(late_ms(frames, simulated)).max() < 6
 
 
 def test_a_stalled_endpoint_is_cleared():
-    """errno 32 is not for ever: the endpoint is cleared, and the board streams again without being replugged."""
+    """errno 32 is not for ever: the endpoint is cleared, and the board streams again without being
+    replugged."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -151,10 +175,12 @@ def test_a_stalled_endpoint_is_cleared():
 
 
 @pytest.mark.parametrize(
-    ("string", "state"), [(b"", "lost"), (b"\x05\x03a\0b", "absent"), (b"\x06\x03\x00\xd8\x00\xd8", "mismatch")]
+    ("string", "state"),
+    [(b"", "lost"), (b"\x05\x03a\0b", "absent"), (b"\x06\x03\x00\xd8\x00\xd8", "mismatch")],
 )
 def test_a_serial_number_that_is_no_text(string: bytes, state: str):
-    """Where the serial number chooses the board and is no text: a state that says so, not the end of the program."""
+    """Where the serial number chooses the board and is no text: a state that says so, not the end
+    of the program."""
     simulated = idle_devices()
     backend, control = simulated.backend, simulated.backend.ctrl_transfer
 
@@ -174,16 +200,20 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-80, 80])
 def test_windows_over_many_offsets(ppm: float):
-    """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each within a frame of the
-    middle."""
+    """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each
+    within a frame of the middle."""
     rng = np.random.default_rng(11)
-    late = (150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01) for _ in iter(int, 1))
+    late = (
+        150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01)
+        for _ in iter(int, 1)
+    )
     simulated = idle_devices(ppm=ppm, latency=lambda: next(late), fifo_frames=3000, packet_frames=6)
     sensor, board = sensor_on(simulated), simulated.backend.board
     recorders = [SweepCutter(FMT, SweepConfig()) for _ in range(10)]
     begun = simulated.clock.now_ns()
     edges = [
-        [round(begun + (5 + 2.4 * k + rng.uniform(0, 0.3)) * SECOND) for k in range(13)] for _ in recorders
+        [round(begun + (5 + 2.4 * k + rng.uniform(0, 0.3)) * SECOND) for k in range(13)]
+        for _ in recorders
     ]  # a stop is the next one's start
     apart = []
     while simulated.clock.now_ns() < begun + 35 * SECOND:
@@ -196,7 +226,10 @@ def test_windows_over_many_offsets(ppm: float):
             for sweep in recorder.finished(now):
                 if len(sweep.frames):
                     middle = int(sweep.frames.seq[len(sweep.frames) // 2]) & ((1 << EPOCH_BITS) - 1)
-                    apart.append((board.frame_ns(middle) - (sweep.start_ns + sweep.stop_ns) / 2) / FMT.period_ns)
+                    apart.append(
+                        (board.frame_ns(middle) - (sweep.start_ns + sweep.stop_ns) / 2)
+                        / FMT.period_ns
+                    )
                 else:
                     assert sweep.status is Status.NO_START
     assert len(apart) == 120
@@ -204,7 +237,8 @@ def test_windows_over_many_offsets(ppm: float):
 
 
 def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
-    """Pauses of the box, between reads and within one, are no silence; half a second of listening in vain is."""
+    """Pauses of the box, between reads and within one, are no silence; half a second of listening
+    in vain is."""
     simulated = idle_devices(fifo_frames=6000)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)

@@ -38,12 +38,18 @@ def test_bytes_are_the_documents_table():
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 1, 2, 2, 2, 0, 0, 0xFFFFFFFF, 7)
     by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
-    assert wire.pack(0xFFFFFFFF, 7, np.arange(8, dtype=np.uint8).reshape(2, 2, 2), wire.Flag.TRIGGER) == by_hand
+    assert (
+        wire.pack(0xFFFFFFFF, 7, np.arange(8, dtype=np.uint8).reshape(2, 2, 2), wire.Flag.TRIGGER)
+        == by_hand
+    )
 
 
-@pytest.mark.parametrize(("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))])
+@pytest.mark.parametrize(
+    ("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))]
+)
 def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
-    """The byte after the data type is the number of axes, and 0 means one, in which form the box writes it, too."""
+    """The byte after the data type is the number of axes, and 0 means one, in which form the box
+    writes it, too."""
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 0, 1, *shape[:2], 0, byte, 5, 7)
     by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
@@ -70,8 +76,14 @@ def test_document_names_the_numbers():
     assert f"at most {wire.MAX_PAYLOAD}" in text
     assert f"up to {wire.RECENT:,} frames back" in text
     assert all(f"| {r.value} | {r.name} |" in text for r in wire.Request)
-    assert f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes" in text
-    assert f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes" in text
+    assert (
+        f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes"
+        in text
+    )
+    assert (
+        f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes"
+        in text
+    )
     assert f"axes A of each taxel: 0 or 1 for one, at most {MOST_AXES}" in text
     assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DATA_TYPES)) in text
 
@@ -82,7 +94,9 @@ def test_every_data_type_survives(dtype: str):
     sent = stream(2, dtype=dtype)
     got = wire.unpack(b"".join(sent))
     assert [p.taxels.dtype.name for p in got.packets] == [dtype, dtype]
-    assert frames_of(got.packets) == frames_of(wire.unpack(sent[0]).packets + wire.unpack(sent[1]).packets)
+    assert frames_of(got.packets) == frames_of(
+        wire.unpack(sent[0]).packets + wire.unpack(sent[1]).packets
+    )
     assert got.garbage == 0
     assert got.leftover == b""
 
@@ -108,14 +122,17 @@ def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
             st.tuples(st.just("packet"), st.integers(0, 19)),
             st.tuples(st.just("garbage"), st.binary(min_size=1, max_size=40)),
             st.tuples(st.just("cut"), st.tuples(st.integers(0, 19), st.integers(1, 41))),
-            st.tuples(st.just("flip"), st.tuples(st.integers(0, 19), st.integers(0, 41), st.integers(1, 255))),
+            st.tuples(
+                st.just("flip"),
+                st.tuples(st.integers(0, 19), st.integers(0, 41), st.integers(1, 255)),
+            ),
         ),
         max_size=25,
     )
 )
 def test_only_intact_frames_and_all_bytes_accounted(pieces):
-    """Repeated, truncated, corrupted packets and garbage: no frame is invented, no intact one is missed, bytes add
-    up."""
+    """Repeated, truncated, corrupted packets and garbage: no frame is invented, no intact one is
+    missed, bytes add up."""
     sent = stream(20)
     wanted, data = {}, b""
     for what, argument in pieces:
@@ -150,8 +167,12 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(0, 2**32 - 1))
 def test_follow_accounts_for_every_frame(order: list[int], first: int):
-    """For any order of packets: numbers rise, and fresh + lost frames span exactly what was seen."""
-    packets = [wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8)) for k in order]
+    """For any order of packets: numbers rise, and fresh + lost frames span exactly what was
+    seen."""
+    packets = [
+        wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8))
+        for k in order
+    ]
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     starts = [s for s, _ in fresh]
     assert starts == sorted(set(starts))
@@ -170,7 +191,8 @@ def test_follow_wraps():
 
 
 def test_follow_takes_a_count_far_back_as_restart():
-    """A board that begins again at 0 starts a new epoch: nothing is lost, and nothing looks adjacent."""
+    """A board that begins again at 0 starts a new epoch: nothing is lost, and nothing looks
+    adjacent."""
     packets = wire.unpack(stream(1, first=900_000)[0] + stream(1, first=0)[0]).packets
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     assert [s for s, _ in fresh] == [900_000, 1 << EPOCH_BITS]
@@ -178,11 +200,14 @@ def test_follow_takes_a_count_far_back_as_restart():
 
 
 def test_unknown_version_is_garbage_but_its_reply_is_read():
-    """Frames of another protocol version are not parsed; a reply is read, so that the version can be named."""
+    """Frames of another protocol version are not parsed; a reply is read, so that the version can
+    be named."""
     packet = bytearray(stream(1)[0])
     packet[2] = 9
     assert wire.unpack(bytes(packet) + bytes(50)).packets == []
-    assert wire.unpack(wire.pack_reply(wire.Request.IDENTITY, b"\x09", version=9)).replies == [wire.Reply(1, b"\x09")]
+    assert wire.unpack(wire.pack_reply(wire.Request.IDENTITY, b"\x09", version=9)).replies == [
+        wire.Reply(1, b"\x09")
+    ]
 
 
 def test_identity_and_format_survive():
@@ -204,7 +229,11 @@ def test_identity_and_format_survive():
         (wire.unpack_identity, b"\x01", "36"),
         (wire.unpack_format, b"\x01", "16"),
         (wire.unpack_format, b"\x04\x04\x09" + bytes(13), "data type 9"),
-        (wire.unpack_format, b"\x04\x04\x00\x09" + bytes(12), "9 axes of each taxel are more than the 8"),
+        (
+            wire.unpack_format,
+            b"\x04\x04\x00\x09" + bytes(12),
+            "9 axes of each taxel are more than the 8",
+        ),
     ],
 )
 def test_broken_replies_are_named(call, value, hint):

@@ -1,5 +1,5 @@
-"""Serial line and class bits: sentences that others can parse, a port that is never waited for, bits that settle
-first."""
+"""Serial line and class bits: sentences that others can parse, a port that is never waited for,
+bits that settle first."""
 
 import fcntl
 import itertools
@@ -35,7 +35,18 @@ PROTOCOL = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
 def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: str = "") -> Verdict:
     """A verdict as the classifier makes it."""
     return Verdict(
-        7, 5_021_384_000_000, status, label, 0.987, 0.981, np.array([0.987, 0.013]), 1, 0, 410_000, "9f3c2a1b", detail
+        7,
+        5_021_384_000_000,
+        status,
+        label,
+        0.987,
+        0.981,
+        np.array([0.987, 0.013]),
+        1,
+        0,
+        410_000,
+        "9f3c2a1b",
+        detail,
     )
 
 
@@ -92,8 +103,8 @@ def test_checksums_agree(text: str):
     ],
 )
 def test_commands_are_read(line: bytes, want: Command):
-    """With checksum or without, as a program or a person sends it; bytes of a break or noise before the $ are
-    ignored."""
+    """With checksum or without, as a program or a person sends it; bytes of a break or noise before
+    the $ are ignored."""
     assert parse(line + b"\r\n") == ([want], b"")
 
 
@@ -108,7 +119,8 @@ def test_commands_are_read(line: bytes, want: Command):
     ],
 )
 def test_bad_commands_are_answered(line: bytes, hint: str):
-    """A wrong checksum, an unknown command, another protocol, noise: an error that says what to send."""
+    """A wrong checksum, an unknown command, another protocol, noise: an error that says what to
+    send."""
     (command,), rest = parse(line + b"\n")
     assert hint in command.error
     assert rest == b""
@@ -116,7 +128,8 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
 
 @pytest.mark.parametrize("line", [b"ID", b"help", b"$PPLP,MATERIAL", b"$PPLP,ID,now", b"\xff"])
 def test_the_example_of_an_error_can_be_copied(line: bytes):
-    """Whatever was typed, what the ANS sentence says to send is understood: nothing of it was lost to NMEA's characters."""
+    """Whatever was typed, what the ANS sentence says to send is understood: nothing of it was lost
+    to NMEA's characters."""
     ((bad,), _) = parse(line + b"\r\n")
     heard = sentence("ANS", bad.name, "error", bad.error).decode("ascii")
     example = re.search(r"(?:send for example|send it as) ([^,*]+)", heard)[1]
@@ -151,8 +164,8 @@ def sink_on(name: str, clock=None, **settings) -> SerialSink:
 
 
 def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
-    """A missing port is named with what to do, sentences wait up to the queue's length, and it is opened when it
-    comes."""
+    """A missing port is named with what to do, sentences wait up to the queue's length, and it is
+    opened when it comes."""
     clock = rig.VirtualClock()
     sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
     sink.send(verdict())
@@ -170,7 +183,8 @@ def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
 
 
 def test_a_port_that_goes_away_while_open():
-    """The other end closes (an adapter is pulled): `trouble` says so, nothing is raised, the next port is opened."""
+    """The other end closes (an adapter is pulled): `trouble` says so, nothing is raised, the next
+    port is opened."""
     clock = rig.VirtualClock()
     with pseudo_terminal.pair() as (_, name):
         sink = sink_on(name, clock)
@@ -198,8 +212,8 @@ def is_shut(port: int) -> bool:
 
 
 def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
-    """While the box has a port the kernel refuses it to others; after closing it is free, even if another had it
-    open."""
+    """While the box has a port the kernel refuses it to others; after closing it is free, even if
+    another had it open."""
     monkeypatch.setattr(serial_port, "PSEUDO_TERMINALS", range(0))
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
         sink = sink_on(name)
@@ -211,7 +225,8 @@ def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_pseudo_terminal_is_not_shut():
-    """Otherwise it would stay locked, also for the box, if the box is killed while the other end is open."""
+    """Otherwise it would stay locked, also for the box, if the box is killed while the other end is
+    open."""
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
         sink = sink_on(name)
         sink.commands()

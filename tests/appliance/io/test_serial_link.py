@@ -1,4 +1,5 @@
-"""PROTOCOL.md over a serial port: a real pseudo-terminal, the real pyserial; each failure has its state and message."""
+"""PROTOCOL.md over a serial port: a real pseudo-terminal, the real pyserial; each failure has its
+state and message."""
 
 from __future__ import annotations
 
@@ -87,7 +88,8 @@ def test_streams_and_stops(board: SerialBoard):
 
 
 def test_unplugged_and_replugged(board: SerialBoard):
-    """Pulled while frames come: lost, then absent; back under the same name: a new epoch, content right."""
+    """Pulled while frames come: lost, then absent; back under the same name: a new epoch, content
+    right."""
     board.plug()
     with closing(sensor_on(board)) as sensor:
         first = read_until(sensor, lambda n: n > 100)
@@ -106,7 +108,8 @@ def test_unplugged_and_replugged(board: SerialBoard):
 
 
 def test_another_format_is_a_mismatch(board: SerialBoard):
-    """A board of another grid is refused with both forms; it is asked again, and taken once it fits."""
+    """A board of another grid is refused with both forms; it is asked again, and taken once it
+    fits."""
     board.board = skins.board(Skin(rows=3), CLOCK)
     board.plug()
     with closing(sensor_on(board)) as sensor:
@@ -124,17 +127,24 @@ def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     who = packets.Identity(1, (1, 2, 3), "board", "7")
     stream = packets.pack(0, 0, np.zeros((6, 4, 4), np.uint8))
     with closing(BoardLink(path, 115200, CLOCK)) as link:
-        os.write(far, stream[50:] + stream + packets.pack_reply(packets.Request.IDENTITY, packets.pack_identity(who)))
+        os.write(
+            far,
+            stream[50:]
+            + stream
+            + packets.pack_reply(packets.Request.IDENTITY, packets.pack_identity(who)),
+        )
         assert packets.unpack_identity(link.request(packets.Request.IDENTITY, 64)) == who
         assert os.read(far, 10) == bytes([packets.Request.IDENTITY])
     assert os.read(far, 10) == bytes([packets.Request.STOP])
 
 
 @pytest.mark.parametrize(
-    ("sent", "hint"), [(b"", "sends nothing"), (b"hello", "sends 5 other bytes"), (bytes(20_000), "other bytes but")]
+    ("sent", "hint"),
+    [(b"", "sends nothing"), (b"hello", "sends 5 other bytes"), (bytes(20_000), "other bytes but")],
 )
 def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
-    """A port with something else on it, or nothing: given up after half a second or too many bytes."""
+    """A port with something else on it, or nothing: given up after half a second or too many
+    bytes."""
     far, path = line
     with closing(SerialLink(path, 115200, CLOCK)) as link:
         rest = sent
@@ -159,7 +169,8 @@ def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str])
 
 
 def test_read_and_write(line: tuple[int, str]):
-    """All bytes values pass both ways unchanged; no byte within the timeout is b""; a longer text is cut at `size`."""
+    """All bytes values pass both ways unchanged; no byte within the timeout is b""; a longer text
+    is cut at `size`."""
     far, path = line
     with closing(SerialLink(path, 2_000_000, CLOCK)) as link:
         assert link.read(10, 1) == b""
@@ -171,8 +182,11 @@ def test_read_and_write(line: tuple[int, str]):
 
 
 @pytest.mark.parametrize(("held", "pause_ns"), [(100, 8_000_000), (2100, 4_000_000), (4095, 0)])
-def test_the_pause_after_a_read(line: tuple[int, str], held: int, pause_ns: int, monkeypatch: pytest.MonkeyPatch):
-    """The fuller the port was, the sooner it is read again: a stream that a short pause has piled up is caught up with."""
+def test_the_pause_after_a_read(
+    line: tuple[int, str], held: int, pause_ns: int, monkeypatch: pytest.MonkeyPatch
+):
+    """The fuller the port was, the sooner it is read again: a stream that a short pause has piled
+    up is caught up with."""
     far, path = line
     clock = VirtualClock()
     with closing(SerialLink(path, 2_000_000, clock)) as link:
@@ -195,15 +209,19 @@ def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.Mo
 
 
 def test_a_port_that_another_program_holds(line: tuple[int, str]):
-    """Held by a lock: busy, and the message names the command that finds the holder; free again after it."""
-    with serial.Serial(line[1], exclusive=True), pytest.raises(SensorBusy, match="port held by another program"):
+    """Held by a lock: busy, and the message names the command that finds the holder; free again
+    after it."""
+    with (
+        serial.Serial(line[1], exclusive=True),
+        pytest.raises(SensorBusy, match="port held by another program"),
+    ):
         SerialLink(line[1], 115200, CLOCK)
     SerialLink(line[1], 115200, CLOCK).close()
 
 
 def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
-    """While it is open another program gets errno 11, after it not; closing does not drop DTR, which restarts many
-    boards."""
+    """While it is open another program gets errno 11, after it not; closing does not drop DTR,
+    which restarts many boards."""
     link = SerialLink(line[1], 115200, CLOCK)
     with open(line[1], "rb", buffering=0) as other:
         with pytest.raises(BlockingIOError):
@@ -235,7 +253,8 @@ def test_a_port_that_cannot_be_opened(code: int, kind: type[SensorError], hint: 
 
 
 def test_ids_find_the_port(tmp_path: Path):
-    """The first port with the ids, and the serial number where one is set; without one, all ports are named."""
+    """The first port with the ids, and the serial number where one is set; without one, all ports
+    are named."""
     ports = [
         PortInfo("/dev/ttyS0"),
         PortInfo("/dev/ttyUSB0", 0x1A86, 0x7523, "", "USB Serial"),
@@ -244,7 +263,9 @@ def test_ids_find_the_port(tmp_path: Path):
     ]
     assert serial_link.find([(0x2E8A, 5)], "", ports) == "/dev/ttyACM0"
     assert serial_link.find([(1, 2), (0x2E8A, 5)], "b", ports) == "/dev/ttyACM1"
-    with pytest.raises(SensorAbsent, match=r"2e8a:0005 and serial number c; there are: /dev/ttyS0, /dev/ttyUSB0"):
+    with pytest.raises(
+        SensorAbsent, match=r"2e8a:0005 and serial number c; there are: /dev/ttyS0, /dev/ttyUSB0"
+    ):
         serial_link.find([(0x2E8A, 5)], "c", ports)
     with pytest.raises(SensorAbsent, match="there are: none; plug the skin in"):
         serial_link.find([(0x2E8A, 5)], "", [])

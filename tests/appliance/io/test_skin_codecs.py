@@ -1,4 +1,5 @@
-"""The bytes of each skin, put together by hand from published layouts: what they hold, and what is no frame."""
+"""The bytes of each skin, put together by hand from published layouts: what they hold, and what is
+no frame."""
 
 from __future__ import annotations
 
@@ -33,8 +34,8 @@ def test_a_matrix_byte_by_byte():
 
 
 def test_anyskin_byte_by_byte():
-    """Five times (t, x, y, z), CR LF: 82 bytes. The temperature is left out, z is last. The first frame has no mark before
-    it, so it is not taken."""
+    """Five times (t, x, y, z), CR LF: 82 bytes. The temperature is left out, z is last. The first
+    frame has no mark before it, so it is not taken."""
     values = [25.0, 1.0, 2.0, 3.0] * 4 + [25.0, 7.0, 8.0, 9.5]
     frame = struct.pack("<20f", *values) + b"\r\n"
     assert len(frame) == 82
@@ -46,17 +47,22 @@ def test_anyskin_byte_by_byte():
 
 
 def test_reskin_and_vitac_lines():
-    """Decimal text with tabs or blanks; lines of rows that a shorter one ends; a row that its type cannot hold is none."""
+    """Decimal text with tabs or blanks; lines of rows that a shorter one ends; a row that its type
+    cannot hold is none."""
     found = decoded(profile("reskin"), b"25.0\t1\t-2.5\t3e2\t" * 4 + b"25,1,2,3\r\n" + b"1 2 3\n")
     assert found.taxels[0, 0, 0].tolist() == [1, -2.5, 300]
     assert (len(found), found.garbage) == (1, 6)
     p = replace(profile("3d-vitac"), rows=2, cols=2, number="uint8")
-    found = decoded(p, b"3 4\n\n1 2\n3 4\n\n5 6\n7 256\n\n1 2\n3 4\n5 6\n\n9 9\r\n8 8\r\n7\r\n1 x\n1 1\n\n")
+    found = decoded(
+        p, b"3 4\n\n1 2\n3 4\n\n5 6\n7 256\n\n1 2\n3 4\n5 6\n\n9 9\r\n8 8\r\n7\r\n1 x\n1 1\n\n"
+    )
     assert found.taxels.tolist() == [[[1, 2], [3, 4]], [[9, 9], [8, 8]]]
     assert found.skipped.tolist() == [5, 11 + 13]
 
 
-@pytest.mark.parametrize("word", [b"1_0", b"0x10", b"1.5", b"+-1", b"", b"nan", b"99999999999999999999", b"-1"])
+@pytest.mark.parametrize(
+    "word", [b"1_0", b"0x10", b"1.5", b"+-1", b"", b"nan", b"99999999999999999999", b"-1"]
+)
 def test_a_word_that_is_no_whole_number(word: bytes):
     """A text of whole numbers takes no other word."""
     p = replace(profile("3d-vitac"), rows=1, cols=2)
@@ -64,8 +70,8 @@ def test_a_word_that_is_no_whole_number(word: bytes):
 
 
 def test_papillarray_byte_by_byte():
-    """One sensor of nine pillars: forces, counter and microseconds of its clock; a wrong sum, and bytes of 0 that the sum
-    does not see, are no frame."""
+    """One sensor of nine pillars: forces, counter and microseconds of its clock; a wrong sum, and
+    bytes of 0 that the sum does not see, are no frame."""
     p = profile("papillarray")
     data = wire("papillarray", 5)
     found = decoded(p, data)
@@ -89,8 +95,8 @@ def test_papillarray_with_a_tail_inside():
 
 
 def test_papillarray_of_changing_form():
-    """Packets of one length whose pillars are elsewhere are read by their own tables, and one that is no packet is left
-    out; what is read at once is what is read one by one."""
+    """Packets of one length whose pillars are elsewhere are read by their own tables, and one that
+    is no packet is left out; what is read at once is what is read one by one."""
     p = replace(profile("papillarray"), rows=6)
     grids = [np.arange(108, dtype=np.float32).reshape(6, 3, 6) + i for i in range(5)]
     data = [papillarray(grid, i, sensors=2 if i % 2 else 1) for i, grid in enumerate(grids)]
@@ -98,7 +104,10 @@ def test_papillarray_of_changing_form():
     alike = papillarray(grids[0], 7, sensors=2)
     other = bytearray(alike)
     at = other.index(b"\x02\x00", 40)
-    other[at], other[at + 2] = 3, (other[at + 2] - 1) % 256  # numbers of another type, and the same sum
+    other[at], other[at + 2] = (
+        3,
+        (other[at + 2] - 1) % 256,
+    )  # numbers of another type, and the same sum
     stream = [*data, alike, bytes(other), alike]
     found = decoded(p, b"".join(stream))
     single = [decoded(p, packet).taxels for packet in stream]
@@ -119,8 +128,8 @@ def test_papillarray_of_two_sensors():
 
 
 def test_xela_byte_by_byte():
-    """t 710 8 and eight bytes: X Y Z big-endian in bytes 1 to 6. Answers of the adapter are no garbage; a first byte of X
-    from FA on is no value, and a frame that lacks a taxel none."""
+    """t 710 8 and eight bytes: X Y Z big-endian in bytes 1 to 6. Answers of the adapter are no
+    garbage; a first byte of X from FA on is no value, and a frame that lacks a taxel none."""
     p = replace(profile("xela-can"), rows=1, cols=2)
     lines = [b"t7108001234567800FF00\r", b"t71180000010002000300\r"]
     found = decoded(p, b"\r\az\r" + b"".join(lines) + b"z\r")
@@ -134,10 +143,13 @@ def test_xela_byte_by_byte():
 
 
 def test_robotiq_byte_by_byte():
-    """The grids of two fingers in one packet or in two, big-endian; other fields are passed over; the last packet waits for
-    the next."""
+    """The grids of two fingers in one packet or in two, big-endian; other fields are passed over;
+    the last packet waits for the next."""
     p = profile("robotiq-tsf")
-    fingers = [bytes([0x10 | k << 2]) + struct.pack(">28H", *range(1000 * k, 1000 * k + 28)) for k in (0, 1)]
+    fingers = [
+        bytes([0x10 | k << 2]) + struct.pack(">28H", *range(1000 * k, 1000 * k + 28))
+        for k in (0, 1)
+    ]
     dynamic = b"\x20\x00\x07"
     head = bytes.fromhex("9a0061")
     one = head + bytes([len(fingers[0] + dynamic + fingers[1])]) + fingers[0] + dynamic + fingers[1]
@@ -182,7 +194,9 @@ def test_numbers_of_either_byte_order_and_a_count():
 def test_split_or_whole_is_the_same(name: str):
     """Any split gives the frames, ends, garbage of the whole, with garbage in between."""
     p = profile(name)
-    data = wire(name, 0)[7:] + b"".join(wire(name, i) + b"\xaa\x55garbage\r\n" * (i == 4) for i in range(9))
+    data = wire(name, 0)[7:] + b"".join(
+        wire(name, i) + b"\xaa\x55garbage\r\n" * (i == 4) for i in range(9)
+    )
     whole = decoded(p, data)
     assert len(whole) >= 5
     for size in (1, 2, 7, 50, 400):
@@ -198,7 +212,8 @@ def test_split_or_whole_is_the_same(name: str):
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.binary(max_size=600), at=st.integers(0, 500))
 def test_no_bytes_raise(name: str, data: bytes, at: int):
-    """Any bytes, also in the middle of frames: no exception, every byte is in a frame, garbage, or left over."""
+    """Any bytes, also in the middle of frames: no exception, every byte is in a frame, garbage, or
+    left over."""
     p = profile(name)
     sent = wire(name, 0) + wire(name, 1)
     mixed = sent[:at] + data + sent[at:]
@@ -206,7 +221,12 @@ def test_no_bytes_raise(name: str, data: bytes, at: int):
         found = decoded(p, one)
         inside = len(one) - found.garbage - len(found.rest.data)
         assert 0 <= inside <= len(one)
-        assert (inside > 0) == (len(found) > 0) or name in ("xela-can", "anyskin", "reskin", "3d-vitac")
+        assert (inside > 0) == (len(found) > 0) or name in (
+            "xela-can",
+            "anyskin",
+            "reskin",
+            "3d-vitac",
+        )
         assert len(found.ends) == len(found.skipped) == len(found.taxels)
 
 
@@ -223,8 +243,8 @@ def test_what_is_left_over_stays_small(name: str):
 
 @pytest.mark.parametrize("name", ["matrix", "flexitac", "anyskin"])
 def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Frames full of marks have no beginning that can be told. They are passed over whole, not byte by byte, which would
-    cost more time than they take to come: so many places are looked at."""
+    """Frames full of marks have no beginning that can be told. They are passed over whole, not byte
+    by byte, which would cost more time than they take to come: so many places are looked at."""
     p, looked = profile(name), []
     begins = fixed._begins
     monkeypatch.setattr(fixed, "_begins", lambda *args: looked.append(1) or begins(*args))

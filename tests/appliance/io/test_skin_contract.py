@@ -1,5 +1,5 @@
-"""One contract for all skins on a serial port: whatever is done to the wire, frames are those that were sent, at the times
-at which they were taken, or it is said why not. In virtual time."""
+"""One contract for all skins on a serial port: whatever is done to the wire, frames are those that
+were sent, at the times at which they were taken, or it is said why not. In virtual time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def consecutive(skin: WiredSkin, frames) -> bool:
 
 @each
 def test_streaming(name: str):
-    """Every frame once and in order, numbered without a gap, its time correct to a few milliseconds, never ahead."""
+    """Every frame once and in order, numbered without a gap, its time correct to a few
+    milliseconds, never ahead."""
     skin = WiredSkin(name)
     skin.seconds(3)
     frames = skin.seconds(5)
@@ -44,14 +45,19 @@ def test_streaming(name: str):
 
 @each
 def test_jitter(name: str):
-    """Reads that are late by up to 20 ms at random, and a clock that is 2 % off: times correct to a few milliseconds."""
+    """Reads that are late by up to 20 ms at random, and a clock that is 2 % off: times correct to a
+    few milliseconds."""
     skin = WiredSkin(name, rate=1.0 if name == "papillarray" else 1.02)
     rng = np.random.default_rng(1)
     late = 0.0
 
     def latency() -> int:
         nonlocal late
-        late = max(200_000, rng.exponential(3e6) if rng.random() < 0.9 else 20e6, late - skin.port.period_ns)
+        late = max(
+            200_000,
+            rng.exponential(3e6) if rng.random() < 0.9 else 20e6,
+            late - skin.port.period_ns,
+        )
         return round(late)
 
     skin.port.latency = latency
@@ -117,7 +123,8 @@ def test_absent_is_found_by_its_ids(name: str):
 
 @each
 def test_silence(name: str):
-    """A skin that stops sending: silent after the time that is set, opened again, and it streams when it sends."""
+    """A skin that stops sending: silent after the time that is set, opened again, and it streams
+    when it sends."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.port.silent = True
@@ -142,8 +149,8 @@ def test_held_by_another_program(name: str):
 
 @each
 def test_garbage(name: str):
-    """One frame in twenty is damaged, cut or doubled on the cable: all others are right, the times too, and the damage is
-    counted."""
+    """One frame in twenty is damaged, cut or doubled on the cable: all others are right, the times
+    too, and the damage is counted."""
     skin = WiredSkin(name)
     rng = np.random.default_rng(3)
 
@@ -168,7 +175,8 @@ def test_garbage(name: str):
 
 @each
 def test_wrong_skin(name: str):
-    """Bytes of another skin: no frame, a mismatch that stays, and the message says what was heard and what to do."""
+    """Bytes of another skin: no frame, a mismatch that stays, and the message says what was heard
+    and what to do."""
     other = "3d-vitac" if name != "3d-vitac" else "flexitac"
     skin = WiredSkin(name)
     skin.port.frames = lambda i: wire(other, i)
@@ -182,7 +190,8 @@ def test_wrong_skin(name: str):
 
 @each
 def test_wrong_format_of_the_bundle(name: str):
-    """A bundle for another grid is refused with both sides named, before a byte is sent to the skin."""
+    """A bundle for another grid is refused with both sides named, before a byte is sent to the
+    skin."""
     p = profile(name)
     skin = WiredSkin(name, replace(p.format, rows=p.format.rows + 1))
     skin.seconds(0.3)
@@ -194,12 +203,14 @@ def test_wrong_format_of_the_bundle(name: str):
 @each
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.1, 2.0])
 def test_wrong_rate(name: str, rate: float):
-    """A skin that is too slow or too fast: a mismatch that stays, with the measured figure and what to set, until it has
-    sent at the right rate for a while."""
+    """A skin that is too slow or too fast: a mismatch that stays, with the measured figure and what
+    to set, until it has sent at the right rate for a while."""
     skin = WiredSkin(name, rate=rate)
     skin.seconds(12)
     assert skin.states == ["streaming", "mismatch"]
-    seen = [why for state, why in zip(skin.states, skin.troubles, strict=True) if state == "mismatch"]
+    seen = [
+        why for state, why in zip(skin.states, skin.troubles, strict=True) if state == "mismatch"
+    ]
     assert seen
     if skin.sensor.loss_known:
         assert "clock went on" in seen[0]
@@ -217,8 +228,8 @@ def test_wrong_rate(name: str, rate: float):
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])
 def test_a_rate_that_wanders(name: str):
-    """2 % more or less are followed; when the rate then falls by a tenth that is a mismatch with the figure. Skins with a
-    clock of their own: test_pace.py."""
+    """2 % more or less are followed; when the rate then falls by a tenth that is a mismatch with
+    the figure. Skins with a clock of their own: test_pace.py."""
     skin = WiredSkin(name)
     skin.seconds(4)
     for rate in (1.02, 0.98, 1.0):
@@ -244,7 +255,8 @@ def _change_rate(skin: WiredSkin, rate: float) -> None:
 @each
 @pytest.mark.parametrize("pause_s", [0.2, 1.0, 3.0])
 def test_a_backlog_after_a_pause(name: str, pause_s: float):
-    """Nobody reads for a while and the driver keeps all: each frame comes with the time at which it was taken, none as new."""
+    """Nobody reads for a while and the driver keeps all: each frame comes with the time at which it
+    was taken, none as new."""
     skin = WiredSkin(name)
     skin.seconds(5)
     skin.clock.sleep_until(skin.clock.now_ns() + round(pause_s * 1e9))
@@ -259,8 +271,8 @@ def test_a_backlog_after_a_pause(name: str, pause_s: float):
 
 @each
 def test_a_driver_that_throws_away(name: str):
-    """Two seconds without a read, and the driver keeps 0.4 s: what is lost is counted, numbers of before and after are
-    never adjacent, and no frame has a wrong time."""
+    """Two seconds without a read, and the driver keeps 0.4 s: what is lost is counted, numbers of
+    before and after are never adjacent, and no frame has a wrong time."""
     skin = WiredSkin(name)
     before = skin.seconds(5)
     skin.port.capacity = round(0.4 * skin.format.rate_hz) * len(wire(name, 0)) + 11
@@ -281,8 +293,8 @@ def test_a_driver_that_throws_away(name: str):
 
 @each
 def test_back_pressure(name: str):
-    """A host that is slower than the skin for three seconds gets later and later frames, whose times stay true; then it
-    catches up."""
+    """A host that is slower than the skin for three seconds gets later and later frames, whose
+    times stay true; then it catches up."""
     skin = WiredSkin(name)
     skin.seconds(5)
     parts = []
@@ -297,7 +309,8 @@ def test_back_pressure(name: str):
 
 @each
 def test_commands(name: str):
-    """What the profile says is written at the start and at the end, and nothing else; a tare only where it is set."""
+    """What the profile says is written at the start and at the end, and nothing else; a tare only
+    where it is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.sensor.close()
@@ -307,7 +320,8 @@ def test_commands(name: str):
 
 
 def test_tare():
-    """With sensor.tare the command goes out after those of the start, and no frame is passed on while it lasts."""
+    """With sensor.tare the command goes out after those of the start, and no frame is passed on
+    while it lasts."""
     skin = WiredSkin("papillarray", tare=True)
     assert len(skin.seconds(1.9)) == 0
     assert skin.sensor.state == "streaming"
@@ -317,8 +331,8 @@ def test_tare():
 
 @pytest.mark.parametrize("name", ["flexitac", "matrix", "anyskin"])
 def test_a_mark_in_the_payload(name: str):
-    """The mark stands among the numbers, at rest in every frame at the same place: no frame is taken from the wrong place,
-    and once the number changes frames come."""
+    """The mark stands among the numbers, at rest in every frame at the same place: no frame is
+    taken from the wrong place, and once the number changes frames come."""
     skin = WiredSkin(name)
     mark = skin.profile.trailer + skin.profile.marker
     resting = bytearray(wire(name, 0))
@@ -335,13 +349,19 @@ def test_a_mark_in_the_payload(name: str):
     own = len(skin.profile.marker)
     for one in frames.taxels[1:-1:17]:
         sent = [moving(i)[own : len(resting) - len(skin.profile.trailer)] for i in range(200)]
-        grids = [np.frombuffer(s, skin.profile.number).reshape(skin.profile.rows, skin.profile.cols, -1) for s in sent]
-        assert any((one.reshape(-1) == g[..., list(skin.profile.take)].reshape(-1)).all() for g in grids)
+        grids = [
+            np.frombuffer(s, skin.profile.number).reshape(skin.profile.rows, skin.profile.cols, -1)
+            for s in sent
+        ]
+        assert any(
+            (one.reshape(-1) == g[..., list(skin.profile.take)].reshape(-1)).all() for g in grids
+        )
 
 
 @pytest.mark.parametrize("name", ["flexitac", "anyskin"])
 def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
-    """A stream that is in step stays so while its numbers hold marks; a lost byte in such a time invents no frame."""
+    """A stream that is in step stays so while its numbers hold marks; a lost byte in such a time
+    invents no frame."""
     skin = WiredSkin(name)
     skin.seconds(2)
     mark = skin.profile.trailer + skin.profile.marker
@@ -354,8 +374,12 @@ def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
     once = iter([1])
     skin.port.mangle = lambda data: data[1:] if next(once, 0) else data
     own = len(skin.profile.marker)
-    grid = np.frombuffer(bytes(hidden)[own : len(hidden) - len(skin.profile.trailer)], skin.profile.number)
-    grid = grid.reshape(skin.profile.rows, skin.profile.cols, -1)[..., list(skin.profile.take)].reshape(-1)
+    grid = np.frombuffer(
+        bytes(hidden)[own : len(hidden) - len(skin.profile.trailer)], skin.profile.number
+    )
+    grid = grid.reshape(skin.profile.rows, skin.profile.cols, -1)[
+        ..., list(skin.profile.take)
+    ].reshape(-1)
     known = {taxels(skin.profile, i).tobytes() for i in range(199)} | {grid.tobytes()}
     assert all(one.tobytes() in known for one in skin.seconds(3).taxels)
 
@@ -372,10 +396,13 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
 
 
 def test_a_sequence_number_shows_each_loss():
-    """A home-made matrix with a count: loss is known, and each missing frame is a gap in the numbers."""
+    """A home-made matrix with a count: loss is known, and each missing frame is a gap in the
+    numbers."""
     skin = WiredSkin("matrix")
     p = replace(skin.profile, sequence="uint8")
-    skin.port.frames = lambda i: b"" if i % 50 == 49 else b"\xaa\x55" + bytes([i % 256]) + wire("matrix", i)[2:]
+    skin.port.frames = lambda i: (
+        b"" if i % 50 == 49 else b"\xaa\x55" + bytes([i % 256]) + wire("matrix", i)[2:]
+    )
     skin.sensor = SerialSensor(
         SensorConfig(skin="matrix", port=PATH), p, skin.format, skin.clock, open_port=skin.port.open
     )

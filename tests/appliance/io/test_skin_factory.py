@@ -1,4 +1,5 @@
-"""The factory: which sensor a profile gets, the form of its sweeps, and a real terminal with an emulated skin."""
+"""The factory: which sensor a profile gets, the form of its sweeps, and a real terminal with an
+emulated skin."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ def settings(*sets: str) -> Config:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_profile_has_its_sensor_and_form(name: str):
-    """Skins of other protocols are read from a serial port; the form is the profile's, without asking anything."""
+    """Skins of other protocols are read from a serial port; the form is the profile's, without
+    asking anything."""
     simulated = idle_devices()
     chosen = settings(f"sensor.skin={name}")
     assert skins.announced(chosen, simulated) == profile(name).format
@@ -58,10 +60,13 @@ def test_a_rate_that_can_be_set_is_that_of_the_bundle():
 
 
 def test_a_form_that_a_person_describes():
-    """The examples of the error are understood, with a window of two seconds; what is none is refused with them."""
+    """The examples of the error are understood, with a window of two seconds; what is none is
+    refused with them."""
     assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
     assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
-    with pytest.raises(ConfigError, match=r"--format 5x3: not understood.* 5x3:float32:100 or 4x4x3:int16:250"):
+    with pytest.raises(
+        ConfigError, match=r"--format 5x3: not understood.* 5x3:float32:100 or 4x4x3:int16:250"
+    ):
         skins.described("5x3")
     with pytest.raises(ConfigError, match=r"--format 0x3:int16:9: a grid of 0 x 3"):
         skins.described("0x3:int16:9")
@@ -100,12 +105,15 @@ def playing() -> Iterator[str]:
 
 
 def test_on_a_real_terminal(playing: str):
-    """The real pyserial on a real terminal: frames as they were sent; the port is free again after that."""
+    """The real pyserial on a real terminal: frames as they were sent; the port is free again after
+    that."""
     clock = SystemClock()
     chosen = settings("sensor.skin=flexitac", f"sensor.port={playing}")
     known = {taxels(profile("flexitac"), i).tobytes() for i in range(199)}
     for _ in range(2):
-        with closing(skins.sensor(chosen, profile("flexitac").format, Devices(clock, None))) as sensor:
+        with closing(
+            skins.sensor(chosen, profile("flexitac").format, Devices(clock, None))
+        ) as sensor:
             end_ns, n = clock.now_ns() + 20_000_000_000, 0
             while n < 50:
                 assert clock.now_ns() < end_ns, f"{sensor.state}: {sensor.trouble}"

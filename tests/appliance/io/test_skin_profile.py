@@ -1,4 +1,5 @@
-"""Skin profiles: every way a file can be wrong, what the settings change, and the delivered ones as they are shipped."""
+"""Skin profiles: every way a file can be wrong, what the settings change, and the delivered ones as
+they are shipped."""
 
 from __future__ import annotations
 
@@ -58,7 +59,10 @@ def written(tmp_path: Path, text: str) -> Path:
         (GOOD.replace('about = "a"', ""), "about is missing; matrix.toml explains each key"),
         (GOOD.replace('source = "s"', 'source = ""'), "source is missing"),
         ('about = "a"\nsource = "s"\ncodec = "papillarray"', 'values = 6, number = "float32"'),
-        ('about = "a"\nsource = "s"\ncodec = "robotiq-tsf"\nnumber = "uint16"\n', "neither one finger"),
+        (
+            'about = "a"\nsource = "s"\ncodec = "robotiq-tsf"\nnumber = "uint16"\n',
+            "neither one finger",
+        ),
         ('about = "a"\nsource = "s"\ncodec = "palpate"\nusb_ids = ["1a86:7523"]', "sensor.link"),
         ("about = a", "not TOML"),
         ("x = [" * 3000, "not TOML"),
@@ -74,10 +78,12 @@ def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
 
 
 def test_names(tmp_path: Path):
-    """A misspelt name, a name that leads out of the folder, none at all; the first folder wins; palpate needs no file; a
-    file is named by its ending."""
+    """A misspelt name, a name that leads out of the folder, none at all; the first folder wins;
+    palpate needs no file; a file is named by its ending."""
     folder = written(tmp_path, GOOD)
-    with pytest.raises(ConfigError, match=r"sensor\.skin = 'oven' has no profile in .*did you mean own"):
+    with pytest.raises(
+        ConfigError, match=r"sensor\.skin = 'oven' has no profile in .*did you mean own"
+    ):
         load("oven", [folder])
     for name in ("../own", ""):
         with pytest.raises(ConfigError, match="has no profile"):
@@ -106,7 +112,9 @@ def test_delivered(name: str):
 def test_the_template_explains_each_key():
     """matrix.toml holds or names every key."""
     text = (FOLDER / "matrix.toml").read_text()
-    assert [key for key in skin_profile._KEYS if not re.search(rf"^#?{key} = ", text, re.MULTILINE)] == []
+    assert [
+        key for key in skin_profile._KEYS if not re.search(rf"^#?{key} = ", text, re.MULTILINE)
+    ] == []
 
 
 def test_modem_manager_leaves_each_skin_alone():
@@ -114,9 +122,15 @@ def test_modem_manager_leaves_each_skin_alone():
     rules = (ROOT / "firmware_config" / "70-palpate.rules").read_text()
     ignored = 'SUBSYSTEM!="tty", GOTO="palpate_skins_end"', 'LABEL="palpate_skins_end"'
     lines = rules.split(ignored[0])[1].split(ignored[1])[0].splitlines()
-    named = [re.search(r'idVendor}=="(\w{4})", ATTRS{idProduct}=="(\w{4})"', line) for line in lines if line]
+    named = [
+        re.search(r'idVendor}=="(\w{4})", ATTRS{idProduct}=="(\w{4})"', line)
+        for line in lines
+        if line
+    ]
     assert all(
-        'ENV{ID_MM_DEVICE_IGNORE}="1"' in line and 'ENV{ID_MM_PORT_IGNORE}="1"' in line for line in lines if line
+        'ENV{ID_MM_DEVICE_IGNORE}="1"' in line and 'ENV{ID_MM_PORT_IGNORE}="1"' in line
+        for line in lines
+        if line
     )
     assert sorted(f"{ids[1]}:{ids[2]}" for ids in named if ids) == sorted(
         usb_id for name in NAMES for usb_id in profile(name).usb_ids
@@ -128,7 +142,10 @@ def test_what_each_lacks():
     assert {name: profile(name).lacks for name in NAMES} == {
         name: () if name == "papillarray" else ("sequence", "time", "checksum") for name in NAMES
     }
-    assert SkinProfile(codec="fixed", marker=b"\xaa", sequence="uint8").lacks == ("time", "checksum")
+    assert SkinProfile(codec="fixed", marker=b"\xaa", sequence="uint8").lacks == (
+        "time",
+        "checksum",
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +153,11 @@ def test_what_each_lacks():
     [
         ("flexitac", {"grid": "12x32"}, SweepFormat(12, 32, 100, 200, "uint8")),
         ("flexitac", {"grid": "16x16", "rate_hz": 50.0}, SweepFormat(16, 16, 50, 100, "uint8")),
-        ("papillarray", {"grid": "6x3", "rate_hz": 250.0}, SweepFormat(6, 3, 250, 500, "float32", 3)),
+        (
+            "papillarray",
+            {"grid": "6x3", "rate_hz": 250.0},
+            SweepFormat(6, 3, 250, 500, "float32", 3),
+        ),
         ("anyskin", {}, SweepFormat(5, 1, 28, 56, "float32", 3)),
     ],
 )
@@ -151,7 +172,11 @@ def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepForma
         ("flexitac", {"grid": "12*32"}, "sensor.grid = '12*32' is not allowed; use rows x columns"),
         ("flexitac", {"grid": "0x4"}, "rows x columns"),
         ("flexitac", {"grid": "300x4"}, "rows x columns"),
-        ("papillarray", {"rate_hz": 300.0}, "sensor.rate_hz = 300 cannot be set on this skin; use one of 100, 250"),
+        (
+            "papillarray",
+            {"rate_hz": 300.0},
+            "sensor.rate_hz = 300 cannot be set on this skin; use one of 100, 250",
+        ),
         ("robotiq-tsf", {"grid": "5x5"}, "neither one finger"),
     ],
 )
@@ -193,7 +218,11 @@ def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (skins.profile(settings).rows, skins.profile(settings).cols) == (2, 3)
 
 
-@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats() | st.text(), st.lists, max_leaves=5))
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(), st.lists, max_leaves=5
+    )
+)
 def test_any_value_of_any_key_is_taken_or_refused(value: object):
     """No value of a file ends in anything but a profile or a ConfigError."""
     for key in skin_profile._KEYS:

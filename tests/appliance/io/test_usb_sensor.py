@@ -1,5 +1,5 @@
-"""The sensor over the real usb.core: each failure of a bus has its state and message, and the sensor recovers by
-itself."""
+"""The sensor over the real usb.core: each failure of a bus has its state and message, and the
+sensor recovers by itself."""
 
 import errno
 from dataclasses import replace
@@ -58,7 +58,8 @@ def test_a_board_that_does_not_know_dtr_is_read(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
-    """A healthy board, vendor class or CDC-ACM: every frame in order, its time correct to a millisecond."""
+    """A healthy board, vendor class or CDC-ACM: every frame in order, its time correct to a
+    millisecond."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
     frames = read_for(sensor, simulated, 5)
@@ -108,7 +109,8 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_failures_have_their_state_and_end(call: str, code: int, state: str, hint: str):
-    """An errno at open, claim, request or read: its own state and message; afterwards frames come again."""
+    """An errno at open, claim, request or read: its own state and message; afterwards frames come
+    again."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     simulated.backend.errors[call] = code
@@ -132,7 +134,8 @@ def test_serial_number_that_cannot_be_read(code: int):
 
 
 def test_unplug_and_replug_in_mid_read():
-    """errno 19 while reading; back again: a new epoch, numbers never look adjacent, content is right."""
+    """errno 19 while reading; back again: a new epoch, numbers never look adjacent, content is
+    right."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     now = simulated.clock.now_ns()
@@ -190,7 +193,8 @@ def test_zero_length_packets():
 
 
 def test_overflow_loses_one_transfer():
-    """A transfer larger than asked for is lost, counted, and seen in the numbers; streaming goes on."""
+    """A transfer larger than asked for is lost, counted, and seen in the numbers; streaming goes
+    on."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -216,7 +220,8 @@ def test_garbage_on_the_cable():
 
 
 def test_a_host_that_pauses_too_long():
-    """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, the board says so."""
+    """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, the
+    board says so."""
     simulated = idle_devices(fifo_frames=188)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -238,7 +243,8 @@ def test_a_host_that_pauses_too_long():
     ],
 )
 def test_a_board_that_does_not_fit(change: dict, hint: str):
-    """Another protocol, grid, number of axes, data type or rate: state mismatch, naming both sides; a matching board is used."""
+    """Another protocol, grid, number of axes, data type or rate: state mismatch, naming both sides;
+    a matching board is used."""
     simulated = idle_devices()
     board = simulated.backend.board
     before = {name: getattr(board, name) for name in change}
@@ -255,7 +261,8 @@ def test_a_board_that_does_not_fit(change: dict, hint: str):
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_a_skin_with_three_axes(acm: bool):
-    """All axes of every frame arrive in their places; a box for one axis refuses the board, and the other way round."""
+    """All axes of every frame arrive in their places; a box for one axis refuses the board, and the
+    other way round."""
     pillars = SweepFormat(3, 3, 1000.0, 2000, "float32", 3)
     simulated = idle_devices(fmt=pillars, acm=acm)
     sensor = sensor_on(simulated, pillars)
@@ -320,7 +327,8 @@ def test_acm_board_that_never_answers():
 
 
 def test_acm_board_that_answers_a_byte_at_a_time():
-    """A reply that never becomes complete is given up after half a second, even if bytes still come."""
+    """A reply that never becomes complete is given up after half a second, even if bytes still
+    come."""
     simulated = idle_devices(acm=True)
     sensor = sensor_on(simulated)
     backend = simulated.backend
@@ -351,8 +359,8 @@ def test_another_format_is_not_other_code():
 
 @pytest.mark.parametrize("replugged", [True, False])
 def test_a_board_whose_clock_starts_anew(replugged: bool):
-    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin a new epoch and are
-    correct."""
+    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin
+    a new epoch and are correct."""
     simulated = idle_devices(first_seq=1_000_000)
     sensor = sensor_on(simulated)
     now = simulated.clock.now_ns()
@@ -368,5 +376,7 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
     frames = read_for(sensor, simulated, 2)
     assert sensor.counters.enumerations == 1 + replugged
     assert set(frames.seq >> EPOCH_BITS) == {1}
-    truth = np.array([simulated.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq])
+    truth = np.array(
+        [simulated.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq]
+    )
     assert np.abs(frames.t_ns - truth).max() < 1_000_000

@@ -1,4 +1,5 @@
-"""The black box: which sweeps it keeps, over restarts and on a full disk, and that its errors never stop the box."""
+"""The black box: which sweeps it keeps, over restarts and on a full disk, and that its errors never
+stop the box."""
 
 from __future__ import annotations
 
@@ -26,11 +27,17 @@ def box(folder: Path, most: int = MOST) -> BlackBox:
     return BlackBox(folder, toy_bundle.FORMAT, most)
 
 
-def judged(number: int, status: Status = Status.OK, window: bool = True) -> tuple[Sweep, Verdict, dict[str, Any]]:
+def judged(
+    number: int, status: Status = Status.OK, window: bool = True
+) -> tuple[Sweep, Verdict, dict[str, Any]]:
     """A sweep, its verdict and its circumstances."""
     frames = toy_bundle.sweep(0, 0).frames if window else Frames.empty(toy_bundle.FORMAT)
     sweep = Sweep(number, 0, 1, Status.OK if window else status, frames)
-    return sweep, Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b"), {"bundle": "b"}
+    return (
+        sweep,
+        Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b"),
+        {"bundle": "b"},
+    )
 
 
 def numbers(folder: Path) -> list[int]:
@@ -43,7 +50,8 @@ def numbers(folder: Path) -> list[int]:
 
 
 def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
-    """Each new one displaces the oldest, also in a later run and for any status; one without a window does not."""
+    """Each new one displaces the oldest, also in a later run and for any status; one without a
+    window does not."""
     first = box(tmp_path / "b")
     for n in range(1, 6):
         first.sweep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
@@ -76,8 +84,11 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
     assert [len(names) for names in there] == [4, 3]
 
 
-def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """A new sweep displaces the oldest; if that does not help, one line is logged, and one when it works again."""
+def test_a_full_disk_drops_the_oldest_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
+    """A new sweep displaces the oldest; if that does not help, one line is logged, and one when it
+    works again."""
     black = box(tmp_path)
     limit = [2]
 
@@ -101,11 +112,14 @@ def test_a_full_disk_drops_the_oldest_first(tmp_path: Path, monkeypatch: pytest.
         black.sweep(*judged(n))
     assert numbers(tmp_path) == [8, 9]
     assert logged == [
-        f"<4>black box: no sweep is kept: No space left on device; see to {tmp_path}", "black box: sweeps are kept again"
-    ]  # fmt: skip
+        f"<4>black box: no sweep is kept: No space left on device; see to {tmp_path}",
+        "black box: sweeps are kept again",
+    ]
 
 
-def test_another_error_removes_no_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
+def test_another_error_removes_no_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
     """A disk that fails for another reason than being full: existing sweeps are kept."""
     black = box(tmp_path)
     black.sweep(*judged(1))
@@ -120,7 +134,8 @@ def test_another_error_removes_no_sweep(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
-    """A file in its place, another program in it: the box starts all the same, one line each, and later it works."""
+    """A file in its place, another program in it: the box starts all the same, one line each, and
+    later it works."""
     (tmp_path / "b").write_text("in the way")
     black = box(tmp_path / "b")
     for n in (1, 2):
@@ -133,12 +148,15 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
     black.sweep(*judged(4))
     assert numbers(tmp_path / "b") == [1, 5]
     assert [line.split(": ", 2)[-1].split(";")[0] for line in logged] == [
-        "File exists", "another program keeps sweeps there", "sweeps are kept again"
-    ]  # fmt: skip
+        "File exists",
+        "another program keeps sweeps there",
+        "sweeps are kept again",
+    ]
 
 
 def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
-    """Slow disk accesses of the start are done before the box runs, and the folder is released at the end."""
+    """Slow disk accesses of the start are done before the box runs, and the folder is released at
+    the end."""
     black = box(tmp_path / "b")
     assert (tmp_path / "b").is_dir()
     black.close()

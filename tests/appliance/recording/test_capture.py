@@ -33,8 +33,12 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
     port = StdoutPort("replay", play.commands)
-    pipeline = Pipeline(play, play, SweepCutter(play.format, SweepConfig()), Classifier(model, play))
-    box = Box(pipeline, play, port=port, observers=[OnSweep(lambda sweep, verdict: sweeps.append(sweep))])
+    pipeline = Pipeline(
+        play, play, SweepCutter(play.format, SweepConfig()), Classifier(model, play)
+    )
+    box = Box(
+        pipeline, play, port=port, observers=[OnSweep(lambda sweep, verdict: sweeps.append(sweep))]
+    )
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
@@ -44,16 +48,21 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
 def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are the same when
-    replayed."""
+    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are
+    the same when replayed."""
     rng = np.random.default_rng(5)
     acts = list(script.tubes(1010, 8))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
     simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
     simulated.backend.board = rig.Board(
-        skin.FORMAT, simulated.robot, simulated.clock, ppm=80,
-        latency=lambda: int(rng.exponential(100_000) + (rng.random() < 0.01) * rng.uniform(5e6, 4e7)),
-    )  # fmt: skip
+        skin.FORMAT,
+        simulated.robot,
+        simulated.clock,
+        ppm=80,
+        latency=lambda: int(
+            rng.exponential(100_000) + (rng.random() < 0.01) * rng.uniform(5e6, 4e7)
+        ),
+    )
     simulated.backend.mangle = lambda data: b"" if rng.random() < 0.001 else data
     begin = simulated.clock.now_ns()
     simulated.backend.at(begin + 9 * SECOND, simulated.backend.unplug)
@@ -84,12 +93,17 @@ def test_a_capture_from_before_there_were_axes(tmp_path: Path):
         (v["sweep"], v["status"], v["label"], v["fused"]) for v in then
     ]
     np.testing.assert_allclose([v.scores for v in verdicts], [v["scores"] for v in then], rtol=1e-5)
-    np.testing.assert_array_equal(sweeps[1].frames.taxels, load(ONE_AXIS / "sweep.npy")[0].frames.taxels)
+    np.testing.assert_array_equal(
+        sweeps[1].frames.taxels, load(ONE_AXIS / "sweep.npy")[0].frames.taxels
+    )
 
 
 @pytest.mark.slow
-def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path):
-    """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and end as they did."""
+def test_commands_are_part_of_a_capture(
+    rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
+):
+    """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and
+    end as they did."""
     simulated = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
     box = rigged(simulated, capture=capture)
@@ -102,7 +116,9 @@ def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_b
     capture.close()
     verdicts, _ = played(tmp_path / "capture", default_bundle)
     assert [v.fused for v in first] == [1, 1, 2, 0, 3]
-    assert [(v.status, v.label, v.fused) for v in verdicts] == [(v.status, v.label, v.fused) for v in first]
+    assert [(v.status, v.label, v.fused) for v in verdicts] == [
+        (v.status, v.label, v.fused) for v in first
+    ]
     for a, b in zip(first, verdicts, strict=True):
         assert a.scores.tobytes() == b.scores.tobytes()
 
@@ -110,7 +126,8 @@ def test_commands_are_part_of_a_capture(rigged: Callable[..., Rigged], default_b
 def test_a_capture_of_a_skin_that_sent_another_form(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it is replayed."""
+    """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it
+    is replayed."""
     simulated = devices.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
     count = itertools.count()
     other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
@@ -141,7 +158,8 @@ def test_a_capture_that_was_cut_off_plays_up_to_there(
 
 
 def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
-    """Under the next number; when there are too many, the start is refused and nothing is overwritten."""
+    """Under the next number; when there are too many, the start is refused and nothing is
+    overwritten."""
     path = tmp_path / "capture"
     for edges in range(3):
         capture = CaptureWriter(path, skin.FORMAT)
@@ -152,7 +170,9 @@ def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
     assert logged[-1] == f"capture: {path} was there, of an earlier start; it is capture.2 now"
     for i in range(3, MOST_KEPT + 1):
         (tmp_path / f"capture.{i}").touch()
-    with pytest.raises(ConfigError, match="99 captures of earlier starts are beside it; move them away"):
+    with pytest.raises(
+        ConfigError, match="99 captures of earlier starts are beside it; move them away"
+    ):
         CaptureWriter(path, skin.FORMAT)
     assert path.stat().st_size == sizes[-1]
 
@@ -216,11 +236,15 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
         (lambda d: (d / "s.json").unlink(), "not a recorded sweep"),
         (lambda d: (d / "s.json").write_text("{}"), "not a recorded sweep"),
         (
-            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"schema": 2', '"schema": 7')),
+            lambda d: (d / "s.json").write_text(
+                (d / "s.json").read_text().replace('"schema": 2', '"schema": 7')
+            ),
             "schema 7",
         ),
         (
-            lambda d: (d / "s.json").write_text((d / "s.json").read_text().replace('"rows": 4', '"rows": 3')),
+            lambda d: (d / "s.json").write_text(
+                (d / "s.json").read_text().replace('"rows": 4', '"rows": 3')
+            ),
             "do not fit",
         ),
         (lambda d: (d / "s.json").write_text("3"), "not a recorded sweep"),
@@ -229,7 +253,9 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
         (lambda d: np.save(d / "s.npy", np.array([{}]), allow_pickle=True), "not a recorded sweep"),
     ],
 )
-def test_broken_recordings_are_named(rigged: Callable[..., Rigged], tmp_path: Path, spoil, hint: str):
+def test_broken_recordings_are_named(
+    rigged: Callable[..., Rigged], tmp_path: Path, spoil, hint: str
+):
     """A missing or broken sidecar, an unknown schema, another grid, a broken array, a pickle."""
     simulated = devices.build(skin.FORMAT, script.tubes(1013, 1), rig.VirtualClock(), "sim")
     box = rigged(simulated)

@@ -1,4 +1,5 @@
-"""Recordings: which labels a sweep gets, what REC reports, and a disk that is full, read-only or in use."""
+"""Recordings: which labels a sweep gets, what REC reports, and a disk that is full, read-only or in
+use."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ class Desk:
 
     def __init__(self, folder: Path, labels: Labels = WOOD, target: int = 10) -> None:
         self.t_ns, self.sentences = 0, []
-        self.recording = RecordingSession(folder, toy_bundle.FORMAT, labels, self, self.hear, target)
+        self.recording = RecordingSession(
+            folder, toy_bundle.FORMAT, labels, self, self.hear, target
+        )
 
     def now_ns(self) -> int:
         """Clock."""
@@ -54,7 +57,9 @@ class Desk:
         return self.sentences[-1]
 
 
-def judged(number: int, start_ns: int = 0, status: Status = Status.RECORDED) -> tuple[Sweep, Verdict]:
+def judged(
+    number: int, start_ns: int = 0, status: Status = Status.RECORDED
+) -> tuple[Sweep, Verdict]:
     """A sweep, with a window if the status has one, and a verdict on it."""
     windowless = status in (Status.SHORT, Status.GAP)
     frames = Frames.empty(toy_bundle.FORMAT) if windowless else toy_bundle.sweep(0, 0).frames
@@ -78,7 +83,9 @@ def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rig
 
     def make(simulated: devices.SimDevices, labels: Labels = NONE) -> Rigged:
         box: Rigged
-        recording = RecordingSession(tmp_path, skin.FORMAT, labels, simulated.clock, lambda line: box.port.say(line))
+        recording = RecordingSession(
+            tmp_path, skin.FORMAT, labels, simulated.clock, lambda line: box.port.say(line)
+        )
         box = rigged(simulated, observers=[recording], commands=recording.commands)
         return box
 
@@ -90,11 +97,19 @@ def heard(box: Rigged) -> list[list[str]]:
     return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
 
 
-def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Callable[..., Rigged], tmp_path: Path):
-    """Over the serial line, with real edges: a label that is sent during a sweep applies to the next one."""
+def test_a_label_applies_to_sweeps_that_start_after_it(
+    recorded: Callable[..., Rigged], tmp_path: Path
+):
+    """Over the serial line, with real edges: a label that is sent during a sweep applies to the
+    next one."""
     first, *others = script.tubes(1, 3)
     before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
-    first = rig.Act(np.concatenate([before, first.frames]), len(before) + first.start, len(before) + first.stop, "")
+    first = rig.Act(
+        np.concatenate([before, first.frames]),
+        len(before) + first.start,
+        len(before) + first.stop,
+        "",
+    )
     simulated = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels(session="first day"))
     box.seconds(0.1)
@@ -117,13 +132,18 @@ def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Callable[..., R
 
 
 def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: Path):
-    """Verdict, board, clock, trigger, unloaded skin and run stand beside the frames, in plain JSON; of a bundle nothing."""
+    """Verdict, board, clock, trigger, unloaded skin and run stand beside the frames, in plain JSON;
+    of a bundle nothing."""
     simulated = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels("wood", "3", "monday"))
     (verdict,) = box.until(lambda: simulated.finished(box.box.answered))
     about = json.loads((tmp_path / "sweep-000001.json").read_text())
     assert about["verdict"] == verdict.as_dict()
-    assert (about["verdict"]["status"], about["verdict"]["label"], about["verdict"]["bundle"]) == ("recorded", "", "")
+    assert (about["verdict"]["status"], about["verdict"]["label"], about["verdict"]["bundle"]) == (
+        "recorded",
+        "",
+        "",
+    )
     assert about["trigger"] == {"mode": "two-lines", "times": "edge, stamped by the kernel"}
     assert about["device"]["serial"] == "SIM0001"
     assert about["clock"]["late_ms"] >= 0
@@ -138,7 +158,8 @@ def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: P
 
 
 def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_path: Path):
-    """What the box records is what `palpate-train --set DIR` reads: materials, positions, sessions, windows."""
+    """What the box records is what `palpate-train --set DIR` reads: materials, positions, sessions,
+    windows."""
     files = pytest.importorskip(
         "train.data.readers", reason="the desktop's tools are not here; make test installs them"
     )
@@ -177,12 +198,18 @@ def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
 
 
 def test_the_label_at_the_start_edge_counts(tmp_path: Path):
-    """Each sweep has the labels that applied when it began, also if it is answered after a later sweep."""
+    """Each sweep has the labels that applied when it began, also if it is answered after a later
+    sweep."""
     desk = Desk(tmp_path, Labels())
     for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
         desk.t_ns = t_ns
         desk.do("MATERIAL", material)
-    assert [desk.sweep(n, start)[3] for n, start in ((1, 299), (2, 100), (3, 99), (4, 300))] == ["b", "a", "", "c"]
+    assert [desk.sweep(n, start)[3] for n, start in ((1, 299), (2, 100), (3, 99), (4, 300))] == [
+        "b",
+        "a",
+        "",
+        "c",
+    ]
 
 
 def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
@@ -196,7 +223,15 @@ def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("text", "after"),
-    [("1", "2"), ("9", "10"), ("09", "10"), ("", None), ("left", None), ("2.5", None), ("9" * 24, None)],
+    [
+        ("1", "2"),
+        ("9", "10"),
+        ("09", "10"),
+        ("", None),
+        ("left", None),
+        ("2.5", None),
+        ("9" * 24, None),
+    ],
 )
 def test_next_position(tmp_path: Path, text: str, after: str | None):
     """A whole number is increased by one; anything else is an error and stays."""
@@ -221,8 +256,8 @@ def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
 
 
 def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
-    """Down to the first sweep of this run; those of an earlier run stay, and no number is given twice, after a restart
-    neither."""
+    """Down to the first sweep of this run; those of an earlier run stay, and no number is given
+    twice, after a restart neither."""
     before = Desk(tmp_path)
     before.sweep(1)
     before.recording.close()
@@ -246,7 +281,8 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
 
 
 def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
-    """With a number it removes the last stored sweep alone if it is this one: not one that has come since then."""
+    """With a number it removes the last stored sweep alone if it is this one: not one that has come
+    since then."""
     desk = Desk(tmp_path)
     for n in (1, 2):
         desk.sweep(n)
@@ -263,16 +299,28 @@ def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):
     assert [desk.recording.about()[name] for name in ("last", "discard")] == [None, None]
     desk.sweep(1)
     desk.sweep(2, status=Status.SHORT)
-    last = {"sweep": 2, "outcome": "skipped", "detail": "short", "material": "wood", "position": "3", "session": "a"}
+    last = {
+        "sweep": 2,
+        "outcome": "skipped",
+        "detail": "short",
+        "material": "wood",
+        "position": "3",
+        "session": "a",
+    }
     assert [desk.recording.about()[name] for name in ("last", "discard")] == [last, 1]
     desk.sweep(3)
     desk.do("DISCARD")
     about = desk.recording.about()
-    assert (about["last"]["sweep"], about["last"]["outcome"], about["discard"]) == (3, "discarded", 1)
+    assert (about["last"]["sweep"], about["last"]["outcome"], about["discard"]) == (
+        3,
+        "discarded",
+        1,
+    )
 
 
 def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
-    """After each sweep, per material and position, with those of earlier runs; a faulty window does not count."""
+    """After each sweep, per material and position, with those of earlier runs; a faulty window does
+    not count."""
     before = Desk(tmp_path, Labels("wood", "1"), target=2)
     before.sweep(1)
     before.recording.close()
@@ -299,20 +347,23 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
 
 
 def test_a_folder_of_another_form_is_refused(tmp_path: Path):
-    """Sweeps of two forms cannot be trained on together; the folder stays as it was and can be used by others."""
+    """Sweeps of two forms cannot be trained on together; the folder stays as it was and can be used
+    by others."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
     other = replace(toy_bundle.FORMAT, rows=3)
-    with pytest.raises(ConfigError, match=r"sweep-000001\.npy holds another form of sweeps than 3x2 .* with --out"):
+    with pytest.raises(
+        ConfigError, match=r"sweep-000001\.npy holds another form of sweeps than 3x2 .* with --out"
+    ):
         RecordingSession(tmp_path, other, NONE, first, first.hear)
     (tmp_path / "sweep-000002.json").write_text("{}")  # damaged: not counted, not refused
     assert Desk(tmp_path).sweep(1)[6] == "sweep-000003"
 
 
 def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD can remove the
-    rest."""
+    """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD
+    can remove the rest."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     with monkeypatch.context() as broken:
@@ -336,7 +387,8 @@ def failing(replace: Callable[..., Path], suffix: str) -> Callable[..., Path]:
 
 
 def test_a_later_run_writes_nothing_over(tmp_path: Path):
-    """Numbers continue; only unfinished files of a killed run are removed; an incomplete sweep keeps its number."""
+    """Numbers continue; only unfinished files of a killed run are removed; an incomplete sweep
+    keeps its number."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
@@ -365,19 +417,31 @@ def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("blocks", "left", "detail"),
-    [(1 << 20, 16383, "67.1 MB left of 67.1 for the system"), (1000, 49, "0.2 MB left of 0.2 for the system")],
+    [
+        (1 << 20, 16383, "67.1 MB left of 67.1 for the system"),
+        (1000, 49, "0.2 MB left of 0.2 for the system"),
+    ],
 )
 def test_no_room_for_the_system_stops_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocks: int, left: int, detail: str, logged: list[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    blocks: int,
+    left: int,
+    detail: str,
+    logged: list[str],
 ):
-    """Below the reserved space nothing is written: REC says so, one log line, a new try with each sweep, one log
-    line."""
+    """Below the reserved space nothing is written: REC says so, one log line, a new try with each
+    sweep, one log line."""
     free = [left]
     monkeypatch.setattr(
-        os, "statvfs", lambda path: os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255))
+        os,
+        "statvfs",
+        lambda path: os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255)),
     )
     desk = Desk(tmp_path)
-    assert [desk.sweep(n)[1:3] + desk.sentences[-1][6:] for n in (1, 2)] == [["full", "0", detail]] * 2
+    assert [desk.sweep(n)[1:3] + desk.sentences[-1][6:] for n in (1, 2)] == [
+        ["full", "0", detail]
+    ] * 2
     assert names(tmp_path) == []
     free[0] += 1
     assert desk.sweep(3)[1:3] == ["stored", "1"]
@@ -389,7 +453,9 @@ def test_no_room_for_the_system_stops_recording(
     ]
 
 
-@pytest.mark.parametrize(("code", "outcome"), [(errno.ENOSPC, "full"), (errno.EDQUOT, "full"), (errno.EROFS, "failed")])
+@pytest.mark.parametrize(
+    ("code", "outcome"), [(errno.ENOSPC, "full"), (errno.EDQUOT, "full"), (errno.EROFS, "failed")]
+)
 def test_a_disk_that_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, outcome: str, logged: list[str]
 ):
@@ -405,7 +471,8 @@ def test_a_disk_that_refuses(
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]):
-    """The disk is full after n bytes, for n across both files: failed, nothing stays, existing files are complete."""
+    """The disk is full after n bytes, for n across both files: failed, nothing stays, existing
+    files are complete."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -425,7 +492,11 @@ def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
     """Its sweeps fail with a report; once the folder is back, recording continues."""
     desk = Desk(tmp_path / "a" / "b")
     shutil.rmtree(tmp_path / "a")
-    assert desk.sweep(1)[1:3] + desk.sentences[-1][6:] == ["failed", "0", "No such file or directory"]
+    assert desk.sweep(1)[1:3] + desk.sentences[-1][6:] == [
+        "failed",
+        "0",
+        "No such file or directory",
+    ]
     (tmp_path / "a" / "b").mkdir(parents=True)
     assert desk.sweep(2)[1] == "stored"
     assert "stored again" in logged[-2]
@@ -438,8 +509,11 @@ def test_a_folder_that_cannot_be_made(folder: str):
         Desk(Path(folder))
 
 
-def test_folders_are_on_the_disk_before_their_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each is synced into its parent, at every start: a power failure cannot remove them all later."""
+def test_folders_are_on_the_disk_before_their_sweeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Each is synced into its parent, at every start: a power failure cannot remove them all
+    later."""
     synced: list[Path] = []
     monkeypatch.setattr(recording.storage, "sync", synced.append)
     for _ in range(2):
@@ -448,7 +522,9 @@ def test_folders_are_on_the_disk_before_their_sweeps(tmp_path: Path, monkeypatch
         synced.clear()
 
 
-def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
+def test_a_disk_that_is_full_costs_no_answer(
+    recorded: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch
+):
     """On the whole box: each sweep is answered, each REC says full, no frame is lost."""
 
     def full(path: Path, sweep: Sweep, fmt: object, about: Mapping[str, object]) -> None:
@@ -465,7 +541,8 @@ def test_a_disk_that_is_full_costs_no_answer(recorded: Callable[..., Rigged], mo
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():
-    """Floats through JSON: the same bits, also where they have no short form; and no field is left out."""
+    """Floats through JSON: the same bits, also where they have no short form; and no field is left
+    out."""
     _, verdict = judged(1)
     again = json.loads(json.dumps(verdict.as_dict()))
     assert again == verdict.as_dict()

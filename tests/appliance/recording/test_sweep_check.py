@@ -1,4 +1,5 @@
-"""Sweeps that are recorded before there is a bundle: `recorded`, or what the counts alone show to be wrong."""
+"""Sweeps that are recorded before there is a bundle: `recorded`, or what the counts alone show to
+be wrong."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ def played(frames: np.ndarray) -> rig.Act:
 def slide(level: int | None = None) -> np.ndarray:
     """Three seconds on a rough tube; level: of one taxel in the middle, where it is broken."""
     place = skin.placements("T-LAB", 1)[0]
-    frames = skin.sweep("plastic rough", place, np.random.default_rng(3), rest_s=0, slide_s=3, after_s=0)
+    frames = skin.sweep(
+        "plastic rough", place, np.random.default_rng(3), rest_s=0, slide_s=3, after_s=0
+    )
     if level is not None:
         frames[:, 1, 1] = level
     return frames
@@ -60,7 +63,9 @@ def test_good_sweeps_are_recorded(rigged: Callable[..., Rigged]):
     ],
     ids=["lifted", "stuck", "dead", "saturated"],
 )
-def test_a_faulty_skin_is_seen(rigged: Callable[..., Rigged], frames: np.ndarray, status: Status, detail: str):
+def test_a_faulty_skin_is_seen(
+    rigged: Callable[..., Rigged], frames: np.ndarray, status: Status, detail: str
+):
     """After a good sweep, from which the skin is known with and without contact."""
     box = recording(rigged, played(slide()), played(frames))
     first, second = box.until(lambda: box.box.answered == 2)
@@ -76,7 +81,8 @@ def test_what_the_window_lacks_is_answered_as_ever(rigged: Callable[..., Rigged]
 
 
 def test_contact_that_cannot_be_judged_is_said(rigged: Callable[..., Rigged]):
-    """A skin that was only ever seen lifted: recorded, and the answer says that contact was not checked."""
+    """A skin that was only ever seen lifted: recorded, and the answer says that contact was not
+    checked."""
     off = skin.idle(8 * RATE, np.random.default_rng(1))
     box = recording(rigged, rig.Act(off, RATE, 4 * RATE, ""))
     (verdict,) = box.until(lambda: box.box.answered == 1)
@@ -96,10 +102,13 @@ def test_a_tare_makes_it_certain(rigged: Callable[..., Rigged]):
 
 
 def test_commands_that_need_a_bundle(rigged: Callable[..., Rigged]):
-    """ID says that sweeps are recorded, and what the skin sends; TEST that there is nothing to test."""
+    """ID says that sweeps are recorded, and what the skin sends; TEST that there is nothing to
+    test."""
     box = recording(rigged, played(slide()))
     box.seconds(0.5)
-    assert "ID,ok,recording,,,4x4 uint8 at 750 Hz  window 1500,palpate-sim SIM0001" in box.ask("$PPLP,ID")
+    assert "ID,ok,recording,,,4x4 uint8 at 750 Hz  window 1500,palpate-sim SIM0001" in box.ask(
+        "$PPLP,ID"
+    )
     assert "TEST,error,no bundle is used" in box.ask("$PPLP,TEST")
     with pytest.raises(ApplianceError, match="palpate check"):
         SweepCheck(skin.FORMAT, rig.VirtualClock()).test()

@@ -1,4 +1,5 @@
-"""SweepCutter: every trigger gets one answer, and the window is the middle of the sweep to the frame."""
+"""SweepCutter: every trigger gets one answer, and the window is the middle of the sweep to the
+frame."""
 
 import numpy as np
 import pytest
@@ -20,11 +21,17 @@ def t_ns(frame: float) -> int:
     return 10 * SECOND + round(frame * PERIOD)
 
 
-def frames(first: int, n: int, drop: tuple[int, ...] = (), epoch: int = 0, fmt: SweepFormat = FMT) -> Frames:
+def frames(
+    first: int, n: int, drop: tuple[int, ...] = (), epoch: int = 0, fmt: SweepFormat = FMT
+) -> Frames:
     """Frames `first` to `first + n` without those in `drop`."""
     seq = np.array([i for i in range(first, first + n) if i not in drop])
     taxels = numbered(first + n, fmt)[seq]
-    return Frames(10 * SECOND + np.rint(seq * fmt.period_ns).astype(np.int64), seq + (epoch << EPOCH_BITS), taxels)
+    return Frames(
+        10 * SECOND + np.rint(seq * fmt.period_ns).astype(np.int64),
+        seq + (epoch << EPOCH_BITS),
+        taxels,
+    )
 
 
 class Bench:
@@ -98,8 +105,12 @@ def test_every_axis_is_interpolated():
     fmt = SweepFormat(2, 2, 750.0, 100, "int16", 3)
     bench = Bench(fmt)
     whole = frames(0, 400, fmt=fmt)
-    whole.taxels[:] = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10]) + np.arange(4).reshape(2, 2, 1)
-    bench.put(Frames(*(np.delete(getattr(whole, name), [200, 201], axis=0) for name in Frames.__slots__)))
+    whole.taxels[:] = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10]) + np.arange(
+        4
+    ).reshape(2, 2, 1)
+    bench.put(
+        Frames(*(np.delete(getattr(whole, name), [200, 201], axis=0) for name in Frames.__slots__))
+    )
     bench.edge(EdgeKind.START, 100)
     bench.edge(EdgeKind.STOP, 300)
     (sweep,) = bench.done()
@@ -107,9 +118,12 @@ def test_every_axis_is_interpolated():
     np.testing.assert_array_equal(sweep.frames.taxels, whole.taxels[150:250])
 
 
-@pytest.mark.parametrize("drop", [(1000,), (1000, 1001), (875,), (875, 876), (2373, 2374), (900, 905, 906, 2000)])
+@pytest.mark.parametrize(
+    "drop", [(1000,), (1000, 1001), (875,), (875, 876), (2373, 2374), (900, 905, 906, 2000)]
+)
 def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
-    """One or two missing frames, also at the window's ends: filled on the line between neighbours, counted as lost."""
+    """One or two missing frames, also at the window's ends: filled on the line between neighbours,
+    counted as lost."""
     sweep = sweep_of(drop)
     assert sweep.status is Status.OK
     assert sweep.lost == len(drop)
@@ -124,7 +138,8 @@ def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
 
 @pytest.mark.parametrize("first", [873, 875, 1500, 2372, 2374])
 def test_wider_gaps_are_not_interpolated(first: int):
-    """Three frames in a row that are missing, wholly or partly in the window, make the status `gap`, without frames."""
+    """Three frames in a row that are missing, wholly or partly in the window, make the status
+    `gap`, without frames."""
     sweep = sweep_of(tuple(range(first, first + MAX_GAP + 1)))
     assert sweep.status is Status.GAP
     assert len(sweep.frames) == 0
@@ -137,7 +152,8 @@ def test_gap_outside_the_window_does_not_matter():
 
 
 def test_frames_that_come_after_the_stop_edge_are_waited_for():
-    """The window's last frames are late: no answer until they come; `complete_ns` is the time at which they do."""
+    """The window's last frames are late: no answer until they come; `complete_ns` is the time at
+    which they do."""
     bench = Bench()
     bench.put(frames(0, 2000))
     bench.edge(EdgeKind.START, 500)
@@ -189,8 +205,8 @@ def test_short():
 
 
 def test_start_without_stop():
-    """No stop edge within `max_duration_s`: `long`, once; the late stop edge gives no answer, the next sweep is cut as
-    usual."""
+    """No stop edge within `max_duration_s`: `long`, once; the late stop edge gives no answer, the
+    next sweep is cut as usual."""
     bench = Bench(max_duration_s=4)
     bench.put(frames(0, 3000))
     bench.edge(EdgeKind.START, 100)
@@ -234,7 +250,8 @@ def test_double_start():
 
 
 def test_not_ready():
-    """A start edge while the box cannot take it is answered at once; its stop edge brings no second answer."""
+    """A start edge while the box cannot take it is answered at once; its stop edge brings no second
+    answer."""
     bench = Bench()
     bench.edge(EdgeKind.START, 100, ready=False)
     assert one(bench) is Status.NOT_READY
@@ -244,7 +261,8 @@ def test_not_ready():
 
 
 def test_lost_edges():
-    """Edges dropped by the kernel end the open sweep; with none open, that something was lost is still answered."""
+    """Edges dropped by the kernel end the open sweep; with none open, that something was lost is
+    still answered."""
     bench = Bench()
     bench.edge(EdgeKind.START, 100)
     bench.edge(EdgeKind.LOST, 200)
@@ -257,7 +275,8 @@ def test_lost_edges():
 
 @pytest.mark.parametrize("ready", [False, True])
 def test_a_start_beside_lost_edges_gets_one_answer(ready: bool):
-    """Both come in one turn, in which the trigger is blind already, or is not: the sweep that began ends once."""
+    """Both come in one turn, in which the trigger is blind already, or is not: the sweep that began
+    ends once."""
     bench = Bench()
     edges = [Edge(EdgeKind.START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
     bench.recorder.trigger(edges, ready, bench.now)
@@ -302,7 +321,8 @@ def test_objects_are_counted():
 
 
 def test_the_ring_overwrites_only_old_frames():
-    """After many turns of the ring a window is still cut correctly; one that was overwritten is a `gap`."""
+    """After many turns of the ring a window is still cut correctly; one that was overwritten is a
+    `gap`."""
     bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
         bench.put(frames(first, 750))
@@ -330,7 +350,8 @@ def steps_of(bench: Bench, steps: int = 9) -> list[Sweep]:
 
 @pytest.mark.parametrize("packet", [1, 6, 40, 1000])
 def test_an_open_sweep_so_far(packet: int):
-    """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the frames come."""
+    """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the
+    frames come."""
     bench = Bench(lead_ms=400)
     bench.put(frames(0, 510))
     assert steps_of(bench) == []
@@ -343,7 +364,11 @@ def test_an_open_sweep_so_far(packet: int):
             seen.append(sweep)
     assert [(len(s.frames), s.share) for s in seen] == [(150 * d, d / 10) for d in range(1, 10)]
     for s in seen:
-        assert (s.frames.seq[0], s.start_ns, s.stop_ns) == (800, t_ns(500), t_ns(800 + len(s.frames) - 1))
+        assert (s.frames.seq[0], s.start_ns, s.stop_ns) == (
+            800,
+            t_ns(500),
+            t_ns(800 + len(s.frames) - 1),
+        )
         assert (s.frames.taxels == numbered(3000)[800 : 800 + len(s.frames)]).all()
     bench.edge(EdgeKind.STOP, 2750)
     bench.put(frames(2600, 400))
@@ -363,7 +388,8 @@ def test_steps_of_a_window_that_does_not_divide():
 
 
 def test_no_step_lies_beyond_a_gap():
-    """Three missing frames end the steps, also later ones; two are interpolated, from both sides."""
+    """Three missing frames end the steps, also later ones; two are interpolated, from both
+    sides."""
     bench = Bench(lead_ms=0)
     bench.edge(EdgeKind.START, 0)
     bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))
@@ -404,7 +430,8 @@ def test_a_sweep_whose_answer_is_still_to_come_goes_first():
 
 
 def test_steps_begin_with_a_new_enumeration():
-    """Frames of a skin that was plugged in again do not belong to the sweep that was open before."""
+    """Frames of a skin that was plugged in again do not belong to the sweep that was open
+    before."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 100))
     bench.edge(EdgeKind.START, 0)
@@ -419,11 +446,15 @@ def test_steps_begin_with_a_new_enumeration():
 @pytest.mark.slow
 @given(
     st.lists(
-        st.tuples(st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)), max_size=30
+        st.tuples(
+            st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)
+        ),
+        max_size=30,
     )
 )
 def test_every_start_gets_exactly_one_answer(script):
-    """For any edges in any order, with some sweeps settled at a step: each number is answered once."""
+    """For any edges in any order, with some sweeps settled at a step: each number is answered
+    once."""
     bench = Bench(max_duration_s=5, lead_ms=0)
     frame = starts = 0
     answers: list[Sweep] = []

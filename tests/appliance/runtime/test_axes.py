@@ -1,4 +1,5 @@
-"""A skin with three axes through the whole box: the wire, windows, answers, recordings, captures and their replay."""
+"""A skin with three axes through the whole box: the wire, windows, answers, recordings, captures
+and their replay."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def act(z1: float, z2: float, label: str) -> rig.Act:
 
 
 def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path: Path, capsys):
-    """Labels are right; kept sweeps hold all axes and replay bit for bit; the capture gives the same sentences."""
+    """Labels are right; kept sweeps hold all axes and replay bit for bit; the capture gives the
+    same sentences."""
     model = toy_bundle.load(tmp_path / "bundle", fmt=FMT)
     stuck = act(0, 0, "stuck")
     stuck.frames[OFF:-OFF, 1, 0, 0] = 5
@@ -45,15 +47,28 @@ def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
     kept.close()
     capture.close()
-    assert [(v.status, v.label) for v in verdicts] == [("ok", "a"), ("ok", "b"), ("stuck-taxel", ""), ("ok", "c")]
+    assert [(v.status, v.label) for v in verdicts] == [
+        ("ok", "a"),
+        ("ok", "b"),
+        ("stuck-taxel", ""),
+        ("ok", "c"),
+    ]
     assert verdicts[2].detail == "taxel 2.1 axis 1"
     sweep, fmt = load(sorted((tmp_path / "kept").rglob("*.npy"))[1])
     assert (fmt, sweep.frames.taxels.shape) == (FMT, (20, 2, 2, 3))
-    np.testing.assert_array_equal(np.ptp(sweep.frames.taxels, axis=0), np.tile([4, 4, 2], (2, 2, 1)))
+    np.testing.assert_array_equal(
+        np.ptp(sweep.frames.taxels, axis=0), np.tile([4, 4, 2], (2, 2, 1))
+    )
     settings, printed = config.load(None, site=NO_SITE), []
     assert replay(tmp_path / "kept", settings, model, printed.append) == 0
     assert printed[-1] == "4 sweeps: 4 the same\n"
     assert replay(tmp_path / "capture", settings, model, printed.append) == 0
-    heard = [line.replace(",sim,", ",replay,").rpartition("*")[0] for line in box.heard if ",RES," in line]
-    again = [line.rpartition("*")[0] for line in capsys.readouterr().out.splitlines() if ",RES," in line]
+    heard = [
+        line.replace(",sim,", ",replay,").rpartition("*")[0]
+        for line in box.heard
+        if ",RES," in line
+    ]
+    again = [
+        line.rpartition("*")[0] for line in capsys.readouterr().out.splitlines() if ",RES," in line
+    ]
     assert again == heard

@@ -1,4 +1,5 @@
-"""The whole box on simulated devices: USB bytes and GPIO edges in, sentences and lines out, and each way to fail."""
+"""The whole box on simulated devices: USB bytes and GPIO edges in, sentences and lines out, and
+each way to fail."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ def quiet() -> devices.SimDevices:
 
 
 def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
-    """Twelve sweeps: each answered once, with a right checksum, nothing lost, at the far end of the serial line."""
+    """Twelve sweeps: each answered once, with a right checksum, nothing lost, at the far end of the
+    serial line."""
     simulated = simulated_devices(script.tubes(1000, 12))
     box = rigged(simulated)
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
@@ -73,18 +75,23 @@ def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
 
 
 def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
-    """The window that reaches the network is, count for count, the middle of the act that the robot played."""
+    """The window that reaches the network is, count for count, the middle of the act that the robot
+    played."""
     simulated = simulated_devices(script.tubes(1001, 3))
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
     for sweep, act in zip(box.kept, simulated.robot.played, strict=True):
         middle = (act.start + act.stop) // 2
-        near = [(act.frames[middle - 750 + k : middle + 750 + k] == sweep.frames.taxels).all() for k in (-1, 0, 1)]
+        near = [
+            (act.frames[middle - 750 + k : middle + 750 + k] == sweep.frames.taxels).all()
+            for k in (-1, 0, 1)
+        ]
         assert any(near)
 
 
 def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
-    """READY falls and BUSY rises with the sweep; class bits, then RESULT VALID; both fall when the next one starts."""
+    """READY falls and BUSY rises with the sweep; class bits, then RESULT VALID; both fall when the
+    next one starts."""
     simulated = simulated_devices(script.tubes(1002, 2))
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
@@ -93,8 +100,17 @@ def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
     def changes(*names: str) -> list[tuple[int, str, bool]]:
         return [w for w in simulated.gpio.written if w[1] in names]
 
-    cycle = [(devices.READY, False), (devices.BUSY, True), (devices.READY, True), (devices.BUSY, False)]
-    assert [w[1:] for w in changes(devices.READY, devices.BUSY)] == [(devices.READY, True), *cycle, *cycle]
+    cycle = [
+        (devices.READY, False),
+        (devices.BUSY, True),
+        (devices.READY, True),
+        (devices.BUSY, False),
+    ]
+    assert [w[1:] for w in changes(devices.READY, devices.BUSY)] == [
+        (devices.READY, True),
+        *cycle,
+        *cycle,
+    ]
     assert [level for _, _, level in changes(devices.RESULT_VALID)] == [True, False, True]
     falls = changes(devices.RESULT_VALID)[1][0]
     second = [t for t, _, level in changes(devices.BUSY) if level][1]
@@ -114,7 +130,8 @@ def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
 
 
 def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
-    """The sweep is answered `sensor-lost` at once; FAULT; a trigger meanwhile is `not-ready`; after replugging all is well."""
+    """The sweep is answered `sensor-lost` at once; FAULT; a trigger meanwhile is `not-ready`; after
+    replugging all is well."""
     simulated = simulated_devices(script.tubes(1003, 3))
     box = rigged(simulated)
     box.until(lambda: box.box.answered == 1)
@@ -153,11 +170,16 @@ def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):
         ([(devices.START, 0.5)], ["long"]),
         ([(devices.START, 0.5), (devices.STOP, 14)], ["long"]),
         ([(devices.STOP, 0.5)], ["no-start"]),
-        ([(devices.START, 0.5), (devices.START, 1.5), (devices.STOP, 4.5)], ["no-stop", "no-contact"]),
+        (
+            [(devices.START, 0.5), (devices.START, 1.5), (devices.STOP, 4.5)],
+            ["no-stop", "no-contact"],
+        ),
         ([(devices.START, 0.5), (devices.STOP, 3.5)], ["no-contact"]),
     ],
 )
-def test_triggers_out_of_order(rigged: Callable[..., Rigged], edges: list[tuple[str, float]], want: list[str]):
+def test_triggers_out_of_order(
+    rigged: Callable[..., Rigged], edges: list[tuple[str, float]], want: list[str]
+):
     """Short, long, lone and double edges: a defined answer each, as sentences."""
     box = rigged(quiet())
     for name, after_s in edges:
@@ -167,7 +189,8 @@ def test_triggers_out_of_order(rigged: Callable[..., Rigged], edges: list[tuple[
 
 
 def test_storm_of_edges(rigged: Callable[..., Rigged]):
-    """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is fine."""
+    """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is
+    fine."""
     frames = slide()
     quiet_act = rig.Act(np.zeros((6 * RATE, 4, 4), np.uint8), 10**7, 10**7 + 1, "")
     simulated = simulated_devices([quiet_act, *touched(frames)])
@@ -188,9 +211,12 @@ def test_storm_of_edges(rigged: Callable[..., Rigged]):
 
 @pytest.mark.parametrize(("packet_frames", "statuses"), [(2, {"ok", "unsure"}), (4, {"gap"})])
 def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statuses: set[str]):
-    """A lost packet within the window: two frames are interpolated and counted, four make it a `gap`."""
+    """A lost packet within the window: two frames are interpolated and counted, four make it a
+    `gap`."""
     simulated = simulated_devices(touched(slide()))
-    simulated.backend.board = rig.Board(skin.FORMAT, simulated.robot, simulated.clock, packet_frames=packet_frames)
+    simulated.backend.board = rig.Board(
+        skin.FORMAT, simulated.robot, simulated.clock, packet_frames=packet_frames
+    )
     count = itertools.count()
     simulated.backend.mangle = lambda data: b"" if next(count) == 1500 // packet_frames else data
     box = rigged(simulated)
@@ -217,9 +243,16 @@ def spoiled(fault: str) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("fault", "detail"),
-    [("saturated", "taxel 2.2"), ("stuck-taxel", "taxel 2.3"), ("dead-taxel", "taxel 3.2"), ("no-contact", "digits")],
+    [
+        ("saturated", "taxel 2.2"),
+        ("stuck-taxel", "taxel 2.3"),
+        ("dead-taxel", "taxel 3.2"),
+        ("no-contact", "digits"),
+    ],
 )
-def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Callable[..., Rigged], fault: str, detail: str):
+def test_a_spoiled_skin_is_seen_before_the_network_is_asked(
+    rigged: Callable[..., Rigged], fault: str, detail: str
+):
     """Saturation, stuck and dead taxels, no contact: a status with the place, and no label."""
     box = rigged(simulated_devices(touched(spoiled(fault))))
     (verdict,) = box.until(lambda: box.box.answered == 1)
@@ -244,7 +277,8 @@ def test_fusing_can_be_turned_off(rigged: Callable[..., Rigged]):
 
 
 def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
-    """Identity, state, self-test, tare, new object, abort: each is answered; a bad one says what would be right."""
+    """Identity, state, self-test, tare, new object, abort: each is answered; a bad one says what
+    would be right."""
     box = rigged(quiet())
     box.seconds(1)
     assert default_bundle.id in box.ask("$PPLP,ID")
@@ -258,7 +292,9 @@ def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
     for code, label in enumerate(labels, 1):
         assert f",LABEL,ok,{code},{label},{len(labels)}*" in box.ask(f"$PPLP,LABEL,{code}")
     for code in (0, len(labels) + 1, "wood"):
-        assert f",LABEL,error,label {code} is not there; use 1 to {len(labels)}*" in box.ask(f"$PPLP,LABEL,{code}")
+        assert f",LABEL,error,label {code} is not there; use 1 to {len(labels)}*" in box.ask(
+            f"$PPLP,LABEL,{code}"
+        )
     assert "known are" in box.ask("$PPLP,DANCE")
 
 
@@ -308,7 +344,8 @@ def test_state_is_sent_once_a_second(rigged: Callable[..., Rigged]):
 
 @pytest.mark.slow
 def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]):
-    """The line is full: sentences are dropped and counted, every frame and every sweep is still taken."""
+    """The line is full: sentences are dropped and counted, every frame and every sweep is still
+    taken."""
     simulated = simulated_devices(script.tubes(1006, 20))
     box = rigged(simulated, sets=("serial.queue=4", "serial.state_s=0.05"))
     while not simulated.finished(box.box.answered):
@@ -334,7 +371,8 @@ def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]
 
 
 def test_the_log_names_the_port(rigged: Callable[..., Rigged], logged: list[str]):
-    """That it is open is told once, with its name; of a box without a port nothing is told of one."""
+    """That it is open is told once, with its name; of a box without a port nothing is told of
+    one."""
     box = rigged(quiet())
     box.seconds(2)
     assert [line for line in logged if "serial" in line] == [f"serial: {box.port.name} open"]
@@ -370,7 +408,8 @@ class EffectLog(Observer):
 
 
 def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged: Callable[..., Rigged]):
-    """Two answers in one turn: both are out, at the port and at each observer, before any sweep is passed on; then health."""
+    """Two answers in one turn: both are out, at the port and at each observer, before any sweep is
+    passed on; then health."""
     effects: list[str] = []
     box = rigged(quiet(), observers=[EffectLog("a", effects), EffectLog("b", effects), Observer()])
     box.seconds(0.5)
@@ -378,7 +417,14 @@ def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged: Call
         box.edge(devices.STOP, after_ms / 1000, level)
     box.seconds(0.5)
     assert effects == [
-        "a answered 1", "b answered 1", "a answered 2", "b answered 2", "a sweep 1 sim", "b sweep 1 sim",
-        "a sweep 2 sim", "b sweep 2 sim", "a turn 2",
-    ]  # fmt: skip
+        "a answered 1",
+        "b answered 1",
+        "a answered 2",
+        "b answered 2",
+        "a sweep 1 sim",
+        "b sweep 1 sim",
+        "a sweep 2 sim",
+        "b sweep 2 sim",
+        "a turn 2",
+    ]
     assert [a.status for a in answers(box)] == ["no-start", "no-start"]

@@ -1,4 +1,5 @@
-"""Kept sweeps judged again: the same verdict bit for bit, and every way in which it can be another one."""
+"""Kept sweeps judged again: the same verdict bit for bit, and every way in which it can be another
+one."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ from tests.factories.simulated_box import Rigged
 SWEEPS = 30
 PER_OBJECT = 3
 HERE = config.load(None, site=NO_SITE)
-OTHERWISE = config.load(None, ("classifier.fuse=vote", "classifier.min_probability=1"), site=NO_SITE)
+OTHERWISE = config.load(
+    None, ("classifier.fuse=vote", "classifier.min_probability=1"), site=NO_SITE
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +42,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.fixture
-def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Path) -> tuple[Path, list[str]]:
-    """A copy of a folder of 30 sweeps, three an object, some answered early; and the sentences that went out."""
+def in_service(
+    run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Path
+) -> tuple[Path, list[str]]:
+    """A copy of a folder of 30 sweeps, three an object, some answered early; and the sentences that
+    went out."""
     if "heard" not in run:
-        acts = [replace(act, new_object=i % PER_OBJECT == 0) for i, act in enumerate(script.tubes(1020, SWEEPS))]
+        acts = [
+            replace(act, new_object=i % PER_OBJECT == 0)
+            for i, act in enumerate(script.tubes(1020, SWEEPS))
+        ]
         simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
         black_box = BlackBox(run["folder"], skin.FORMAT, SWEEPS)
         box = rigged(
-            simulated, sets=("classifier.early=true", "classifier.min_probability=0.97"), observers=[black_box]
+            simulated,
+            sets=("classifier.early=true", "classifier.min_probability=0.97"),
+            observers=[black_box],
         )
         box.until(lambda: simulated.finished(box.box.answered), limit_s=300)
         black_box.close()
@@ -54,12 +65,18 @@ def in_service(run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Pat
     return Path(shutil.copytree(run["folder"], tmp_path / "kept")), run["heard"]
 
 
-def played(path: Path, model: bundle.Bundle, settings: config.Config = HERE) -> tuple[int, list[str], list[str]]:
+def played(
+    path: Path, model: bundle.Bundle, settings: config.Config = HERE
+) -> tuple[int, list[str], list[str]]:
     """Exit code, sentences, and what came of each sweep."""
     printed: list[str] = []
     code = replay(path, settings, model, printed.append)
     lines = "".join(printed).splitlines()
-    return code, [line for line in lines if line.startswith("$")], [line for line in lines if line[0] != "$"]
+    return (
+        code,
+        [line for line in lines if line.startswith("$")],
+        [line for line in lines if line[0] != "$"],
+    )
 
 
 def change(path: Path, **values: object) -> None:
@@ -70,7 +87,8 @@ def change(path: Path, **values: object) -> None:
 
 @pytest.mark.slow
 def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundle.Bundle):
-    """Fused and early ones, whatever the settings are now: the very sentences that went out, times included."""
+    """Fused and early ones, whatever the settings are now: the very sentences that went out, times
+    included."""
     folder, heard = in_service
     abouts = [sidecar(path) for path in sorted(folder.glob("*.npy"))]
     assert max(about["verdict"]["fused"] for about in abouts) == PER_OBJECT
@@ -78,47 +96,68 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundl
     code, sentences, outcomes = played(folder, default_bundle, OTHERWISE)
     assert code == 0
     assert sentences == heard
-    assert outcomes == [f"sweep-{n:06d}.npy: the same" for n in range(1, SWEEPS + 1)] + ["30 sweeps: 30 the same"]
+    assert outcomes == [f"sweep-{n:06d}.npy: the same" for n in range(1, SWEEPS + 1)] + [
+        "30 sweeps: 30 the same"
+    ]
 
 
 @pytest.mark.slow
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle: bundle.Bundle):
     """A single file is fused with the earlier ones beside it, and with no others."""
     folder, heard = in_service
-    change(folder / "sweep-000002.npy", bundle="0badcafe")  # of the first object; it would end the others' replay
+    change(
+        folder / "sweep-000002.npy", bundle="0badcafe"
+    )  # of the first object; it would end the others' replay
     for n in (1, 11, 30):
         code, sentences, outcomes = played(folder / f"sweep-{n:06d}.npy", default_bundle)
         assert (code, sentences) == (0, [heard[n - 1]])
         assert outcomes == [f"sweep-{n:06d}.npy: the same"]
 
 
-def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, default_bundle: bundle.Bundle):
-    """The ring has dropped an object's first sweep: the others' own scores are compared, and the output says so."""
+def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
+    in_service, default_bundle: bundle.Bundle
+):
+    """The ring has dropped an object's first sweep: the others' own scores are compared, and the
+    output says so."""
     folder, _ = in_service
-    counts = {n: sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] for n in range(1, SWEEPS + 1)}
-    threes = [n for n in counts if counts[n] == PER_OBJECT]  # the last sweeps of objects of which all were fused
+    counts = {
+        n: sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] for n in range(1, SWEEPS + 1)
+    }
+    threes = [
+        n for n in counts if counts[n] == PER_OBJECT
+    ]  # the last sweeps of objects of which all were fused
     for n in (threes[0] - 2, threes[1] - 1):  # of one the first is gone, of another the second
         (folder / f"sweep-{n:06d}.npy").unlink()
     fused = [threes[0] - 1, threes[0], threes[1]]
     code, _, outcomes = played(folder, default_bundle)
     assert code == 0
-    alone = [line.split(":")[0] for line in outcomes if "the same by itself (earlier sweeps" in line]
+    alone = [
+        line.split(":")[0] for line in outcomes if "the same by itself (earlier sweeps" in line
+    ]
     assert alone == [f"sweep-{n:06d}.npy" for n in fused]
     own = sidecar(folder / f"sweep-{fused[0]:06d}.npy")["verdict"]
     change(
-        folder / f"sweep-{fused[0]:06d}.npy", verdict=own | {"own": [np.nextafter(own["own"][0], 2), *own["own"][1:]]}
+        folder / f"sweep-{fused[0]:06d}.npy",
+        verdict=own | {"own": [np.nextafter(own["own"][0], 2), *own["own"][1:]]},
     )
     code, _, outcomes = played(folder, default_bundle)
     assert code == 1
-    assert next(line for line in outcomes if "DIFFERENT" in line).startswith(f"sweep-{fused[0]:06d}.npy")
+    assert next(line for line in outcomes if "DIFFERENT" in line).startswith(
+        f"sweep-{fused[0]:06d}.npy"
+    )
 
 
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
-    """By itself it would not have been given: its own scores are compared all the same, and no sentence is made up."""
-    model = toy_bundle.load(tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early"))
+    """By itself it would not have been given: its own scores are compared all the same, and no
+    sentence is made up."""
+    model = toy_bundle.load(
+        tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early")
+    )
     classifier = Classifier(model, rig.VirtualClock(), min_probability=0.97)
     whole = toy_bundle.sweep(2.5, 0.5, object=1)
-    frames = Frames(*(values[:10] for values in (whole.frames.t_ns, whole.frames.seq, whole.frames.taxels)))
+    frames = Frames(
+        *(values[:10] for values in (whole.frames.t_ns, whole.frames.seq, whole.frames.taxels))
+    )
     early = replace(whole, id=2, frames=frames, share=0.5)
     verdicts = classifier(whole), Decider(classifier)(early)
     assert [(str(v.status), v.fused) for v in verdicts] == [("unsure", 1), ("ok", 2)]
@@ -133,14 +172,19 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
 
 
 def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
-    """A score one bit off, another label, another tare: different, what differs is named, and the exit code is 1."""
+    """A score one bit off, another label, another tare: different, what differs is named, and the
+    exit code is 1."""
     folder, _ = in_service
     verdict = sidecar(folder / "sweep-000001.npy")["verdict"]
     change(
         folder / "sweep-000001.npy",
-        verdict=verdict | {"scores": [np.nextafter(verdict["scores"][0], 2), *verdict["scores"][1:]]},
+        verdict=verdict
+        | {"scores": [np.nextafter(verdict["scores"][0], 2), *verdict["scores"][1:]]},
     )
-    change(folder / "sweep-000002.npy", verdict=sidecar(folder / "sweep-000002.npy")["verdict"] | {"label": "velvet"})
+    change(
+        folder / "sweep-000002.npy",
+        verdict=sidecar(folder / "sweep-000002.npy")["verdict"] | {"label": "velvet"},
+    )
     change(folder / "sweep-000004.npy", tare=np.full((4, 4), 200).tolist())
     code, _, outcomes = played(folder, default_bundle)
     assert code == 1
@@ -151,7 +195,8 @@ def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle: bundle.Bundle):
-    """Wherever in the file it is: the low bit of a digit may leave every score as it was, but not the check sum."""
+    """Wherever in the file it is: the low bit of a digit may leave every score as it was, but not
+    the check sum."""
     folder, _ = in_service
     path = folder / "sweep-000003.npy"
     data = path.read_bytes()
@@ -168,11 +213,13 @@ def test_a_changed_byte_is_told(in_service, default_bundle: bundle.Bundle):
 
 
 def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bundle.Bundle):
-    """One sweep: both ids and what to try. A folder: those of the bundle are judged, the others are named."""
+    """One sweep: both ids and what to try. A folder: those of the bundle are judged, the others are
+    named."""
     folder, _ = in_service
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(
-        FormatError, match=f"judged by bundle {default_bundle.id}, this is 0badcafe; .*classifier.bundle=DIR"
+        FormatError,
+        match=f"judged by bundle {default_bundle.id}, this is 0badcafe; .*classifier.bundle=DIR",
     ):
         played(folder / "sweep-000001.npy", other)
     code, sentences, outcomes = played(folder, other)
@@ -180,15 +227,24 @@ def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bun
     change(folder / "sweep-000030.npy", bundle="0badcafe")
     code, _, outcomes = played(folder, default_bundle)
     assert code == 0
-    assert "sweep-000030.npy: of another bundle (sweep 30 was judged by bundle 0badcafe" in outcomes[-2]
+    assert (
+        "sweep-000030.npy: of another bundle (sweep 30 was judged by bundle 0badcafe"
+        in outcomes[-2]
+    )
     assert outcomes[-1] == "30 sweeps: 29 the same, 1 of another bundle"
 
 
 def test_the_next_run_begins_anew(tmp_path: Path):
-    """Objects are counted anew in each run: object 1 of a later run in the same folder is not fused with the earlier."""
+    """Objects are counted anew in each run: object 1 of a later run in the same folder is not fused
+    with the earlier."""
     model = toy_bundle.load(tmp_path / "bundle")
     for n, run in ((1, 0), (2, 1)):
-        save(tmp_path / f"sweep-{n:06d}.npy", toy_bundle.sweep(0, 0, object=1), toy_bundle.FORMAT, {"run": run})
+        save(
+            tmp_path / f"sweep-{n:06d}.npy",
+            toy_bundle.sweep(0, 0, object=1),
+            toy_bundle.FORMAT,
+            {"run": run},
+        )
     _, sentences, outcomes = played(tmp_path, model)
     assert [line.split(",")[8] for line in sentences] == ["1", "1"]
     assert outcomes[-1] == "2 sweeps: 2 no verdict to compare with"
@@ -201,7 +257,9 @@ def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
     save(tmp_path / "s.npy", early, toy_bundle.FORMAT)
     kinds = {"does": 0.5, "not": 2.0}
     does, not_ = (
-        toy_bundle.load(tmp_path / name, early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early"))
+        toy_bundle.load(
+            tmp_path / name, early=Early((least,) * 3, 1), outputs=("logits", "embedding", "early")
+        )
         for name, least in kinds.items()
     )
     code, (sentence,), _ = played(tmp_path / "s.npy", does)
@@ -249,7 +307,9 @@ def test_sidecars_that_make_no_sense(tmp_path: Path, about: dict[str, object], h
 @pytest.mark.parametrize(("n", "share"), [(3, 1.0), (20, 0.5), (0, 0.5), (0, 1.0)])
 def test_sweeps_of_another_length(tmp_path: Path, n: int, share: float):
     """Frames that are too few for a window, or too many for an early answer."""
-    model = toy_bundle.load(tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early"))
+    model = toy_bundle.load(
+        tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early")
+    )
     frames = Frames(np.arange(n), np.arange(n), toy_bundle.window(1, 0)[:n])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=share), toy_bundle.FORMAT)
     with pytest.raises(FormatError, match=f"has {n} frames"):
@@ -259,7 +319,11 @@ def test_sweeps_of_another_length(tmp_path: Path, n: int, share: float):
 def test_a_sweep_without_a_window(tmp_path: Path):
     """Its verdict is its status, as in service."""
     model = toy_bundle.load(tmp_path / "bundle")
-    save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.GAP, Frames.empty(toy_bundle.FORMAT)), toy_bundle.FORMAT)
+    save(
+        tmp_path / "s.npy",
+        Sweep(1, 0, 0, Status.GAP, Frames.empty(toy_bundle.FORMAT)),
+        toy_bundle.FORMAT,
+    )
     _, (sentence,), _ = played(tmp_path / "s.npy", model)
     assert ",gap," in sentence
 
@@ -269,6 +333,8 @@ def test_another_skin_and_an_empty_folder(tmp_path: Path, default_bundle: bundle
     with pytest.raises(FormatError, match="no kept sweep is there"):
         played(tmp_path, default_bundle)
     save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT)
-    with pytest.raises(FormatError, match=r"2x2 int16 at 100 Hz.*4x4 uint8 at 750 Hz.*classifier.bundle=DIR"):
+    with pytest.raises(
+        FormatError, match=r"2x2 int16 at 100 Hz.*4x4 uint8 at 750 Hz.*classifier.bundle=DIR"
+    ):
         played(tmp_path / "s.npy", default_bundle)
     assert load(tmp_path / "s.npy")[1] == toy_bundle.FORMAT

@@ -14,11 +14,15 @@ from appliance.sim import devices, rig, script
 
 
 def skin_of(share: float) -> selftest.CheckResult:
-    """The check of the simulated skin on a board whose processor it takes by `share` once it streams, and wholly before."""
+    """The check of the simulated skin on a board whose processor it takes by `share` once it
+    streams, and wholly before."""
     acts, source, fmt = script.named("skin", None, 1, spread=False)
     built = devices.build(fmt, acts, rig.VirtualClock(), source)
     results = selftest.check(
-        built.wire(config.load(None)), lambda: bundle.load(bundle.DEFAULT), built, spending(built.clock, share)
+        built.wire(config.load(None)),
+        lambda: bundle.load(bundle.DEFAULT),
+        built,
+        spending(built.clock, share),
     )
     return next(result for result in results if result.component == "skin")
 
@@ -28,9 +32,12 @@ def spending(clock: Clock, share: float) -> Callable[[], int]:
     return lambda: round(clock.now_ns() * share)
 
 
-@pytest.mark.parametrize(("share", "ok"), [(0.043, True), (0.49, True), (0.51, False), (0.97, False)])
+@pytest.mark.parametrize(
+    ("share", "ok"), [(0.043, True), (0.49, True), (0.51, False), (0.97, False)]
+)
 def test_what_reading_takes_of_a_core(share: float, ok: bool):
-    """It is told; from half a core on nothing would be left for answers, and the check says what to do."""
+    """It is told; from half a core on nothing would be left for answers, and the check says what to
+    do."""
     found = skin_of(share)
     assert found.ok == ok
     assert f"750 Hz, 750 frames in 1.0 s, 0 lost, {100 * share:.1f} % of a core" in found.detail

@@ -1,4 +1,5 @@
-"""A box with a skin that does not count its frames: it says so in each sentence, in the status and beside each sweep."""
+"""A box with a skin that does not count its frames: it says so in each sentence, in the status and
+beside each sweep."""
 
 from __future__ import annotations
 
@@ -28,11 +29,22 @@ PROFILE = from_json(MATRIX, "test")
 
 
 def on_a_matrix(
-    rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch, capture: CaptureWriter | None = None, **more
+    rigged: Callable[..., Rigged],
+    monkeypatch: pytest.MonkeyPatch,
+    capture: CaptureWriter | None = None,
+    **more,
 ) -> tuple[Rigged, WiredSkin]:
     """A box whose skin is a matrix of 4x4 at 750 Hz, with a marker and nothing else."""
     simulated = idle_devices()
-    wired = WiredSkin("matrix", skin.FORMAT, rate=7.5, clock=simulated.clock, tap=capture, grid="4x4", rate_hz=750.0)
+    wired = WiredSkin(
+        "matrix",
+        skin.FORMAT,
+        rate=7.5,
+        clock=simulated.clock,
+        tap=capture,
+        grid="4x4",
+        rate_hz=750.0,
+    )
     wired.port.frames = lambda i: b"\xaa\x55" + bytes((k + i) % 97 for k in range(16))
     monkeypatch.setattr(skins, "sensor", lambda settings, fmt, devices, tap: wired.sensor)
     return rigged(simulated, capture=capture, **more), wired
@@ -59,13 +71,18 @@ class Beside(Observer):
 
 
 def test_it_is_said_everywhere(rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
-    """RES has a 14th field, STA an 18th, the status and the sidecar a word; the frames are taken all the same."""
+    """RES has a 14th field, STA an 18th, the status and the sidecar a word; the frames are taken
+    all the same."""
     beside = Beside()
     box, _ = on_a_matrix(rigged, monkeypatch, observers=[beside])
     fields = swept(box).rpartition("*")[0].split(",")[2:]
     assert (len(fields), fields[13]) == (14, "1")
     box.seconds(2)
-    state = next(line for line in reversed(box.heard) if ",STA," in line).rpartition("*")[0].split(",")[2:]
+    state = (
+        next(line for line in reversed(box.heard) if ",STA," in line)
+        .rpartition("*")[0]
+        .split(",")[2:]
+    )
     assert (len(state), state[17]) == (18, "1")
     assert beside.kept[0]["loss_known"] is False
     assert beside.kept[0]["device"]["board"] == "matrix"
@@ -73,7 +90,10 @@ def test_it_is_said_everywhere(rigged: Callable[..., Rigged], monkeypatch: pytes
     health = asdict(box.box.health)
     assert health["loss_known"] is False
     report = {**health, "running": True, "pid": 1, "version": "", "since_ns": 0, "verdicts": []}
-    assert any("at least 0 lost: this skin does not count its frames" in line for line in status.lines(report, 10**12))
+    assert any(
+        "at least 0 lost: this skin does not count its frames" in line
+        for line in status.lines(report, 10**12)
+    )
 
 
 def test_a_board_that_counts_says_nothing_of_it(rigged: Callable[..., Rigged]):
@@ -86,7 +106,18 @@ def test_a_board_that_counts_says_nothing_of_it(rigged: Callable[..., Rigged]):
 def test_the_detail_gives_way(default_bundle: Bundle):
     """In a sentence that would be too long the detail is cut, never the field."""
     verdict = Verdict(
-        99999, 10**15, Status.UNDECIDED, "x" * 24, 0.5, 0.1, np.empty(0), 1, 0, 10**9, "9f3c2a1b", "moved far " * 10
+        99999,
+        10**15,
+        Status.UNDECIDED,
+        "x" * 24,
+        0.5,
+        0.1,
+        np.empty(0),
+        1,
+        0,
+        10**9,
+        "9f3c2a1b",
+        "moved far " * 10,
     )
     line = result(verdict, "replay", loss_known=False)
     assert len(line) <= MAX_LINE
@@ -98,7 +129,8 @@ def test_the_detail_gives_way(default_bundle: Bundle):
 def test_a_capture_of_such_a_skin(
     rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, pause_s: float
 ):
-    """The capture holds the profile, so that its bytes give the same frames, numbers and times again."""
+    """The capture holds the profile, so that its bytes give the same frames, numbers and times
+    again."""
     path = tmp_path / "capture"
     capture = CaptureWriter(path, skin.FORMAT, PROFILE)
     box, wired = on_a_matrix(rigged, monkeypatch, capture)

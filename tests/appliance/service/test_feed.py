@@ -1,4 +1,5 @@
-"""The feed: what each line says, and that no reader, however slow, many or hostile, costs the loop more than a little."""
+"""The feed: what each line says, and that no reader, however slow, many or hostile, costs the loop
+more than a little."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ from appliance.service.feed import (
     Asked,
     FeedServer,
     requests,
-)  # fmt: skip
+)
 from appliance.sim import devices, rig, script, skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND, Rigged
@@ -54,7 +55,8 @@ def kinds(lines: list[dict[str, Any]]) -> list[str]:
 
 
 def test_a_reader_first_hears_what_the_box_is_and_how_it_is(offered: Offered) -> None:
-    """hello with the format and the labels, then health as in the status file, with further facts."""
+    """hello with the format and the labels, then health as in the status file, with further
+    facts."""
     hello, health = offered.peer().lines()
     assert {
         "type": "hello",
@@ -67,7 +69,12 @@ def test_a_reader_first_hears_what_the_box_is_and_how_it_is(offered: Offered) ->
     assert hello["format"] == skin.FORMAT.json()
     assert (hello["window_s"], hello["frames_hz"]) == (2.0, 20.0)
     assert health["trial"] == "7 of 20 sweeps"
-    assert (health["skin"], health["answered"], health["ready"], health["pid"]) == ("streaming", 7, True, os.getpid())
+    assert (health["skin"], health["answered"], health["ready"], health["pid"]) == (
+        "streaming",
+        7,
+        True,
+        os.getpid(),
+    )
     assert health["time_ns"] >= health["since_ns"] > 0
 
 
@@ -78,9 +85,13 @@ def test_health_comes_once_a_second_and_a_state_with_each_change(offered: Offere
     offered.turns(375, step_s=0.008)
     assert kinds(peer.lines()) == ["health"] * 3
     offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
-    assert peer.lines() == [{"type": "state", "skin": "streaming", "trouble": "", "sweeping": True, "ready": False}]
+    assert peer.lines() == [
+        {"type": "state", "skin": "streaming", "trouble": "", "sweeping": True, "ready": False}
+    ]
     offered.turns(2, replace(HEALTH, skin="absent", trouble="no skin on USB", ready=False))
-    assert [(line["skin"], line["trouble"]) for line in peer.lines()] == [("absent", "no skin on USB")]
+    assert [(line["skin"], line["trouble"]) for line in peer.lines()] == [
+        ("absent", "no skin on USB")
+    ]
 
 
 def test_those_who_connect_within_a_second_hear_the_same_health(offered: Offered) -> None:
@@ -104,7 +115,8 @@ def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None
 
 @pytest.mark.parametrize("hz", [0.5, 1, 5, 8, 20])
 def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float) -> None:
-    """In ten seconds at 125 turns a second: the newest frame so often, and none once 0 was asked for."""
+    """In ten seconds at 125 turns a second: the newest frame so often, and none once 0 was asked
+    for."""
     peer, other = offered.peer(), offered.peer()
     peer.ask(json.dumps({"frames": hz}))
     found = []
@@ -114,7 +126,10 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float)
         found += [line for line in peer.lines() if line["type"] == "frame"]
     assert len(found) == pytest.approx(10 * hz, abs=1)
     last = frames(first=6 * round(found[-1]["time_ns"] / 6000 - 5 / 6))
-    assert (found[-1]["time_ns"], found[-1]["taxels"]) == (int(last.t_ns[-1]), last.taxels[-1].tolist())
+    assert (found[-1]["time_ns"], found[-1]["taxels"]) == (
+        int(last.t_ns[-1]),
+        last.taxels[-1].tolist(),
+    )
     peer.ask('{"frames": 0}')
     offered.turns(20)
     peer.lines()
@@ -124,7 +139,8 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float)
 
 
 def test_a_verdict_is_not_kept_for_the_next_look(offered: Offered) -> None:
-    """It is there with the turn that has it, 8 ms after the last look; a storm of them is sent each 5 ms at most."""
+    """It is there with the turn that has it, 8 ms after the last look; a storm of them is sent each
+    5 ms at most."""
     peer = offered.peer()
     peer.lines()
     for turn in range(1, 4):
@@ -152,7 +168,8 @@ def test_without_a_new_frame_none_is_repeated(offered: Offered) -> None:
 
 
 def test_of_a_large_skin_fewer_frames_are_offered(tmp_path: Path) -> None:
-    """Text of 10,000 counts a second at most: 32x32 taxels at 9.8 frames a second, whatever was asked for."""
+    """Text of 10,000 counts a second at most: 32x32 taxels at 9.8 frames a second, whatever was
+    asked for."""
     fmt = SweepFormat(32, 32, 100.0, 200, "uint16")
     offered = Offered(tmp_path / "feed.sock", fmt)
     peer = offered.peer()
@@ -172,7 +189,10 @@ def test_the_window_of_a_sweep_comes_bit_for_bit(offered: Offered) -> None:
     peer, other = offered.peer(), offered.peer()
     peer.ask('{"sweeps": true}')
     offered.turns(2)
-    for sweep, verdict in ((cut(), OK), (replace(cut(), frames=Frames.empty(skin.FORMAT)), replace(OK, sweep=8))):
+    for sweep, verdict in (
+        (cut(), OK),
+        (replace(cut(), frames=Frames.empty(skin.FORMAT)), replace(OK, sweep=8)),
+    ):
         offered.feed.answered(verdict)
         offered.feed.sweep(sweep, verdict, {})
         offered.turns(5)
@@ -180,7 +200,12 @@ def test_the_window_of_a_sweep_comes_bit_for_bit(offered: Offered) -> None:
         if len(sweep.frames):
             assert kinds(peer_lines)[-2:] == ["verdict", "sweep"]
             line = peer_lines[-1]
-            assert (line["sweep"], line["start_ns"], line["shape"], line["dtype"]) == (7, 5, [1500, 4, 4], "uint8")
+            assert (line["sweep"], line["start_ns"], line["shape"], line["dtype"]) == (
+                7,
+                5,
+                [1500, 4, 4],
+                "uint8",
+            )
             read = np.frombuffer(b64decode(line["data"]), np.dtype(line["dtype"]).newbyteorder("<"))
             np.testing.assert_array_equal(read.reshape(line["shape"]), sweep.frames.taxels)
         else:
@@ -211,7 +236,8 @@ def asking(offered: Offered) -> FeedPeer:
 
 
 def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
-    """Over 64 kB, in pieces as the readers take them, with other lines in their order; it is held once for both."""
+    """Over 64 kB, in pieces as the readers take them, with other lines in their order; it is held
+    once for both."""
     peers = [asking(large), asking(large)]
     sweep = cut(LARGE)
     large.feed.answered(OK)
@@ -226,16 +252,25 @@ def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
         for lines, peer in zip(got, peers, strict=True):
             lines += peer.lines()
     for lines in got:
-        assert [kind for kind in kinds(lines) if kind != "health"] == ["verdict", "sweep", "verdict"]
+        assert [kind for kind in kinds(lines) if kind != "health"] == [
+            "verdict",
+            "sweep",
+            "verdict",
+        ]
         (line,) = (line for line in lines if line["type"] == "sweep")
-        assert (line["sweep"], line["start_ns"], line["shape"], line["dtype"]) == (7, 5, [200, 16, 32], "uint8")
+        assert (line["sweep"], line["start_ns"], line["shape"], line["dtype"]) == (
+            7,
+            5,
+            [200, 16, 32],
+            "uint8",
+        )
         assert b64decode(line["data"]) == sweep.frames.taxels.tobytes()
     assert not any(reader.takes(large.feed._large) for reader in (one, other))
 
 
 def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
-    """While a reader takes none, the next one is lost to all; after five seconds the reader is closed, and told why when it
-    reads in the end; the other one gets the third."""
+    """While a reader takes none, the next one is lost to all; after five seconds the reader is
+    closed, and told why when it reads in the end; the other one gets the third."""
     slow, quick = asking(large), asking(large)
     got: list[dict[str, Any]] = []
 
@@ -254,7 +289,8 @@ def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
 
 
 def test_readers_that_never_read_hold_one_large_window(large: Offered) -> None:
-    """Sixty-four of them, and a sweep a second: the box holds less than 2 MiB more, and goes on serving who reads."""
+    """Sixty-four of them, and a sweep a second: the box holds less than 2 MiB more, and goes on
+    serving who reads."""
     peers = [asking(large) for _ in range(MOST_READERS - 1)]
     quick = asking(large)
     quick.lines()
@@ -305,8 +341,8 @@ def test_counts_that_are_no_numbers_become_null(tmp_path: Path) -> None:
 
 
 def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offered) -> None:
-    """Two thousand verdicts that one reader does not take: what it gets in the end, with what it lost, is all of them;
-    another that reads has them all, and the queue stayed within its limit."""
+    """Two thousand verdicts that one reader does not take: what it gets in the end, with what it
+    lost, is all of them; another that reads has them all, and the queue stayed within its limit."""
     slow, quick = offered.peer(), offered.peer()
     all_lines: list[dict[str, Any]] = []
     for i in range(2000):
@@ -324,7 +360,9 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offere
         got += slow.lines()
     lost = [line["lines"] for line in got if line["type"] == "lost"]
     assert len(lost) == 1
-    at = kinds(got).index("lost")  # where the gap is; before stand hello and health, which each reader has of its own
+    at = kinds(got).index(
+        "lost"
+    )  # where the gap is; before stand hello and health, which each reader has of its own
     assert got[2:at] == all_lines[2:at]
     rest = got[at + 1 :]
     first = all_lines.index(rest[0])
@@ -333,7 +371,8 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offere
 
 
 def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> None:
-    """A reader that takes nothing: of four windows two fit, and of eight lines in all each is there or counted."""
+    """A reader that takes nothing: of four windows two fit, and of eight lines in all each is there
+    or counted."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     offered.turns(2)
@@ -356,7 +395,8 @@ def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> Non
 
 @pytest.mark.slow
 def test_one_that_never_reads_costs_no_memory_without_bound(offered: Offered) -> None:
-    """Sixty-four of them that asked for all: after thousands of lines and windows the box holds less than 2 MiB more."""
+    """Sixty-four of them that asked for all: after thousands of lines and windows the box holds
+    less than 2 MiB more."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
     for peer in peers:
         peer.ask('{"frames": 20, "sweeps": true}')
@@ -380,7 +420,9 @@ def test_the_65th_reader_is_told_why_it_is_not_served(offered: Offered) -> None:
     peers = [offered.peer() for _ in range(MOST_READERS)]
     assert all(kinds(peer.lines())[0] == "hello" for peer in peers)
     late = offered.peer()
-    assert late.lines() == [{"type": "closed", "why": "64 readers are connected already; close one"}]
+    assert late.lines() == [
+        {"type": "closed", "why": "64 readers are connected already; close one"}
+    ]
     assert late.ended
     peers[5].socket.close()
     offered.turns(2)
@@ -388,7 +430,8 @@ def test_the_65th_reader_is_told_why_it_is_not_served(offered: Offered) -> None:
 
 
 def test_a_thousand_connections_leave_no_file_open(offered: Offered) -> None:
-    """Some read nothing, some go at once, some send half a request: no descriptor and no reader is left of them."""
+    """Some read nothing, some go at once, some send half a request: no descriptor and no reader is
+    left of them."""
     before = len(os.listdir("/proc/self/fd"))
     for i in range(1000):
         peer = FeedPeer(offered.path)
@@ -440,8 +483,11 @@ def test_what_is_no_request_closes_its_reader_alone(offered: Offered, data: str)
     assert "verdict" in kinds(other.lines())
 
 
-def test_endless_requests_are_read_a_little_each_turn(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader that sends without a pause: of its bytes no more than a few are taken in a turn, and others are served."""
+def test_endless_requests_are_read_a_little_each_turn(
+    offered: Offered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reader that sends without a pause: of its bytes no more than a few are taken in a turn, and
+    others are served."""
     taken: list[int] = []
     plain = module.requests
 
@@ -458,14 +504,17 @@ def test_endless_requests_are_read_a_little_each_turn(offered: Offered, monkeypa
     offered.turns(10)
     assert len(taken) == HEARD * 10
     assert max(taken) <= HEARD_BYTES
-    assert sum(reader.sweeps for reader in offered.feed._readers.values()) == 1  # heard between the floods
+    assert (
+        sum(reader.sweeps for reader in offered.feed._readers.values()) == 1
+    )  # heard between the floods
     offered.feed.answered(OK)
     offered.turns(4)
     assert "verdict" in kinds(other.lines())
 
 
 def test_a_turn_serves_a_few_and_all_in_the_end(offered: Offered) -> None:
-    """A verdict for 64 readers: SERVED get it at the first look at the sockets, the last after 64 / SERVED looks."""
+    """A verdict for 64 readers: SERVED get it at the first look at the sockets, the last after 64 /
+    SERVED looks."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
     offered.turns(MOST_READERS)
     for peer in peers:
@@ -488,7 +537,8 @@ def test_a_turn_serves_a_few_and_all_in_the_end(offered: Offered) -> None:
 def test_a_costly_look_at_the_sockets_puts_off_the_next(
     offered: Offered, monkeypatch: pytest.MonkeyPatch, cost_ns: int, period_ns: int
 ) -> None:
-    """Looks take no more than SHARE of a core: one that took three times that is followed by a pause three times as long."""
+    """Looks take no more than SHARE of a core: one that took three times that is followed by a
+    pause three times as long."""
     offered.cost_ns = cost_ns
     looks: list[int] = []
     monkeypatch.setattr(offered.feed, "_work", lambda *_: looks.append(offered.clock.now_ns()))
@@ -509,7 +559,8 @@ def test_a_reader_that_stops_in_the_middle_or_is_killed(offered: Offered) -> Non
 
 
 def test_one_that_only_listens_may_close_its_own_side(offered: Offered) -> None:
-    """As `socat` does when its input ends: its last request holds, and lines go on; when it leaves it is let go."""
+    """As `socat` does when its input ends: its last request holds, and lines go on; when it leaves
+    it is let go."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     peer.socket.shutdown(socket.SHUT_WR)
@@ -551,7 +602,8 @@ def test_members_of_the_group_may_read_and_nobody_else(tmp_path: Path) -> None:
 
 
 def test_the_socket_of_a_process_that_died_is_replaced(tmp_path: Path, logged: list[str]) -> None:
-    """What a killed box leaves behind refuses connections; the next one takes its place without a word."""
+    """What a killed box leaves behind refuses connections; the next one takes its place without a
+    word."""
     dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     dead.bind(str(tmp_path / "feed.sock"))
     dead.close()
@@ -562,8 +614,8 @@ def test_the_socket_of_a_process_that_died_is_replaced(tmp_path: Path, logged: l
 
 
 def test_a_path_that_cannot_be_bound_is_told_once(tmp_path: Path, logged: list[str]) -> None:
-    """A folder that is missing, a file in its place, a path that is too long: one line each, and turns go on; once the
-    reason is gone the feed is there."""
+    """A folder that is missing, a file in its place, a path that is too long: one line each, and
+    turns go on; once the reason is gone the feed is there."""
     offered = Offered(tmp_path / "run" / "feed.sock")
     offered.turns(2000)
     assert len(logged) == 1
@@ -585,7 +637,9 @@ def test_a_path_that_cannot_be_bound_is_told_once(tmp_path: Path, logged: list[s
     assert "too long" in logged[3]
 
 
-def test_two_boxes_do_not_take_the_socket_from_each_other(offered: Offered, logged: list[str]) -> None:
+def test_two_boxes_do_not_take_the_socket_from_each_other(
+    offered: Offered, logged: list[str]
+) -> None:
     """The second says so, and offers its feed when the first has ended."""
     second = Offered(offered.path)
     second.turns(1000)
@@ -600,7 +654,8 @@ def test_two_boxes_do_not_take_the_socket_from_each_other(offered: Offered, logg
 
 
 def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered: Offered) -> None:
-    """Readers get what was waiting, the reason, and an end; the verdict of a sweep that was open then is no error."""
+    """Readers get what was waiting, the reason, and an end; the verdict of a sweep that was open
+    then is no error."""
     peer = offered.peer()
     offered.feed.answered(OK)
     offered.feed.stopping()
@@ -620,16 +675,23 @@ def test_requests_in_parts_are_requests(offered: Offered) -> None:
         offered.turns()
     (reader,) = offered.feed._readers.values()
     assert (reader.frames_hz, reader.sweeps) == (4.0, False)
-    assert requests(b'{"frames": 1}\n{"sweeps": true}\n{"fr') == ([Asked(1.0), Asked(None, True)], b'{"fr')
+    assert requests(b'{"frames": 1}\n{"sweeps": true}\n{"fr') == (
+        [Asked(1.0), Asked(None, True)],
+        b'{"fr',
+    )
     with pytest.raises(FormatError, match="over 1024 bytes"):
         requests(b"y" * 25, b"x" * 1000)
 
 
-def test_without_readers_nothing_is_written_as_text(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_readers_nothing_is_written_as_text(
+    offered: Offered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No verdict, no frame, no health is encoded; only changes of the state are."""
     made: list[str] = []
     plain: Callable[..., bytes] = module.encode
-    monkeypatch.setattr(module, "encode", lambda kind, content: made.append(kind) or plain(kind, content))
+    monkeypatch.setattr(
+        module, "encode", lambda kind, content: made.append(kind) or plain(kind, content)
+    )
     for _ in range(500):
         offered.feed.frames(frames())
         offered.feed.answered(OK)
@@ -638,10 +700,15 @@ def test_without_readers_nothing_is_written_as_text(offered: Offered, monkeypatc
     assert set(made) <= {"state"}
 
 
-def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged: Callable[..., Rigged], tmp_path: Path) -> None:
-    """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box has cut."""
+def test_a_running_box_offers_its_verdicts_frames_and_sweeps(
+    rigged: Callable[..., Rigged], tmp_path: Path
+) -> None:
+    """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box
+    has cut."""
     simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
-    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0)
+    feed = FeedServer(
+        tmp_path / "feed.sock", skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0
+    )
     box = rigged(simulated, observers=[feed])
     box.box.step()
     peer = FeedPeer(tmp_path / "feed.sock")
@@ -654,7 +721,11 @@ def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged: Callable[..
     for _ in range(20):
         box.box.step()
         lines += peer.lines()
-    told = [(line["sweep"], line["label"], line["probability"]) for line in lines if line["type"] == "verdict"]
+    told = [
+        (line["sweep"], line["label"], line["probability"])
+        for line in lines
+        if line["type"] == "verdict"
+    ]
     assert told == [(v.sweep, v.label, v.probability) for v in verdicts]
     cuts = {line["sweep"]: line for line in lines if line["type"] == "sweep"}
     for sweep in box.kept[:3]:

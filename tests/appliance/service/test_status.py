@@ -1,4 +1,5 @@
-"""What a person sees of the service: the status file and its reader, and the log lines of verdicts."""
+"""What a person sees of the service: the status file and its reader, and the log lines of
+verdicts."""
 
 from __future__ import annotations
 
@@ -26,16 +27,43 @@ from appliance.sim import devices, rig
 from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 
 HEALTH = Health(
-    time_ns=0, skin="streaming", trouble="", streams=True, sweeping=False, answered=7, frames=5_000_000, lost_frames=3,
-    garbage_bytes=0, enumerations=1, dropped=0, bundle="9f3c2a1b", source="usb",
-    stale_frames=0, overflows=0, fifo_overflows=0, glitches=0, lost_edges=0, storms=0,
-)  # fmt: skip
+    time_ns=0,
+    skin="streaming",
+    trouble="",
+    streams=True,
+    sweeping=False,
+    answered=7,
+    frames=5_000_000,
+    lost_frames=3,
+    garbage_bytes=0,
+    enumerations=1,
+    dropped=0,
+    bundle="9f3c2a1b",
+    source="usb",
+    stale_frames=0,
+    overflows=0,
+    fifo_overflows=0,
+    glitches=0,
+    lost_edges=0,
+    storms=0,
+)
 AWAY = replace(HEALTH, skin="absent", trouble="no skin on USB; check cable", streams=False)
 OK = Verdict(
-    sweep=7, time_ns=0, status=Status.OK, label="plastic rough", probability=0.987, margin=0.9, scores=np.ones(2) / 2,
-    fused=1, lost=0, latency_ns=1_200_000, bundle="9f3c2a1b",
-)  # fmt: skip
-SHORT = replace(OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0))
+    sweep=7,
+    time_ns=0,
+    status=Status.OK,
+    label="plastic rough",
+    probability=0.987,
+    margin=0.9,
+    scores=np.ones(2) / 2,
+    fused=1,
+    lost=0,
+    latency_ns=1_200_000,
+    bundle="9f3c2a1b",
+)
+SHORT = replace(
+    OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0)
+)
 
 
 class ClockedStatus:
@@ -70,7 +98,8 @@ def status_file(tmp_path: Path) -> ClockedStatus:
 
 
 def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedStatus):
-    """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a second later."""
+    """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a
+    second later."""
     assert status_file.turns(4) in (4, 5)
     status_file.file.turn(HEALTH)
     status_file.file.answered(OK)
@@ -94,7 +123,8 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: Cloc
 
 
 def test_writing_it_interns_no_string(status_file: ClockedStatus, monkeypatch: pytest.MonkeyPatch):
-    """pathlib interns the parts of a path: one a second would fill Python's table of interned strings (docs/faults.md)."""
+    """pathlib interns the parts of a path: one a second would fill Python's table of interned
+    strings (docs/faults.md)."""
     status_file.turns(2)
     interned = []
     monkeypatch.setattr(sys, "intern", lambda text: interned.append(text) or text)
@@ -106,7 +136,8 @@ def test_writing_it_interns_no_string(status_file: ClockedStatus, monkeypatch: p
 
 
 def test_every_user_may_read_it_whole(status_file: ClockedStatus):
-    """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still has it whole."""
+    """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still
+    has it whole."""
     before = os.umask(0o027)
     try:
         status_file.turns(0.01)
@@ -120,7 +151,8 @@ def test_every_user_may_read_it_whole(status_file: ClockedStatus):
 
 
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
-    """Since when, skin, bundle, further facts, the last verdicts newest first; advice where something is wrong."""
+    """Since when, skin, bundle, further facts, the last verdicts newest first; advice where
+    something is wrong."""
     status_file = ClockedStatus(
         tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
     )
@@ -129,7 +161,10 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     status_file.file.answered(SHORT)
     status_file.turns(135)
     text = status_file.text().splitlines()
-    assert text[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
+    assert (
+        text[0]
+        == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
+    )
     assert text[1:5] == [
         "skin     streaming (5,000,000 frames, 3 lost)",
         "bundle   9f3c2a1b",
@@ -144,7 +179,10 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
     text = status_file.text()
     assert "bundle   none" in text  # while sweeps are recorded
-    assert "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t" in text
+    assert (
+        "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t"
+        in text
+    )
     assert "serial   4 sentences dropped, since nobody read them" in text
     assert status.exit_code(status_file.read()) == 69
 
@@ -156,7 +194,8 @@ def test_text_of_a_device_does_not_steer_a_terminal(status_file: ClockedStatus):
 
 
 def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
-    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: it says why. All exit with 1."""
+    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: it says why.
+    All exit with 1."""
     assert status.exit_code(status_file.read()) == 1
     assert "does not run" in status_file.text()
     status_file.turns(0.01)
@@ -164,16 +203,22 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
     written = json.loads(status_file.path.read_text())
     status_file.clock.sleep_until(status_file.clock.now_ns() + 11 * SECOND)
     assert "has written nothing for 11 s, so it hangs" in status_file.text()
-    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    )
     for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
-        status_file.path.write_text(json.dumps(written | {"time_ns": status_file.clock.now_ns()} | wrong))
+        status_file.path.write_text(
+            json.dumps(written | {"time_ns": status_file.clock.now_ns()} | wrong)
+        )
         assert "has ended without closing down" in status_file.text()
         assert status.exit_code(status_file.read()) == 1
     status_file.file.stopping()
     assert not status_file.path.exists()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}']
+)
 def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
     """What is no status of this version is an error, not a guess."""
     status_file.path.write_text(text)
@@ -189,7 +234,8 @@ def test_a_file_that_may_not_be_read_is_named(status_file: ClockedStatus):
 
 
 def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str]):
-    """Without its folder the box goes on; one line, and another only after it had worked in between."""
+    """Without its folder the box goes on; one line, and another only after it had worked in
+    between."""
     status_file = ClockedStatus(tmp_path / "run")
     status_file.turns(5)
     assert len(logged) == 1
@@ -205,7 +251,8 @@ def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str])
 
 
 def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
-    """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the log."""
+    """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the
+    log."""
     clock = rig.VirtualClock()
     file = StatusFile(tmp_path / "status.json", clock)
     box: Rigged = rigged(observers=[file, VerdictLog()])
@@ -214,9 +261,13 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
     box.seconds(0.2)
     read = status.read(tmp_path / "status.json", clock.now_ns())
     assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
-    assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [(v.sweep, v.label) for v in verdicts]
+    assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [
+        (v.sweep, v.label) for v in verdicts
+    ]
     lines = [line.removeprefix("<4>") for line in logged if line.startswith(("sweep", "<4>sweep"))]
-    assert [line.split(",")[0] for line in lines] == [f"sweep {v.sweep}: {v.label}" for v in verdicts]
+    assert [line.split(",")[0] for line in lines] == [
+        f"sweep {v.sweep}: {v.label}" for v in verdicts
+    ]
 
 
 @pytest.mark.parametrize(
@@ -224,15 +275,32 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
     [
         (OK, "sweep 7: plastic rough, 98.7 % (1.2 ms)"),
         (replace(OK, fused=3), "sweep 7: plastic rough, 98.7 % after 3 sweeps (1.2 ms)"),
-        (replace(OK, share=0.4), "sweep 7: plastic rough, 98.7 %, early at 40 % of the window (1.2 ms)"),
-        (replace(OK, status=Status.UNSURE), "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)"),
-        (replace(OK, moved="moved 2 mm", detail="moved 2 mm"), "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm"),
-        (SHORT, "<4>sweep 8: no answer, short: the stop edge came before a window's length had passed"),
-        (replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
-         "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; taxel 2.3"),
-        (replace(SHORT, status=Status.ABORTED), "sweep 8: no answer, aborted: by command, or because the box was stopping"),
+        (
+            replace(OK, share=0.4),
+            "sweep 7: plastic rough, 98.7 %, early at 40 % of the window (1.2 ms)",
+        ),
+        (
+            replace(OK, status=Status.UNSURE),
+            "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)",
+        ),
+        (
+            replace(OK, moved="moved 2 mm", detail="moved 2 mm"),
+            "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm",
+        ),
+        (
+            SHORT,
+            "<4>sweep 8: no answer, short: the stop edge came before a window's length had passed",
+        ),
+        (
+            replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
+            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; taxel 2.3",
+        ),
+        (
+            replace(SHORT, status=Status.ABORTED),
+            "sweep 8: no answer, aborted: by command, or because the box was stopping",
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: list[str]):
     """In words; one that a person should look at is a warning."""
     VerdictLog().answered(verdict)
@@ -263,24 +331,46 @@ def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
 @pytest.mark.parametrize(
     ("name", "field", "fault", "text"),
     [
-        ("stale_frames", 12, lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data * 2)),
-         "4 repeated or late"),
-        ("overflows", 13, lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data + bytes(5000))),
-         "1 transfers too large"),
-        ("fifo_overflows", 14, lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
-         "1 times the board's FIFO was full"),
+        (
+            "stale_frames",
+            12,
+            lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data * 2)),
+            "4 repeated or late",
+        ),
+        (
+            "overflows",
+            13,
+            lambda box: setattr(
+                box.simulated.backend, "mangle", once(lambda data: data + bytes(5000))
+            ),
+            "1 transfers too large",
+        ),
+        (
+            "fifo_overflows",
+            14,
+            lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
+            "1 times the board's FIFO was full",
+        ),
         ("glitches", 15, burst(devices.START, 2, 1e-4), "1 glitches; check the trigger lines"),
         ("lost_edges", 16, burst(devices.STOP, 3000, 1e-6), "edges lost; check the trigger lines"),
         ("storms", 17, burst(devices.STOP, 60, 1e-4), "1 storms of edges; check the trigger lines"),
     ],
-)  # fmt: skip
+)
 def test_what_is_counted_is_shown(
-    rigged: Callable[..., Rigged], tmp_path: Path, name: str, field: int, fault: Callable[[Rigged], None], text: str
+    rigged: Callable[..., Rigged],
+    tmp_path: Path,
+    name: str,
+    field: int,
+    fault: Callable[[Rigged], None],
+    text: str,
 ):
-    """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was not before it."""
+    """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was
+    not before it."""
     simulated = idle_devices(60)
     file = StatusFile(tmp_path / "status.json", simulated.clock)
-    box = rigged(simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file])
+    box = rigged(
+        simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file]
+    )
     box.seconds(1.5)
 
     def shown() -> tuple[int, int, int, bool]:
@@ -299,8 +389,19 @@ def test_what_is_counted_is_shown(
 
 
 def test_numbers_of_a_state_are_left_out_rather_than_cut():
-    """After years of faults the line is full: the counts that are there are whole, and the line is no longer than ever."""
-    states = ["31536000.125", "streaming", 1, 10_000_000, 23_652_000_000, 99_999_999, 99_999_999, 99_999, 9_999_999]
+    """After years of faults the line is full: the counts that are there are whole, and the line is
+    no longer than ever."""
+    states = [
+        "31536000.125",
+        "streaming",
+        1,
+        10_000_000,
+        23_652_000_000,
+        99_999_999,
+        99_999_999,
+        99_999,
+        9_999_999,
+    ]
     for kind in (("STA",), ("ANS", "STATE", "ok")):
         line = sentence(*kind, *states, "9f3c2a1b", "usb", *[987_654_321] * 6).decode()
         assert len(line) <= MAX_LINE

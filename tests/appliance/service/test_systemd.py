@@ -1,4 +1,5 @@
-"""The box as a service of systemd: what the service manager gets and when, and the log lines of verdicts."""
+"""The box as a service of systemd: what the service manager gets and when, and the log lines of
+verdicts."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ class ManagerSocket:
 @pytest.fixture(params=["path", "abstract"])
 def socket_end(request: pytest.FixtureRequest, tmp_path: Path):
     """A socket with a place in the file system, and one without."""
-    socket_end = ManagerSocket(str(tmp_path / "notify") if request.param == "path" else f"@palpate-test-{os.getpid()}")
+    socket_end = ManagerSocket(
+        str(tmp_path / "notify") if request.param == "path" else f"@palpate-test-{os.getpid()}"
+    )
     yield socket_end
     socket_end.socket.close()
 
@@ -67,7 +70,8 @@ def state(streams: bool, text: str) -> Any:
 
 
 def test_only_what_is_new_is_sent(socket_end: ManagerSocket):
-    """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the end."""
+    """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the
+    end."""
     sender, _ = notifier(socket_end)
     for ready, status in [
         (False, "skin absent"),
@@ -79,11 +83,17 @@ def test_only_what_is_new_is_sent(socket_end: ManagerSocket):
     ]:
         sender.turn(state(ready, status))
     sender.stopping()
-    assert socket_end.heard() == [["STATUS=skin absent"], ["STATUS=fine", "READY=1"], ["STATUS=no"], ["STOPPING=1"]]
+    assert socket_end.heard() == [
+        ["STATUS=skin absent"],
+        ["STATUS=fine", "READY=1"],
+        ["STATUS=no"],
+        ["STOPPING=1"],
+    ]
 
 
 def test_the_watchdog_is_fed_by_turns_alone(socket_end: ManagerSocket):
-    """At the first turn, then at most each second of its ten; a box that takes no turn is silent."""
+    """At the first turn, then at most each second of its ten; a box that takes no turn is
+    silent."""
     sender, clock = notifier(socket_end, **WATCHDOG, WATCHDOG_PID=str(os.getpid()))
     sender.turn(state(True, "fine"))
     assert socket_end.heard() == [["STATUS=fine", "READY=1", "WATCHDOG=1"]]
@@ -98,7 +108,8 @@ def test_the_watchdog_is_fed_by_turns_alone(socket_end: ManagerSocket):
 
 
 def test_turns_without_a_skin_keep_the_start_alive(socket_end: ManagerSocket):
-    """Until READY each feeding moves the end of the start on, by the watchdog's time; none after it."""
+    """Until READY each feeding moves the end of the start on, by the watchdog's time; none after
+    it."""
     sender, clock = notifier(socket_end, **WATCHDOG)
     for ready in (False, False, True, True):
         sender.turn(state(ready, ""))
@@ -118,7 +129,8 @@ def test_no_watchdog_or_another_s_is_not_fed(socket_end: ManagerSocket, more: di
 
 
 def test_text_of_a_device_is_no_message(socket_end: ManagerSocket):
-    """A line break in a status would begin another message; what is no text is sent all the same."""
+    """A line break in a status would begin another message; what is no text is sent all the
+    same."""
     sender, _ = notifier(socket_end)
     sender.turn(state(False, "skin absent: no\nREADY=1\r\nMAINPID=1 \udcff"))
     assert socket_end.heard() == [["STATUS=skin absent: no READY=1 MAINPID=1 ?"]]
@@ -135,7 +147,8 @@ def test_without_a_socket_nothing_is_sent(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path: Path):
-    """Nobody listens, or nobody reads: the box goes on, and what was not accepted is sent when somebody reads."""
+    """Nobody listens, or nobody reads: the box goes on, and what was not accepted is sent when
+    somebody reads."""
     sender, _ = notifier(socket_end)
     socket_end.socket.close()
     Path(socket_end.address).unlink(missing_ok=True)
@@ -179,7 +192,8 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
-    """Without a skin the status names what is missing; then it streams, and counts the answered sweeps."""
+    """Without a skin the status names what is missing; then it streams, and counts the answered
+    sweeps."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
     box = rigged(simulated, observers=[turn_log])
@@ -206,12 +220,16 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
     simulated.backend.mangle = lambda data: b""
     rigged(simulated, observers=[turn_log]).seconds(3)
     received = {status.split(" for ")[0] for _, status in turn_log.notes}
-    assert received == {"skin streaming. Sweeps answered: 0", "skin silent: the skin is there but sent no frame"}
+    assert received == {
+        "skin streaming. Sweeps answered: 0",
+        "skin silent: the skin is there but sent no frame",
+    }
     assert not any(ready for ready, _ in turn_log.notes)
 
 
 def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
-    """One call for each whole turn: none for the turn that hangs after its sentence, at the disk."""
+    """One call for each whole turn: none for the turn that hangs after its sentence, at the
+    disk."""
     turn_log = TurnLog()
 
     def hang(sweep: object, verdict: object) -> None:
@@ -232,7 +250,11 @@ def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
     """What is open is answered after systemd has been notified."""
     turn_log = TurnLog()
     box = rigged(
-        idle_devices(), observers=[turn_log, OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status)))]
+        idle_devices(),
+        observers=[
+            turn_log,
+            OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status))),
+        ],
     )
     box.pulse(devices.START, 0.2)
     end = box.simulated.clock.now_ns() + SECOND
@@ -242,7 +264,8 @@ def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
 
 @pytest.mark.slow
 def test_the_command_notifies_systemd(tmp_path: Path):
-    """`palpate run` under systemd: first a status, READY once, the watchdog fed while it runs, STOPPING on SIGTERM."""
+    """`palpate run` under systemd: first a status, READY once, the watchdog fed while it runs,
+    STOPPING on SIGTERM."""
     socket_end = ManagerSocket(str(tmp_path / "notify"))
     socket_end.socket.settimeout(30)
     env = os.environ | {"NOTIFY_SOCKET": socket_end.address, "WATCHDOG_USEC": "100000"}

@@ -1,4 +1,5 @@
-"""The centre of a contact, the advice that follows from it, and the positions that a bundle holds."""
+"""The centre of a contact, the advice that follows from it, and the positions that a bundle
+holds."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ NAN, INF = float("nan"), float("inf")
     ],
 )
 def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: str):
-    """Values that are no numbers, not finite, too many or not in pairs: a BundleError that names them."""
+    """Values that are no numbers, not finite, too many or not in pairs: a BundleError that names
+    them."""
     with pytest.raises(BundleError, match=re.escape(message)):
         replace(MIDDLE, **wrong)
 
@@ -62,7 +64,8 @@ def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
 
 
 def test_only_the_normal_axis_of_several_counts():
-    """Shear, however large, moves no centre; the distance is that of the normal axis alone, tare included."""
+    """Shear, however large, moves no centre; the distance is that of the normal axis alone, tare
+    included."""
     load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
     flat = counts(load + tare)
     shear = np.stack([500 * np.indices((4, 4))[0], -counts(load)[0]], axis=-1)
@@ -73,7 +76,8 @@ def test_only_the_normal_axis_of_several_counts():
 
 
 def test_without_contact_there_is_no_centre():
-    """Below the threshold, or where a floating-point skin gives no number: None, and nothing is moved."""
+    """Below the threshold, or where a floating-point skin gives no number: None, and nothing is
+    moved."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
         assert moved(counts(load), TARE, 5.0, MIDDLE) == ""
@@ -89,8 +93,8 @@ def test_a_threshold_below_zero_takes_no_pulled_taxel_along():
 
 @pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
 def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
-    """Silent between two loaded ones it is filled in: the centre stays within 0.15 taxels; without that it would
-    not."""
+    """Silent between two loaded ones it is filled in: the centre stays within 0.15 taxels; without
+    that it would not."""
     load = patch(1.5, 1.5) + 30
     whole = np.array(centre(counts(load), TARE, 5.0))
     load[dead] = 0
@@ -109,13 +113,17 @@ def test_the_rim_of_a_contact_is_not_filled_in():
 
 
 @pytest.mark.parametrize(
-    ("along", "axis", "towards"), [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))]
+    ("along", "axis", "towards"),
+    [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
 )
 def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: tuple[str, str]):
-    """The further forward the skin is, the further back is the centre; the advice names the right end."""
+    """The further forward the skin is, the further back is the centre; the advice names the right
+    end."""
     found = []
     for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
-        window = skin.window("wood", skin.Placement(**{along: mm}, seed=3), np.random.default_rng(0))[:200]
+        window = skin.window(
+            "wood", skin.Placement(**{along: mm}, seed=3), np.random.default_rng(0)
+        )[:200]
         found.append(centre(window, TARE, 5.4)[axis])
         text = moved(window, TARE, 5.4, MIDDLE)
         assert text == "" if mm == 0 else text.endswith(f"mm too far towards {towards[mm > 0]}")
@@ -149,7 +157,20 @@ def test_a_sentence_keeps_what_matters_most_of_the_advice():
     """If a RES sentence is cut at 128 characters, the larger direction is still in it."""
     detail = f"moved {advice((-12.5, 11.5), (4, 4))}"
     scores = np.array([0.98, 0.02])
-    v = Verdict(12345, 10**14, Status.OK, "plastic rough", 0.98, 0.96, scores, 1, 0, 400_000, "9f3c2a1b", detail)
+    v = Verdict(
+        12345,
+        10**14,
+        Status.OK,
+        "plastic rough",
+        0.98,
+        0.96,
+        scores,
+        1,
+        0,
+        400_000,
+        "9f3c2a1b",
+        detail,
+    )
     line = result(v, "usb")
     assert len(line) <= MAX_LINE
     assert b"moved 12.5 mm too far towards row 1" in line

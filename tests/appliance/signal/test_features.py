@@ -18,7 +18,8 @@ RATE, FRAMES = 750.0, 1500
 
 
 def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) -> np.ndarray:
-    """Raw counts uint8 [frames, rows, cols]: drift, a tone and noise, another mean on each taxel."""
+    """Raw counts uint8 [frames, rows, cols]: drift, a tone and noise, another mean on each
+    taxel."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None, None] / RATE
     level = rng.uniform(20, 120, (1, rows, cols))
@@ -40,14 +41,17 @@ def test_weights_are_equation_4() -> None:
     np.testing.assert_allclose(features.taxel_weights(x), want, rtol=1e-12)
 
 
-@pytest.mark.parametrize("counts", [np.zeros((5, 2, 2), np.uint8), np.full((5, 2, 2), -7, np.int16)])
+@pytest.mark.parametrize(
+    "counts", [np.zeros((5, 2, 2), np.uint8), np.full((5, 2, 2), -7, np.int16)]
+)
 def test_weights_without_contact_are_uniform(counts: np.ndarray) -> None:
     """Without activation, or with a negative one, all weights are 1 / M."""
     np.testing.assert_array_equal(features.taxel_weights(counts), [0.25] * 4)
 
 
 def test_a_negative_taxel_weighs_nothing() -> None:
-    """Means of 30, 10 and -39 would give weights of 30 and -39 if they were summed; the negative taxel is left out."""
+    """Means of 30, 10 and -39 would give weights of 30 and -39 if they were summed; the negative
+    taxel is left out."""
     x = np.array([[[30, 10, -39]]], np.int16)
     np.testing.assert_allclose(features.taxel_weights(x), [0.75, 0.25, 0])
 
@@ -56,8 +60,12 @@ def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
     """With three equal axes all features are those of one; shear alone changes no weight."""
     x = _sweep()
     three = np.stack([x, x, x], axis=-1)
-    np.testing.assert_allclose(features.taxel_weights(three).reshape(-1, 3).sum(axis=1), features.taxel_weights(x))
-    np.testing.assert_allclose(features.h_features(three, RATE), features.h_features(x, RATE), atol=1e-12)
+    np.testing.assert_allclose(
+        features.taxel_weights(three).reshape(-1, 3).sum(axis=1), features.taxel_weights(x)
+    )
+    np.testing.assert_allclose(
+        features.h_features(three, RATE), features.h_features(x, RATE), atol=1e-12
+    )
     roughness, *centroids = features.l_features(three, RATE)
     np.testing.assert_allclose(centroids, features.l_features(x, RATE)[1:])
     assert roughness == pytest.approx(features.l_features(x, RATE)[0] + math.log(3))
@@ -66,7 +74,8 @@ def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
 
 
 def _l_by_the_formula(x: np.ndarray) -> list[float]:
-    """Eq. 1 to 3 written out: one complex sum a bin and taxel, after scipy's removal of the trend."""
+    """Eq. 1 to 3 written out: one complex sum a bin and taxel, after scipy's removal of the
+    trend."""
     n = np.arange(len(x))
     series = scipy.signal.detrend(x.reshape(len(x), -1).astype(float), axis=0, type="linear").T
     means = x.reshape(len(x), -1).mean(axis=0)
@@ -91,10 +100,15 @@ def test_l_features_are_equations_1_to_3() -> None:
 
 
 def test_l_features_agree_with_a_periodogram_of_another_skin() -> None:
-    """3x3 taxels at 100 Hz in int16: the same numbers from scipy's periodogram, the upper band ending at 50 Hz."""
+    """3x3 taxels at 100 Hz in int16: the same numbers from scipy's periodogram, the upper band
+    ending at 50 Hz."""
     x = np.random.default_rng(2).integers(-200, 3000, (300, 3, 3)).astype(np.int16)
     hz, power = scipy.signal.periodogram(
-        x.reshape(300, 9).T.astype(float), 100.0, detrend="linear", return_onesided=False, scaling="spectrum"
+        x.reshape(300, 9).T.astype(float),
+        100.0,
+        detrend="linear",
+        return_onesided=False,
+        scaling="spectrum",
     )
     hz, power = np.abs(hz[:151]), power[:, :151] * 300
     weights = features.taxel_weights(x)
@@ -106,7 +120,8 @@ def test_l_features_agree_with_a_periodogram_of_another_skin() -> None:
 
 
 def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
-    """Eq. 5 written out for 1500 frames at 750 Hz, in whole 1/1500 s, so that no window edge hangs on rounding."""
+    """Eq. 5 written out for 1500 frames at 750 Hz, in whole 1/1500 s, so that no window edge hangs
+    on rounding."""
     n = np.arange(FRAMES)
     weights = x.reshape(FRAMES, -1).mean(axis=0) / x.reshape(FRAMES, -1).mean(axis=0).sum()
     p = np.zeros((40, 19))
@@ -116,20 +131,26 @@ def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
             less_mean = s[inside] - s[inside].mean()
             for k in range(1, 38):
                 turn = np.exp(-2j * np.pi * 10 * k * n[inside] / RATE)
-                p[window, k // 2] += weights[m] * abs(np.sum(turn * less_mean) / math.sqrt(FRAMES)) ** 2
+                p[window, k // 2] += (
+                    weights[m] * abs(np.sum(turn * less_mean) / math.sqrt(FRAMES)) ** 2
+                )
     return p / p.sum(axis=1, keepdims=True)
 
 
 def test_h_features_are_equation_5() -> None:
-    """All 760 numbers equal the paper's sum, with the mean taken off and two neighbouring bins a band."""
+    """All 760 numbers equal the paper's sum, with the mean taken off and two neighbouring bins a
+    band."""
     x = _sweep()
     assert features.h_shape(FRAMES, RATE) == (40, 19)
-    np.testing.assert_allclose(features.h_features(x, RATE).reshape(40, 19), _h_by_the_formula(x), atol=1e-12)
+    np.testing.assert_allclose(
+        features.h_features(x, RATE).reshape(40, 19), _h_by_the_formula(x), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(("window", "scipys"), [("rect", "boxcar"), ("hann", "hann")])
 def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
-    """At 1000 Hz steps are whole frames: all windows but the cut-off one equal scipy's; the bins end at 370 Hz."""
+    """At 1000 Hz steps are whole frames: all windows but the cut-off one equal scipy's; the bins
+    end at 370 Hz."""
     x = _sweep(2000)
     taxels = x.reshape(2000, -1).T.astype(float)
     _, _, spectrum = scipy.signal.spectrogram(
@@ -143,9 +164,12 @@ def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
     np.testing.assert_allclose(got[:39], want, atol=1e-12)
 
 
-@pytest.mark.parametrize(("rate_hz", "frames", "hz"), [(750.0, 1500, 133.0), (750.0, 1500, 361.5), (100.0, 200, 31.0)])
+@pytest.mark.parametrize(
+    ("rate_hz", "frames", "hz"), [(750.0, 1500, 133.0), (750.0, 1500, 361.5), (100.0, 200, 31.0)]
+)
 def test_a_tone_lands_in_its_band_and_centroid(rate_hz: float, frames: int, hz: float) -> None:
-    """c1 is the tone's frequency, and in every short window the band that holds it is the strongest."""
+    """c1 is the tone's frequency, and in every short window the band that holds it is the
+    strongest."""
     x = _tone(hz, rate_hz, frames)
     assert features.l_features(x, rate_hz)[1] == pytest.approx(hz, abs=0.5)
     for window in ("rect", "hann"):
@@ -162,7 +186,9 @@ def test_drift_does_not_leak_into_the_low_band() -> None:
     """A ramp of 60 counts changes none of the three features by more than rounding."""
     tone = _tone(11.0, RATE, FRAMES) + 10 * _tone(90.0, RATE, FRAMES, 1.0)
     ramp = np.linspace(-30, 30, FRAMES, dtype=np.float32).reshape(-1, 1, 1)
-    np.testing.assert_allclose(features.l_features(tone + ramp, RATE), features.l_features(tone, RATE), rtol=1e-5)
+    np.testing.assert_allclose(
+        features.l_features(tone + ramp, RATE), features.l_features(tone, RATE), rtol=1e-5
+    )
 
 
 def test_a_gain_adds_to_the_roughness_only() -> None:
@@ -170,7 +196,9 @@ def test_a_gain_adds_to_the_roughness_only() -> None:
     x = _sweep().astype(np.int16)
     small, large = features.l_features(x, RATE), features.l_features(3 * x, RATE)
     np.testing.assert_allclose(large - small, [2 * math.log(3), 0, 0], atol=1e-6)
-    np.testing.assert_allclose(features.h_features(3 * x, RATE), features.h_features(x, RATE), atol=1e-12)
+    np.testing.assert_allclose(
+        features.h_features(3 * x, RATE), features.h_features(x, RATE), atol=1e-12
+    )
 
 
 def test_the_order_of_taxels_does_not_matter() -> None:
@@ -178,7 +206,9 @@ def test_the_order_of_taxels_does_not_matter() -> None:
     x = _sweep()
     other = x[:, ::-1, ::-1].transpose(0, 2, 1)
     for kind in ("L", "H"):
-        np.testing.assert_allclose(features.compute(kind, other, RATE), features.compute(kind, x, RATE), rtol=1e-5)
+        np.testing.assert_allclose(
+            features.compute(kind, other, RATE), features.compute(kind, x, RATE), rtol=1e-5
+        )
 
 
 @pytest.mark.parametrize("level", [0, 255])
@@ -191,7 +221,8 @@ def test_a_silent_or_saturated_skin_has_finite_features(level: int) -> None:
 
 
 def test_a_band_without_a_bin_keeps_the_one_above_its_lower_edge() -> None:
-    """Ten frames at 750 Hz have bins 75 Hz apart, none of them from 2 to 20 Hz; at 30 Hz none lies above 15 Hz."""
+    """Ten frames at 750 Hz have bins 75 Hz apart, none of them from 2 to 20 Hz; at 30 Hz none lies
+    above 15 Hz."""
     x = _sweep(10)
     assert features.l_features(x, RATE)[2] == pytest.approx(75)
     assert features.l_features(x, 30.0)[1] == pytest.approx(15)
@@ -217,7 +248,8 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 @settings(max_examples=60, deadline=None)
 @given(_DIGITS, st.floats(20, 300))
 def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -> None:
-    """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0 to 1."""
+    """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0
+    to 1."""
     weights = features.taxel_weights(taxels)
     assert weights.sum() == pytest.approx(1)
     assert weights.min() >= 0
@@ -244,7 +276,8 @@ def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -
 def test_the_number_of_h_features_follows_from_frames_and_rate(
     frames: int, rate_hz: float, shape: tuple[int, int]
 ) -> None:
-    """Whole steps of 0.05 s times bands of 20 Hz up to 375 Hz or Nyquist, as many as `h_features` gives."""
+    """Whole steps of 0.05 s times bands of 20 Hz up to 375 Hz or Nyquist, as many as `h_features`
+    gives."""
     assert features.h_shape(frames, rate_hz) == shape
     assert len(features.h_features(np.ones((frames, 1, 1), np.uint8), rate_hz)) == math.prod(shape)
 
@@ -268,7 +301,9 @@ def test_dimensions_and_type_are_those_of_the_paper() -> None:
         ("H", (80, 4, 4), 12.0, "12 Hz is too slow for H-features; use at least 20 Hz"),
     ],
 )
-def test_what_cannot_be_computed_is_named(kind: str, shape: tuple[int, ...], rate_hz: float, message: str) -> None:
+def test_what_cannot_be_computed_is_named(
+    kind: str, shape: tuple[int, ...], rate_hz: float, message: str
+) -> None:
     """Each refusal is a FormatError with the value that was wrong."""
     with pytest.raises(FormatError, match=message):
         features.compute(kind, np.ones(shape, np.uint8), rate_hz)

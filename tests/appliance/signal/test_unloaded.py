@@ -1,4 +1,5 @@
-"""The unloaded skin is found in the stream: where it is lifted, only once it was touched, and without a guess."""
+"""The unloaded skin is found in the stream: where it is lifted, only once it was touched, and
+without a guess."""
 
 from __future__ import annotations
 
@@ -11,7 +12,9 @@ from appliance.signal.unloaded import UnloadedSkin, UnloadedTracker
 FORMAT = SweepFormat(4, 4, 100.0, 200, "uint16")
 
 
-def skin(level: float, noise: float, n: int = 200, seed: int = 0, shape: tuple[int, ...] = (4, 4)) -> np.ndarray:
+def skin(
+    level: float, noise: float, n: int = 200, seed: int = 0, shape: tuple[int, ...] = (4, 4)
+) -> np.ndarray:
     """Counts of a skin at one level [n, R, C]."""
     return np.rint(np.random.default_rng(seed).normal(level, noise, (n, *shape))).astype(np.uint16)
 
@@ -29,7 +32,9 @@ def tracked(*parts: np.ndarray, fmt: SweepFormat = FORMAT, packet: int = 7) -> U
 def test_it_is_the_skin_that_nothing_touches(first: str):
     """Whether the finger is there at first or not; it is certain once both were seen."""
     lifted, touched = skin(500, 3), skin(800, 40, seed=1)
-    found = tracked(*((lifted, touched, lifted) if first == "lifted" else (touched, lifted, touched)))
+    found = tracked(
+        *((lifted, touched, lifted) if first == "lifted" else (touched, lifted, touched))
+    )
     assert found.certain
     assert found.skin.level == pytest.approx(np.full((4, 4), 500), abs=6)
     assert 5 < found.skin.contact < 40
@@ -60,20 +65,24 @@ def test_a_tare_is_certain_and_stays():
 
 
 def test_whole_counts_have_a_least_difference():
-    """A skin whose noise lies below one count: two counts are a load; fractions have no such limit."""
+    """A skin whose noise lies below one count: two counts are a load; fractions have no such
+    limit."""
     still = np.full((50, 4, 4), 7, np.uint8)
     assert UnloadedSkin.measured(still).contact == 2
     assert UnloadedSkin.measured(still.astype(np.float32)).contact == 0
 
 
 def test_broken_taxels_do_not_count():
-    """One that gives no number, and one that is far noisier than the others, leave the threshold as it is."""
+    """One that gives no number, and one that is far noisier than the others, leave the threshold as
+    it is."""
     frames = skin(500, 3).astype(np.float32)
     whole = UnloadedSkin.measured(frames).contact
     frames[:, 0, 0] = np.nan
     frames[:, 1, 1] *= np.linspace(0, 2, len(frames))
     assert UnloadedSkin.measured(frames).contact == pytest.approx(whole, rel=0.1)
-    tracker = tracked(frames, skin(800, 40).astype(np.float32), fmt=SweepFormat(4, 4, 100.0, 200, "float32"))
+    tracker = tracked(
+        frames, skin(800, 40).astype(np.float32), fmt=SweepFormat(4, 4, 100.0, 200, "float32")
+    )
     assert tracker.certain
 
 

@@ -1,4 +1,5 @@
-"""Checks of a window without a model: each kind of fault is found and named, and any window gets a status."""
+"""Checks of a window without a model: each kind of fault is found and named, and any window gets a
+status."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def test_without_a_threshold_every_taxel_counts_as_loaded():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_taxel_that_gives_no_number_is_dead(value: float):
-    """One frame of it is enough, also at the edge, and for any number of dead taxels that the bundle tolerates."""
+    """One frame of it is enough, also at the edge, and for any number of dead taxels that the
+    bundle tolerates."""
     taxels = moving().astype(np.float32)
     taxels[150, 0, 3] = value
     found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
@@ -95,7 +97,8 @@ def sheared() -> np.ndarray:
     ],
 )
 def test_a_spoiled_axis_is_named(place, value: int, status: Status, detail: str):
-    """Each kind of fault on one axis or all of them; a taxel whose every axis is meant is named alone."""
+    """Each kind of fault on one axis or all of them; a taxel whose every axis is meant is named
+    alone."""
     taxels = sheared()
     assert inspect(taxels, SHEARED, THREE).status is Status.OK
     taxels[place] = value
@@ -120,7 +123,8 @@ def test_an_axis_that_gives_no_number_is_dead():
 
 
 def test_negative_full_scale_of_the_normal_axis_is_no_fault():
-    """A tared skin may be pulled; the normal axis is saturated at its upper end alone, as that of a skin of one axis."""
+    """A tared skin may be pulled; the normal axis is saturated at its upper end alone, as that of a
+    skin of one axis."""
     taxels = sheared()
     taxels[:, 3, 3, 2] = np.where(np.arange(300) % 2, -2000, -1999)
     assert inspect(taxels, SHEARED, THREE).status is Status.OK
@@ -139,9 +143,13 @@ def test_tare_counts():
 
 
 @given(
-    st.integers(1, 40), st.integers(1, 5), st.integers(1, 5), st.integers(1, 4), st.integers(0, 255),
+    st.integers(1, 40),
+    st.integers(1, 5),
+    st.integers(1, 5),
+    st.integers(1, 4),
+    st.integers(0, 255),
     st.integers(0, 2**32 - 1),
-)  # fmt: skip
+)
 def test_any_window_gets_a_status(n: int, rows: int, cols: int, axes: int, spread: int, seed: int):
     """Any counts of any shape, one frame long or constant: a status, never an error."""
     form = shape(rows, cols, axes)
@@ -149,7 +157,9 @@ def test_any_window_gets_a_status(n: int, rows: int, cols: int, axes: int, sprea
     assert inspect(taxels, np.zeros(form), LIMITS).status in Status
 
 
-UNLOADED = UnloadedSkin.measured(np.random.default_rng(1).integers(9, 12, (100, 4, 4)).astype(np.uint8))
+UNLOADED = UnloadedSkin.measured(
+    np.random.default_rng(1).integers(9, 12, (100, 4, 4)).astype(np.uint8)
+)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +172,8 @@ UNLOADED = UnloadedSkin.measured(np.random.default_rng(1).integers(9, 12, (100, 
     ],
 )
 def test_faults_are_found_without_a_bundle(place, value: int, status: Status, detail: str):
-    """Contact, stuck and dead taxels by comparison with the unloaded skin, saturation by the highest count."""
+    """Contact, stuck and dead taxels by comparison with the unloaded skin, saturation by the
+    highest count."""
     taxels = moving()
     assert inspect_bare(taxels, UNLOADED).status is Status.OK
     taxels[place] = value
@@ -179,21 +190,26 @@ def test_a_skin_whose_counts_fall_under_load():
 
 
 def test_what_vibrates_is_touched():
-    """Also if its mean is that of a stretch that was taken for the unloaded skin, such as a finger at rest."""
+    """Also if its mean is that of a stretch that was taken for the unloaded skin, such as a finger
+    at rest."""
     at_rest = UnloadedSkin(np.full((4, 4), 80.0), np.full((4, 4), 0.3), 2.0)
     assert inspect_bare(moving(80), at_rest).status is Status.OK
 
 
-@pytest.mark.parametrize(("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)])
+@pytest.mark.parametrize(
+    ("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)]
+)
 def test_the_full_scale_of_usual_converters(bits: int, status: Status):
-    """Counts of ten bits in sixteen are saturated at 1023; a limit that no usual converter has is not guessed."""
+    """Counts of ten bits in sixteen are saturated at 1023; a limit that no usual converter has is
+    not guessed."""
     taxels = moving().astype(np.uint16)
     taxels[::10, 1:3, 1:3] = 2**bits - 1
     assert inspect_bare(taxels, UNLOADED).status is status
 
 
 def test_a_weak_contact_at_the_edge_is_no_fault():
-    """Taxels beside the contact, constant at a little more than nothing, are neither stuck nor dead."""
+    """Taxels beside the contact, constant at a little more than nothing, are neither stuck nor
+    dead."""
     taxels = moving(120)
     taxels[:, 3] = 13
     assert inspect_bare(taxels, UNLOADED).status is Status.OK

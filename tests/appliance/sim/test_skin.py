@@ -1,4 +1,5 @@
-"""Tests of the simulated finger and skin (`appliance.sim.skin`): shapes, what each effect does alone, and the sets."""
+"""Tests of the simulated finger and skin (`appliance.sim.skin`): shapes, what each effect does
+alone, and the sets."""
 
 from __future__ import annotations
 
@@ -28,22 +29,29 @@ def rng(seed: int = 3) -> np.random.Generator:
 def centre(frames: np.ndarray) -> np.ndarray:
     """Pressure centre (row, column) of frames [n, 4, 4]."""
     load = frames.mean(0, dtype=float)
-    return np.array([(load.sum(1) * np.arange(4)).sum(), (load.sum(0) * np.arange(4)).sum()]) / load.sum()
+    return (
+        np.array([(load.sum(1) * np.arange(4)).sum(), (load.sum(0) * np.arange(4)).sum()])
+        / load.sum()
+    )
 
 
 SHEAR = World(shear=True)
 
 
 def test_the_normal_axis_of_a_skin_with_shear_is_that_without() -> None:
-    """Same finger, same random numbers: but for the readout's noise the pressure is the same; shear only adds axes."""
+    """Same finger, same random numbers: but for the readout's noise the pressure is the same; shear
+    only adds axes."""
     off = frozenset({"noise"})
-    plain, three = (skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True))
+    plain, three = (
+        skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True)
+    )
     assert (plain.dtype, three.dtype, three.shape) == (np.uint8, np.int16, (*plain.shape, 3))
     np.testing.assert_array_equal(three[..., 2], plain)
 
 
 def test_friction_pulls_against_the_motion_while_the_finger_slides() -> None:
-    """Without relief the shear along the rows is 0.4 of the pressure and negative; before and after the slide it is 0."""
+    """Without relief the shear along the rows is 0.4 of the pressure and negative; before and after
+    the slide it is 0."""
     frames = skin.sweep("metal", PLACE, rng(), replace(only("position"), shear=True)).astype(float)
     along, normal = frames[..., 0], frames[..., 2]
     slides = slice(225, 225 + 2250)
@@ -56,9 +64,14 @@ def test_friction_pulls_against_the_motion_while_the_finger_slides() -> None:
 
 
 def test_a_steeper_relief_shears_more() -> None:
-    """Shear along the rows is the pressure times the slope of the relief, that is, the change of the normal axis."""
-    world = World(off=frozenset(EFFECTS) - {"texture"}, shear=True, counts_per_kpa=100.0, friction=0.0)
-    smooth, rough = (skin.window(m, Placement(), rng(), world).astype(float) for m in ("metal", "plastic rough"))
+    """Shear along the rows is the pressure times the slope of the relief, that is, the change of
+    the normal axis."""
+    world = World(
+        off=frozenset(EFFECTS) - {"texture"}, shear=True, counts_per_kpa=100.0, friction=0.0
+    )
+    smooth, rough = (
+        skin.window(m, Placement(), rng(), world).astype(float) for m in ("metal", "plastic rough")
+    )
     assert rough[..., 0].std(0).mean() > 10 * smooth[..., 0].std(0).mean()
     along, normal = rough[:, 1, 1, 0], rough[:, 1, 1, 2]
     assert np.corrcoef(along[1:] / normal[1:], np.diff(normal))[0, 1] < -0.9
@@ -88,7 +101,10 @@ def test_a_sweep_rests_slides_and_rests(material: str) -> None:
 
 def test_lengths_of_rest_and_slide_are_taken_from_the_caller() -> None:
     """Seconds become frames at 750 Hz."""
-    assert len(skin.sweep("wood", PLACE, rng(), rest_s=0.1, slide_s=0.4, after_s=0.2)) == 75 + 300 + 150
+    assert (
+        len(skin.sweep("wood", PLACE, rng(), rest_s=0.1, slide_s=0.4, after_s=0.2))
+        == 75 + 300 + 150
+    )
 
 
 def test_the_same_seed_gives_the_same_counts() -> None:
@@ -124,7 +140,8 @@ def test_without_effects_the_load_is_constant_and_centred() -> None:
 def test_every_effect_changes_the_signal(effect: str) -> None:
     """Removing any one effect changes the counts."""
     assert not np.array_equal(
-        skin.sweep("paper", PLACE, rng()), skin.sweep("paper", PLACE, rng(), World(off=frozenset({effect})))
+        skin.sweep("paper", PLACE, rng()),
+        skin.sweep("paper", PLACE, rng(), World(off=frozenset({effect}))),
     )
 
 
@@ -135,8 +152,18 @@ def test_every_effect_changes_the_signal(effect: str) -> None:
         ("attachment", lambda w: skin.attachment(PLACE, w)[0]),
         ("drift", lambda w: skin.drift(1500, rng(), w)),
         ("spot", lambda w: skin.spot(w.tube("wood"), rng(), w).vibration_hz),
-        ("texture", lambda w: skin.texture(w.tube("wood"), *skin.position(PLACE, STILL)[:1], np.arange(9), rng(), w)),
-        ("vibration", lambda w: skin.vibration(w.tube("wood"), np.zeros(1), np.zeros(7), np.ones(99, bool), rng(), w)),
+        (
+            "texture",
+            lambda w: skin.texture(
+                w.tube("wood"), *skin.position(PLACE, STILL)[:1], np.arange(9), rng(), w
+            ),
+        ),
+        (
+            "vibration",
+            lambda w: skin.vibration(
+                w.tube("wood"), np.zeros(1), np.zeros(7), np.ones(99, bool), rng(), w
+            ),
+        ),
         ("noise", lambda w: skin.noise(99, rng(), w)),
     ],
 )
@@ -150,19 +177,22 @@ def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
 
 @pytest.mark.parametrize("effect", ["drift", "spot", "texture", "vibration"])
 def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect: str) -> None:
-    """The readout noise, as the difference with and without it, is the same with and without another effect."""
+    """The readout noise, as the difference with and without it, is the same with and without
+    another effect."""
     loud = World(noise_counts=2.0)
     noisy, clean = (replace(loud, off=frozenset(off)) for off in ({effect}, {effect, "noise"}))
     added = [skin.window("metal", PLACE, rng(), w).astype(float) for w in (noisy, clean)]
     drawn = [
-        skin.window("metal", PLACE, rng(), w).astype(float) for w in (loud, replace(loud, off=frozenset({"noise"})))
+        skin.window("metal", PLACE, rng(), w).astype(float)
+        for w in (loud, replace(loud, off=frozenset({"noise"})))
     ]
     alike = np.corrcoef((added[0] - added[1]).ravel(), (drawn[0] - drawn[1]).ravel())[0, 1]
     assert alike > 0.9  # not 1: each of the four is rounded to whole digits
 
 
 def test_noise_alone_is_white_and_has_its_standard_deviation() -> None:
-    """Noise differs between taxels and has the standard deviation of the World, plus that of rounding."""
+    """Noise differs between taxels and has the standard deviation of the World, plus that of
+    rounding."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
     assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_counts, 12**-0.5), rel=0.05)
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
@@ -178,11 +208,14 @@ def test_vibration_alone_shakes_all_taxels_together_by_their_pressure() -> None:
 
 
 def test_vibration_is_where_the_material_puts_it() -> None:
-    """The metal's vibration lies higher than the foam's, and reaches up to half the sampling rate for some tube."""
+    """The metal's vibration lies higher than the foam's, and reaches up to half the sampling rate
+    for some tube."""
     spectra = {}
     for material in MATERIALS:
         moving, no_colour = np.ones(1500, bool), np.zeros(7)
-        shake = skin.vibration(World().tube(material), np.zeros((4, 4)), no_colour, moving, rng(), World())
+        shake = skin.vibration(
+            World().tube(material), np.zeros((4, 4)), no_colour, moving, rng(), World()
+        )
         spectra[material] = abs(np.fft.rfft(shake.ravel())) ** 2
     hz = np.fft.rfftfreq(1500, 1 / FORMAT.rate_hz)
     mean_hz = {m: (p * hz).sum() / p.sum() for m, p in spectra.items()}
@@ -195,7 +228,9 @@ def test_the_pad_damps_vibration_more_further_forward() -> None:
     """A skin one row forward gets less of the high vibrations than one in the middle."""
     power = []
     for dx_mm in (0.0, skin.PITCH_MM):
-        frames = skin.window("metal", Placement(dx_mm), rng(), only("position", "vibration"))[:, 1, 1:3].astype(float)
+        frames = skin.window("metal", Placement(dx_mm), rng(), only("position", "vibration"))[
+            :, 1, 1:3
+        ].astype(float)
         power.append(frames.std(0).mean() / frames.mean())
     assert power[1] < 0.75 * power[0]
 
@@ -211,7 +246,8 @@ def test_the_relief_is_higher_further_forward() -> None:
 
 
 def test_rows_see_the_texture_one_after_another() -> None:
-    """Row 2 of the rough tube shows what row 3 showed 100 frames (4 mm at 3 cm/s) before; columns differ."""
+    """Row 2 of the rough tube shows what row 3 showed 100 frames (4 mm at 3 cm/s) before; columns
+    differ."""
     frames = skin.window("plastic rough", Placement(), rng(), only("texture")).astype(float)
     frames -= frames.mean(0)
     lags = np.arange(-200, 201)
@@ -235,7 +271,8 @@ def test_a_taxel_averages_the_texture_over_its_length() -> None:
 
 
 def test_force_keeps_within_a_fifth() -> None:
-    """For any error of the controller forces stay within 20 % of 1 N; they differ between sweeps and vary slowly."""
+    """For any error of the controller forces stay within 20 % of 1 N; they differ between sweeps
+    and vary slowly."""
     for world in (World(), World(force_spread=0.5)):
         force = np.array([skin.drift(1500, rng(seed), world) for seed in range(40)])
         assert force.min() >= 0.8
@@ -246,7 +283,8 @@ def test_force_keeps_within_a_fifth() -> None:
 
 @pytest.mark.parametrize("kpa_per_mm", [2.0, 4.0])
 def test_the_springs_carry_the_force(kpa_per_mm: float) -> None:
-    """Pressure summed over the whole patch is the force that presses; a softer bed sinks in deeper."""
+    """Pressure summed over the whole patch is the force that presses; a softer bed sinks in
+    deeper."""
     force = np.array([0.8, 1.0, 1.2])
     depth = skin.indentation(force, kpa_per_mm, World())
     x, y = np.meshgrid(np.linspace(-15, 15, 301), np.linspace(-15, 15, 301))
@@ -278,7 +316,9 @@ def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead() -> None:
 
 def test_softer_tubes_spread_the_pressure() -> None:
     """Foam presses the middle of the skin less than metal does, at the same force."""
-    metal, foam = (skin.window(m, Placement(), rng(), STILL)[0].astype(float) for m in ("metal", "foam"))
+    metal, foam = (
+        skin.window(m, Placement(), rng(), STILL)[0].astype(float) for m in ("metal", "foam")
+    )
     assert foam[1, 1] / foam[0, 0] < metal[1, 1] / metal[0, 0]
     assert foam.max() < metal.max()
 
@@ -286,7 +326,8 @@ def test_softer_tubes_spread_the_pressure() -> None:
 def test_reattaching_changes_the_load_but_not_the_position() -> None:
     """Another seed of the placement gives other gains; the same seed the same."""
     first, again, other = (
-        skin.window("wood", Placement(seed=s), rng(), only("attachment"))[0].astype(float) for s in (1, 1, 2)
+        skin.window("wood", Placement(seed=s), rng(), only("attachment"))[0].astype(float)
+        for s in (1, 1, 2)
     )
     assert np.array_equal(first, again)
     assert abs(first - other).mean() > 3
@@ -313,7 +354,9 @@ def test_loads_are_in_the_range_of_the_converter(name: skin.SetName) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "places", "each"), [("T-LAB", 1, 40), ("T-REAL", 9, 10), ("T-HARD", 1, 10)])
+@pytest.mark.parametrize(
+    ("name", "places", "each"), [("T-LAB", 1, 40), ("T-REAL", 9, 10), ("T-HARD", 1, 10)]
+)
 def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int) -> None:
     """Every tube is swept equally often at every position."""
     samples, labels, positions = skin.sweep_set(name, 5)
@@ -326,7 +369,8 @@ def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int)
 
 
 def test_positions_are_those_of_the_paper() -> None:
-    """T-REAL has nine positions within 1 mm, T-HARD one a row further forward, and no two share an attachment."""
+    """T-REAL has nine positions within 1 mm, T-HARD one a row further forward, and no two share an
+    attachment."""
     lab, real, hard = (skin.placements(name, 5) for name in ("T-LAB", "T-REAL", "T-HARD"))
     assert [len(lab), len(real), len(hard)] == [1, 9, 1]
     assert max(np.hypot(p.dx_mm, p.dy_mm) for p in lab + real) <= 1

@@ -1,4 +1,5 @@
-"""`palpate bench`: the keys of its JSON, and the parts that are measured in processes of their own."""
+"""`palpate bench`: the keys of its JSON, and the parts that are measured in processes of their
+own."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ from appliance.tools import bench, bench_process
 
 
 @pytest.mark.slow
-def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_bench_writes_its_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
     for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
         monkeypatch.setattr(bench, name, value)
@@ -45,7 +48,9 @@ def test_bench_writes_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_bench_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def test_bench_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """Memory and processor share, in short."""
     monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
     monkeypatch.setattr(bench_process, "STREAM_S", 0.5)

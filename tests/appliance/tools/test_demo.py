@@ -45,26 +45,35 @@ def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
 
 
 def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
-    """A set of three materials in the order of a file: all of the first, then all of the next. The name of its script."""
+    """A set of three materials in the order of a file: all of the first, then all of the next. The
+    name of its script."""
     samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
     np.savez(
-        folder / "s.npz", samples=samples, labels=np.repeat(np.arange(3), each), materials=["a", "b", "c"],
-        rate_hz=bundle.format.rate_hz, group_recording=np.repeat(np.arange(3), each),
-    )  # fmt: skip
+        folder / "s.npz",
+        samples=samples,
+        labels=np.repeat(np.arange(3), each),
+        materials=["a", "b", "c"],
+        rate_hz=bundle.format.rate_hz,
+        group_recording=np.repeat(np.arange(3), each),
+    )
     return f"replay:{folder / 's.npz'}"
 
 
 def test_demo_of_a_set_shows_its_materials_in_turn(
     tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
 ):
-    """Three sweeps of a set of three materials show each once, also where the file has them one after another."""
+    """Three sweeps of a set of three materials show each once, also where the file has them one
+    after another."""
     assert main(["demo", *VIRTUAL, "--sim", played_set(tmp_path, default_bundle)]) == 0
     named = [line.split()[1] for line in capsys.readouterr().out.splitlines() if " -> " in line]
     assert sorted(named) == ["a", "b", "c"]
 
 
-def test_demo_of_a_set_ends_with_the_set(tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]):
-    """More sweeps are asked for than there are: all are shown, then the table, and the exit code is 0."""
+def test_demo_of_a_set_ends_with_the_set(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """More sweeps are asked for than there are: all are shown, then the table, and the exit code is
+    0."""
     which = ["--sim", played_set(tmp_path, default_bundle, 1), "--sweeps", "50"]
     assert main(["demo", "--virtual", *which]) == 0
     out = capsys.readouterr().out
@@ -75,16 +84,21 @@ def test_demo_of_a_set_ends_with_the_set(tmp_path: Path, default_bundle: Bundle,
 def test_materials_that_the_bundle_never_learnt_are_counted_apart(
     tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
 ):
-    """A bundle of two of the simulated materials: the others are no wrong answers, and `unknown` is what they should be."""
+    """A bundle of two of the simulated materials: the others are no wrong answers, and `unknown` is
+    what they should be."""
     files = bundle.files(bundle.DEFAULT)
     names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
     names[:2] = default_bundle.manifest.labels[:2]
     text = replace(default_bundle.manifest, labels=tuple(names)).json()
     folder = deliveries.put(tmp_path / "few", files | {bundle.MANIFEST: text})
-    assert main(["demo", "--virtual", "--sweeps", "12", "--set", f"classifier.bundle={folder}"]) == 0
+    assert (
+        main(["demo", "--virtual", "--sweeps", "12", "--set", f"classifier.bundle={folder}"]) == 0
+    )
     out = capsys.readouterr().out
     table = out[out.index("right / all") :].splitlines()
-    assert sorted(line.split()[0] for line in table[1:3]) == sorted(name.split()[0] for name in names[:2])
+    assert sorted(line.split()[0] for line in table[1:3]) == sorted(
+        name.split()[0] for name in names[:2]
+    )
     assert table[3].split()[:5] == ["all", "sweeps", "4", "/", "4"]
     others = ", ".join(sorted(set(default_bundle.manifest.labels[2:])))
     assert f"not in the bundle: 0 of 8 sweeps called unknown ({others})" in out
@@ -92,9 +106,13 @@ def test_materials_that_the_bundle_never_learnt_are_counted_apart(
 
 
 def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
-    tmp_path: Path, default_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    default_bundle: Bundle,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
-    """On an installed box what was deployed is for user palpate alone: said, with what to do, and the demo plays."""
+    """On an installed box what was deployed is for user palpate alone: said, with what to do, and
+    the demo plays."""
 
     def refused(path: object) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))

@@ -13,7 +13,20 @@ from appliance.tools.score import AnswerScore
 
 def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:
     """One that went through its sentence."""
-    v = Verdict(number, 10**9, status, label, 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 1_500_000, "9f3c2a1b", share=share)
+    v = Verdict(
+        number,
+        10**9,
+        status,
+        label,
+        0.9,
+        0.8,
+        np.array([0.9, 0.1]),
+        1,
+        0,
+        1_500_000,
+        "9f3c2a1b",
+        share=share,
+    )
     read = Answer.read(result(v, "sim").decode().strip())
     assert read
     return read
@@ -25,10 +38,19 @@ def act(label: str, *, new_object: bool = False) -> Act:
 
 
 def test_only_ok_with_the_right_label_counts():
-    """Another label, and the right one that is unsure, are wrong; percentages have their intervals."""
+    """Another label, and the right one that is unsure, are wrong; percentages have their
+    intervals."""
     score = AnswerScore(frozenset({"wood", "paper"}))
-    answers = [answer(1, "wood"), answer(2, "wood"), answer(3, "wood", Status.UNSURE), answer(4, "wood", share=0.5)]
-    right = [score.add(act(name), one) for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)]
+    answers = [
+        answer(1, "wood"),
+        answer(2, "wood"),
+        answer(3, "wood", Status.UNSURE),
+        answer(4, "wood", share=0.5),
+    ]
+    right = [
+        score.add(act(name), one)
+        for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)
+    ]
     assert right == [True, False, False, True]
     assert score.table()[1:] == [
         "  paper               0 / 1",

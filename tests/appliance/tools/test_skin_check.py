@@ -1,4 +1,5 @@
-"""Conformance of readout boards: a sound one passes over each link, and each fault is found, named and told apart."""
+"""Conformance of readout boards: a sound one passes over each link, and each fault is found, named
+and told apart."""
 
 from __future__ import annotations
 
@@ -22,8 +23,19 @@ from tests.factories import pico
 from tests.factories.simulated_box import idle_devices
 
 PARTS = (
-    "identity", "format", "start", "crc", "packets", "sequence", "loss", "rate", "clock", "requests", "overflow", "stop",
-)  # fmt: skip
+    "identity",
+    "format",
+    "start",
+    "crc",
+    "packets",
+    "sequence",
+    "loss",
+    "rate",
+    "clock",
+    "requests",
+    "overflow",
+    "stop",
+)
 Fault = Callable[[SimDevices], object]
 
 
@@ -50,7 +62,9 @@ def of_packets(change: Callable[[packets.Packet], packets.Packet]) -> Fault:
 
 def of_crc(crc: Callable[[bytes], bytes]) -> Fault:
     """Each packet with another CRC."""
-    return lambda simulated: setattr(simulated.backend, "mangle", lambda data: data[:-4] + crc(data[:-4]))
+    return lambda simulated: setattr(
+        simulated.backend, "mangle", lambda data: data[:-4] + crc(data[:-4])
+    )
 
 
 def of_bytes(change: Callable[[bytes], bytes]) -> Fault:
@@ -83,7 +97,8 @@ def of_requests(change: Callable[[rig.Board, int], bool]) -> Fault:
 def of_format(**changes: object) -> Fault:
     """FORMAT tells of something else than what is sent."""
     return lambda simulated: of_replies(
-        packets.Request.FORMAT, lambda _: packets.pack_format(replace(simulated.backend.board.skin, **changes))
+        packets.Request.FORMAT,
+        lambda _: packets.pack_format(replace(simulated.backend.board.skin, **changes)),
     )(simulated)
 
 
@@ -130,47 +145,117 @@ def inverse(data: bytes) -> bytes:
 
 FAULTS: dict[str, tuple[Fault, str, str]] = {
     "short identity": (of_replies(1, lambda r: r[:20]), "identity", "identity of 20 bytes"),
-    "other version": (of_replies(1, lambda r: b"\2" + r[1:]), "identity", "protocol version 2; byte 0 must be 1"),
-    "no name": (of_replies(1, lambda r: r[:4] + bytes(16) + r[20:]), "identity", "the board's name is empty"),
+    "other version": (
+        of_replies(1, lambda r: b"\2" + r[1:]),
+        "identity",
+        "protocol version 2; byte 0 must be 1",
+    ),
+    "no name": (
+        of_replies(1, lambda r: r[:4] + bytes(16) + r[20:]),
+        "identity",
+        "the board's name is empty",
+    ),
     "short format": (of_replies(2, lambda r: r[:8]), "format", "format of 8 bytes"),
     "unknown type": (of_replies(2, lambda r: r[:2] + b"\7" + r[3:]), "format", "data type 7"),
     "rate 0": (of_format(rate_hz=0), "format", "a rate of 0.0 Hz"),
     "small FIFO": (of_format(fifo_frames=100), "format", "the FIFO must hold 0.25 s"),
-    "no frames in a packet": (of_format(packet_frames=0), "format", "0 bytes a packet; use 1 to 4096"),
+    "no frames in a packet": (
+        of_format(packet_frames=0),
+        "format",
+        "0 bytes a packet; use 1 to 4096",
+    ),
     "large packets": (of_format(packet_frames=300), "format", "4800 bytes a packet; use 1 to 4096"),
-    "sends unasked": (of_requests(lambda b, n: n == 4 and setattr(b, "running", True) is None), "start", "sends before START"),
+    "sends unasked": (
+        of_requests(lambda b, n: n == 4 and setattr(b, "running", True) is None),
+        "start",
+        "sends before START",
+    ),
     "never starts": (of_requests(lambda b, n: n == 3), "start", "no byte within 1 s of START"),
-    "big-endian CRC": (of_crc(lambda d: struct.pack(">I", zlib.crc32(d))), "crc", "big-endian; send its lowest byte"),
+    "big-endian CRC": (
+        of_crc(lambda d: struct.pack(">I", zlib.crc32(d))),
+        "crc",
+        "big-endian; send its lowest byte",
+    ),
     "CRC not inverted": (of_crc(inverse), "crc", "lacks the inversion"),
-    "CRC of the payload": (of_crc(lambda d: struct.pack("<I", zlib.crc32(d[20:]))), "crc", "that of the payload"),
+    "CRC of the payload": (
+        of_crc(lambda d: struct.pack("<I", zlib.crc32(d[20:]))),
+        "crc",
+        "that of the payload",
+    ),
     "no CRC": (of_crc(lambda d: bytes(4)), "crc", "the CRC is 0"),
     "other CRC": (of_crc(lambda d: b"\1\2\3\4"), "crc", "each packet begins with 50 C1 01 00"),
-    "text between packets": (of_bytes(every(50, lambda d: b"debug: 17\n" + d)), "crc", "nothing else prints to this port"),
-    "bytes lost": (of_bytes(every(50, lambda d: d[:30] + d[31:])), "crc", "bytes were lost or added"),
-    "other grid": (of_packets(lambda p: replace(p, taxels=p.taxels.reshape(-1, 2, 8))), "packets", "it sends 2x8 uint8"),
+    "text between packets": (
+        of_bytes(every(50, lambda d: b"debug: 17\n" + d)),
+        "crc",
+        "nothing else prints to this port",
+    ),
+    "bytes lost": (
+        of_bytes(every(50, lambda d: d[:30] + d[31:])),
+        "crc",
+        "bytes were lost or added",
+    ),
+    "other grid": (
+        of_packets(lambda p: replace(p, taxels=p.taxels.reshape(-1, 2, 8))),
+        "packets",
+        "it sends 2x8 uint8",
+    ),
     "more frames": (of_format(packet_frames=2), "packets", "4 frames in a packet, FORMAT says 2"),
-    "counts packets": (of_packets(lambda p: replace(p, seq=p.seq // 4)), "sequence", "it counts packets"),
-    "number stands": (of_packets(lambda p: replace(p, seq=7)), "sequence", "the number never changes"),
+    "counts packets": (
+        of_packets(lambda p: replace(p, seq=p.seq // 4)),
+        "sequence",
+        "it counts packets",
+    ),
+    "number stands": (
+        of_packets(lambda p: replace(p, seq=7)),
+        "sequence",
+        "the number never changes",
+    ),
     "number restarts": (restarting, "sequence", "restarts of the count"),
     "packets lost": (of_bytes(every(10, lambda d: b"")), "loss", "no packet tells of an overflow"),
     "rate too high": (of_format(rate_hz=800.0), "rate", "FORMAT says 800 Hz: -6.25 %"),
     "rate too low": (of_format(rate_hz=700.0), "rate", "FORMAT says 700 Hz: +7.1"),
-    "clock of milliseconds": (of_packets(lambda p: replace(p, t_us=p.t_us // 1000)), "clock", "count microseconds"),
-    "clock runs fast": (of_packets(lambda p: replace(p, t_us=round(p.t_us * 1.001))), "clock", "+1000 ppm"),
+    "clock of milliseconds": (
+        of_packets(lambda p: replace(p, t_us=p.t_us // 1000)),
+        "clock",
+        "count microseconds",
+    ),
+    "clock runs fast": (
+        of_packets(lambda p: replace(p, t_us=round(p.t_us * 1.001))),
+        "clock",
+        "+1000 ppm",
+    ),
     "clock jumps": (
-        of_packets(lambda p: replace(p, t_us=p.t_us + 30_000 * (p.seq // 100 % 7 == 3))), "clock", "the skin's clock went on",
+        of_packets(lambda p: replace(p, t_us=p.t_us + 30_000 * (p.seq // 100 % 7 == 3))),
+        "clock",
+        "the skin's clock went on",
     ),
     "unknown request stops it": (
-        of_requests(lambda b, n: n == 0x51 and b.request(4) is None), "requests", "leave unknown requests alone",
+        of_requests(lambda b, n: n == 0x51 and b.request(4) is None),
+        "requests",
+        "leave unknown requests alone",
     ),
-    "flag always": (of_packets(lambda p: replace(p, flags=2)), "overflow", "while no frame is missing"),
-    "flag never": (of_packets(lambda p: replace(p, flags=0)), "overflow", "set bit 1 of byte 6 in the next packet"),
+    "flag always": (
+        of_packets(lambda p: replace(p, flags=2)),
+        "overflow",
+        "while no frame is missing",
+    ),
+    "flag never": (
+        of_packets(lambda p: replace(p, flags=0)),
+        "overflow",
+        "set bit 1 of byte 6 in the next packet",
+    ),
     "newest dropped": (newest_dropped, "overflow", "drop the oldest frames, not the newest"),
-    "FIFO smaller than it says": (of_format(fifo_frames=1500), "overflow", "s were kept, FORMAT says 2.00 s"),
-    "goes on after STOP": (
-        of_requests(lambda b, n: n == 4 and b.due_ns() is not None), "stop", "frames come after STOP",
+    "FIFO smaller than it says": (
+        of_format(fifo_frames=1500),
+        "overflow",
+        "s were kept, FORMAT says 2.00 s",
     ),
-}  # fmt: skip
+    "goes on after STOP": (
+        of_requests(lambda b, n: n == 4 and b.due_ns() is not None),
+        "stop",
+        "frames come after STOP",
+    ),
+}
 """What is wrong, the part that must fail, and words of its line."""
 
 
@@ -200,9 +285,17 @@ def test_each_fault_is_found(fault: Fault, part: str, words: str):
     assert found[part].verdict == "FAIL", found
     assert words in found[part].detail
     depends = {
-        "format": PARTS, "crc": PARTS, "packets": ("rate", "clock"), "sequence": ("start", *PARTS[4:]), "loss": ("overflow",),
-        "rate": ("clock", "overflow"), "clock": ("overflow",), "start": PARTS, "identity": (), "requests": PARTS[10:],
-    }.get(part, ())  # fmt: skip
+        "format": PARTS,
+        "crc": PARTS,
+        "packets": ("rate", "clock"),
+        "sequence": ("start", *PARTS[4:]),
+        "loss": ("overflow",),
+        "rate": ("clock", "overflow"),
+        "clock": ("overflow",),
+        "start": PARTS,
+        "identity": (),
+        "requests": PARTS[10:],
+    }.get(part, ())
     others = {name: f for name, f in found.items() if name != part and name not in depends}
     assert not {name: f for name, f in others.items() if f.verdict == "FAIL"}
 
@@ -223,7 +316,8 @@ def test_no_reply_while_frames_are_sent_is_found():
 
 
 def test_what_cannot_be_decided_is_unknown():
-    """Too short a time for the clock; packets that arrive with much jitter; a FIFO that does not run over."""
+    """Too short a time for the clock; packets that arrive with much jitter; a FIFO that does not
+    run over."""
     found = findings(idle_devices(), seconds=0.02)
     assert (found["rate"].verdict, found["clock"].verdict) == ("unknown", "unknown")
     assert "listen longer with --seconds" in found["clock"].detail
@@ -255,7 +349,9 @@ class EchoLink:
         """No reply."""
         self.sent += bytes([request])
         if length:
-            raise SensorMismatch(f"the skin sends 1 other bytes but does not answer request {request.name}")
+            raise SensorMismatch(
+                f"the skin sends 1 other bytes but does not answer request {request.name}"
+            )
         return b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
@@ -272,14 +368,21 @@ def test_another_device_at_the_port_is_told_apart():
     """It answers nothing, and its bytes are no packets: no part is ok, and the check ends."""
     link = EchoLink()
     found = {f.part: f for f in skin_check.check(link, link.clock, 5, port=True)}
-    assert [found[part].verdict for part in ("identity", "format", "start")] == ["FAIL", "FAIL", "unknown"]
+    assert [found[part].verdict for part in ("identity", "format", "start")] == [
+        "FAIL",
+        "FAIL",
+        "unknown",
+    ]
     assert "does not answer request FORMAT" in found["format"].detail
     assert found["start"].detail.startswith("1 bytes came after it, and no whole packet")
     assert not [f for f in found.values() if f.verdict == "ok"]
 
 
-def of_a_port(capsys: pytest.CaptureFixture[str], port: str, *options: str) -> dict[str, tuple[str, str]]:
-    """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial port."""
+def of_a_port(
+    capsys: pytest.CaptureFixture[str], port: str, *options: str
+) -> dict[str, tuple[str, str]]:
+    """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial
+    port."""
     sets = ("--set", "sensor.link=serial", "--set", f"sensor.port={port}")
     ended = main(["skin", "check", *sets, *options])
     lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
@@ -289,7 +392,8 @@ def of_a_port(capsys: pytest.CaptureFixture[str], port: str, *options: str) -> d
 
 @pytest.mark.slow
 def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
-    """The reference firmware under MicroPython, at a serial port: nothing that a busy machine has no part in fails."""
+    """The reference firmware under MicroPython, at a serial port: nothing that a busy machine has
+    no part in fails."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=200, DTYPE="uint16", FIFO_S=0.5) as port:
         found = of_a_port(capsys, port, "--seconds", "2")
     assert tuple(found) == PARTS
@@ -299,7 +403,8 @@ def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
 
 @pytest.mark.slow
 def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
-    """Every tenth interrupt comes 20 ms late: frames are missing though all was read, and count and clock still agree."""
+    """Every tenth interrupt comes 20 ms late: frames are missing though all was read, and count and
+    clock still agree."""
     with pico.plugged_in(RATE_HZ=200, late_ms=20, late_every=10) as port:
         found = of_a_port(capsys, port, "--seconds", "3")
     verdict, detail = found["loss"]

@@ -1,5 +1,5 @@
-"""`palpate skin detect` and `skin list`: every delivered skin is found by its ids or by listening; nothing is written to a port
-unasked."""
+"""`palpate skin detect` and `skin list`: every delivered skin is found by its ids or by listening;
+nothing is written to a port unasked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ PROFILES = {name: skin_profile.load(name, [FOLDER]) for name in ["palpate", *NAM
 PORT = PortInfo("/dev/ttyUSB0", 0x1A86, 0x7523, "", "USB Serial")
 
 
-def found_on(port: WirePort, clock: VirtualClock, info: PortInfo = PORT, **options: bool) -> PortFinding:
+def found_on(
+    port: WirePort, clock: VirtualClock, info: PortInfo = PORT, **options: bool
+) -> PortFinding:
     """What is found on one port."""
     (found,) = skin_detect.detect([info], PROFILES, port.open, clock, **options)
     return found
@@ -61,7 +63,8 @@ def test_another_grid_of_a_known_skin():
 
 
 def test_a_skin_that_has_to_be_asked():
-    """Silent until its start command: nothing is written without --write, with it the profile is found, and it is stopped."""
+    """Silent until its start command: nothing is written without --write, with it the profile is
+    found, and it is stopped."""
     clock, p = VirtualClock(), profile("robotiq-tsf")
     start = p.commands(p.start, p.rate_hz)[0]
     port = WirePort(clock, lambda i: b"", p.format.period_ns)
@@ -88,9 +91,12 @@ def test_a_board_of_the_protocol_has_to_be_asked():
     assert 'sensor.link = "serial"' in found.detail
 
 
-@pytest.mark.parametrize("sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40])
+@pytest.mark.parametrize(
+    "sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40]
+)
 def test_something_else_is_no_skin(sent: bytes):
-    """Bytes that are no frames of any profile: no profile, their number, and the command that describes them."""
+    """Bytes that are no frames of any profile: no profile, their number, and the command that
+    describes them."""
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
     assert found.profile == ""
@@ -104,19 +110,27 @@ def test_a_port_that_is_held():
     free = WirePort(clock, lambda i: wire("matrix", i), 1e7)
     ports = {"/dev/a": held, "/dev/b": free}
     infos = [PortInfo(path, 1, 2) for path in ports]
-    first, second = skin_detect.detect(infos, PROFILES, lambda path, baud: ports[path].open(path, baud), clock)
+    first, second = skin_detect.detect(
+        infos, PROFILES, lambda path, baud: ports[path].open(path, baud), clock
+    )
     assert first.profile == ""
     assert SensorBusy("port held by another program").args[0] in first.detail
     assert second.profile == "matrix"
 
 
-def test_the_commands(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """list: a line for each profile, also for one that cannot be read; detect: --write needs --port, a silent port says what
-    to do."""
+def test_the_commands(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """list: a line for each profile, also for one that cannot be read; detect: --write needs
+    --port, a silent port says what to do."""
     assert main(["skin", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert {line.split()[0] for line in lines} >= set(PROFILES), "this computer may have others in /etc/palpate"
-    assert "lacks sequence, time, checksum; not measured on a device" in next(li for li in lines if "flexitac" in li)
+    assert {line.split()[0] for line in lines} >= set(PROFILES), (
+        "this computer may have others in /etc/palpate"
+    )
+    assert "lacks sequence, time, checksum; not measured on a device" in next(
+        li for li in lines if "flexitac" in li
+    )
     assert main(["skin", "detect", "--write"]) == 78
     assert "--port" in capsys.readouterr().err
     monkeypatch.setattr(skin_detect, "LISTEN_S", 0.05)
@@ -130,4 +144,7 @@ def test_the_commands(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkey
     (tmp_path / "skins").mkdir()
     (tmp_path / "skins" / "broken.toml").write_text("rows = 0\n")
     assert main(["skin", "list", "--config-dir", str(tmp_path)]) == 1
-    assert "broken.toml: rows = 0 is not allowed; use a whole number from 1 to 255" in capsys.readouterr().out
+    assert (
+        "broken.toml: rows = 0 is not allowed; use a whole number from 1 to 255"
+        in capsys.readouterr().out
+    )

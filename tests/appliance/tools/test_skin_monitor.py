@@ -17,7 +17,9 @@ def frames(taxels: np.ndarray, first: int = 0) -> Frames:
     return Frames(seq * 10_000_000, seq, taxels)
 
 
-def signal(seconds: float, shape: tuple[int, ...] = (3, 4), noise: float = 2.0, seed: int = 1) -> np.ndarray:
+def signal(
+    seconds: float, shape: tuple[int, ...] = (3, 4), noise: float = 2.0, seed: int = 1
+) -> np.ndarray:
     """Noise around 50 raw counts, [n, *shape]."""
     return np.random.default_rng(seed).normal(50, noise, (round(seconds * RATE), *shape))
 

@@ -1,4 +1,5 @@
-"""`palpate skin new` finds how emulated skins frame what they send, and writes a profile that reads them."""
+"""`palpate skin new` finds how emulated skins frame what they send, and writes a profile that reads
+them."""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ from appliance.tools.skin_new import PortSample
 from appliance.tools.stream_analysis import Proposal, Read
 from tests.factories.played_skins import Numbered, played
 
-MARKED = Proposal("marker", b"\xaa\x55", 18, "", "uint8", False, 16, ((4, 4, 1), (2, 8, 1)), 99.94, 0.99)
+MARKED = Proposal(
+    "marker", b"\xaa\x55", 18, "", "uint8", False, 16, ((4, 4, 1), (2, 8, 1)), 99.94, 0.99
+)
 
 
 class ScriptedPort:
@@ -51,7 +54,10 @@ def test_the_first_speed_with_a_pattern_is_taken_and_every_port_is_closed() -> N
 
     def open_port(baud: int) -> ScriptedPort:
         ports.append(
-            ScriptedPort(clock, good if baud == 9600 else [bytes([i * i % 256, 3 * i % 256]) for i in range(60)])
+            ScriptedPort(
+                clock,
+                good if baud == 9600 else [bytes([i * i % 256, 3 * i % 256]) for i in range(60)],
+            )
         )
         return ports[-1]
 
@@ -74,7 +80,10 @@ def test_silence_and_noise_are_told_apart() -> None:
 
 def test_a_proposal_in_words() -> None:
     """A proposal in words."""
-    assert skin_new.words(MARKED) == "18 bytes: marker aa 55, 16 x uint8; 99.9 Hz, 99% of the bytes; grids: 4x4, 2x8"
+    assert (
+        skin_new.words(MARKED)
+        == "18 bytes: marker aa 55, 16 x uint8; 99.9 Hz, 99% of the bytes; grids: 4x4, 2x8"
+    )
     lines = Proposal("text", b"", 16, "", "uint16", False, 256, ((16, 16, 1),), 32.0, 1.0)
     assert skin_new.words(lines).startswith("16 lines of text: 256 x uint16")
 
@@ -116,7 +125,9 @@ def test_the_profile_that_is_written_can_be_read_and_holds_the_proposal(
     assert made.ids == [(0x1A86, 0x7523)]
     assert (made.number, made.sequence, made.baud) == (proposal.dtype, proposal.sequence, 2_000_000)
     assert made.byte_order == ("big" if proposal.big_endian else "little")
-    assert {"marker": made.marker, "trailer": made.trailer, "text": b""}[proposal.framing] == proposal.mark
+    assert {"marker": made.marker, "trailer": made.trailer, "text": b""}[
+        proposal.framing
+    ] == proposal.mark
     assert made.rate_hz == pytest.approx(proposal.rate_hz, rel=0.01)
 
 
@@ -129,11 +140,14 @@ def test_what_was_heard_is_read_with_the_new_profile() -> None:
     assert garbage == 4
 
 
-@pytest.mark.parametrize(("name", "grid"), [("matrix", "4x4"), ("anyskin", "4x5"), ("3d-vitac", "16x16")])
+@pytest.mark.parametrize(
+    ("name", "grid"), [("matrix", "4x4"), ("anyskin", "4x5"), ("3d-vitac", "16x16")]
+)
 def test_emulated_skins_are_described_and_read_again(
     name: str, grid: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The command, on the terminal of an emulated skin: without --grid it proposes, with it the profile is written."""
+    """The command, on the terminal of an emulated skin: without --grid it proposes, with it the
+    profile is written."""
     with played(name) as player:
         common = ["skin", "new", "mine", "--seconds", "2", "--out", str(tmp_path)]
         common += ["--port", str(player.path), "--set", "sensor.baud=115200"]
@@ -164,7 +178,10 @@ def test_emulated_skins_are_described_and_read_again(
     [
         (["Mine", "--port", "p"], "'Mine' cannot name a profile"),
         (["matrix", "--port", "/dev/null"], "there is a profile matrix already"),
-        (["mine", "--port", "/dev/no-such-port", "--grid", "4x4", "--out", "OUT"], "no port /dev/no-such-port"),
+        (
+            ["mine", "--port", "/dev/no-such-port", "--grid", "4x4", "--out", "OUT"],
+            "no port /dev/no-such-port",
+        ),
         (
             ["mine", "--port", "/dev/no-such-port", "--grid", "4x4", "--out", "/proc/x"],
             "/proc/x cannot be made: no such",
@@ -174,8 +191,11 @@ def test_emulated_skins_are_described_and_read_again(
 def test_what_cannot_be_is_said_in_one_line(
     options: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What cannot be is said in one line; a folder that cannot be written, before anything is listened to."""
-    assert main(["skin", "new", *(str(tmp_path) if option == "OUT" else option for option in options)]) in (69, 78)
+    """What cannot be is said in one line; a folder that cannot be written, before anything is
+    listened to."""
+    assert main(
+        ["skin", "new", *(str(tmp_path) if option == "OUT" else option for option in options)]
+    ) in (69, 78)
     assert text in capsys.readouterr().err
 
 
@@ -184,6 +204,20 @@ def test_clock_of_the_command_is_the_systems() -> None:
     clock = SystemClock()
     begun = clock.now_ns()
     with played("flexitac", paced=False) as player:
-        assert main(["skin", "new", "mine", "--seconds", "1", "--port", str(player.path),
-                     "--set", "sensor.baud=115200"]) == 0  # fmt: skip
+        assert (
+            main(
+                [
+                    "skin",
+                    "new",
+                    "mine",
+                    "--seconds",
+                    "1",
+                    "--port",
+                    str(player.path),
+                    "--set",
+                    "sensor.baud=115200",
+                ]
+            )
+            == 0
+        )
     assert clock.now_ns() - begun < 60_000_000_000

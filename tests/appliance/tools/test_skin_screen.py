@@ -13,9 +13,19 @@ from appliance.tools.skin_monitor import LiveView
 from appliance.tools.skin_screen import SkinScreen, faults, figures, line, picture
 
 VIEW = LiveView(
-    7, "usb", "flexitac 2x3 uint8 at 100 Hz", "streaming", "", (2, 3, 1), load=(((0, 1, 2), (30, 60, 120)),), full=120,
-    rate_hz=99.84, noise=(((1, 1, 2), (1, 1, 9)),), frames=12345, lost=3,
-)  # fmt: skip
+    7,
+    "usb",
+    "flexitac 2x3 uint8 at 100 Hz",
+    "streaming",
+    "",
+    (2, 3, 1),
+    load=(((0, 1, 2), (30, 60, 120)),),
+    full=120,
+    rate_hz=99.84,
+    noise=(((1, 1, 2), (1, 1, 9)),),
+    frames=12345,
+    lost=3,
+)
 
 
 def plain(text: str) -> str:
@@ -32,14 +42,21 @@ def test_figures_name_rate_loss_and_noise() -> None:
 def test_faulty_taxels_are_named_and_many_are_counted() -> None:
     """Faulty taxels are named and many are counted."""
     assert faults(VIEW) == ""
-    assert faults(replace(VIEW, stuck=("1.2",), dead=("2.1", "2.2"))) == "stuck: 1.2; dead: 2.1, 2.2"
-    assert faults(replace(VIEW, dead=tuple(f"1.{i}" for i in range(30)))).endswith("1.7 and 22 more")
+    assert (
+        faults(replace(VIEW, stuck=("1.2",), dead=("2.1", "2.2"))) == "stuck: 1.2; dead: 2.1, 2.2"
+    )
+    assert faults(replace(VIEW, dead=tuple(f"1.{i}" for i in range(30)))).endswith(
+        "1.7 and 22 more"
+    )
 
 
 def test_every_taxel_stands_in_the_picture_with_its_count() -> None:
     """Every taxel stands in the picture with its count."""
     drawn = plain("\n".join(picture(VIEW, 80, colours=True)))
-    assert [row.split() for row in drawn.splitlines()[4:6]] == [["0", "1", "2"], ["30", "60", "120"]]
+    assert [row.split() for row in drawn.splitlines()[4:6]] == [
+        ["0", "1", "2"],
+        ["30", "60", "120"],
+    ]
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
@@ -47,7 +64,9 @@ def test_every_taxel_stands_in_the_picture_with_its_count() -> None:
 def test_no_line_is_wider_than_the_terminal(width: int, shape: tuple[int, int, int]) -> None:
     """No line is wider than the terminal."""
     rows, cols, axes = shape
-    load = tuple(tuple(tuple(float(c) for c in range(cols)) for _ in range(rows)) for _ in range(axes))
+    load = tuple(
+        tuple(tuple(float(c) for c in range(cols)) for _ in range(rows)) for _ in range(axes)
+    )
     view = replace(VIEW, shape=shape, load=load, dead=tuple(f"{i}.1" for i in range(9)))
     lines = [plain(text).rstrip() for text in picture(view, width, colours=True)]
     assert max(map(len, lines)) <= width

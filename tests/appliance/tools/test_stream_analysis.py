@@ -1,4 +1,5 @@
-"""An unknown stream's marker, length, type, grid and rate are found in its bytes, or nothing is proposed."""
+"""An unknown stream's marker, length, type, grid and rate are found in its bytes, or nothing is
+proposed."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ def matrix(seed: int, n: int, size: int, most: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     t = np.arange(n)[:, None]
     waves = 0.5 + 0.4 * np.sin(t / rng.uniform(5, 30, size) + rng.uniform(0, 6, size))
-    return (waves * most * rng.uniform(0.2, 0.9, size) + rng.normal(0, most / 100, (n, size))).clip(0, most)
+    return (waves * most * rng.uniform(0.2, 0.9, size) + rng.normal(0, most / 100, (n, size))).clip(
+        0, most
+    )
 
 
 def first(found: list[Proposal]) -> Proposal:
@@ -39,7 +42,13 @@ def test_a_marker_and_bytes_however_reads_are_cut(cut: int) -> None:
     """A marker and bytes however reads are cut."""
     frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in matrix(1, 120, 512, 255)]
     best = first(analyse(reads(frames, cut)))
-    assert (best.framing, best.mark, best.length, best.dtype, best.values) == ("marker", b"\xaa\x55", 514, "uint8", 512)
+    assert (best.framing, best.mark, best.length, best.dtype, best.values) == (
+        "marker",
+        b"\xaa\x55",
+        514,
+        "uint8",
+        512,
+    )
     assert best.grids[0] == (16, 32, 1)
     assert best.rate_hz == pytest.approx(100, rel=0.05)
 
@@ -49,10 +58,15 @@ def test_an_untouched_skin_sends_zeros_and_they_are_not_taken_for_the_marker() -
     touched = matrix(2, 80, 16, 200)
     touched[:, :5] = 0
     frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in touched]
-    assert (first(analyse(reads(frames))).mark, first(analyse(reads(frames))).values) == (b"\xaa\x55", 16)
+    assert (first(analyse(reads(frames))).mark, first(analyse(reads(frames))).values) == (
+        b"\xaa\x55",
+        16,
+    )
 
 
-@pytest.mark.parametrize(("wire", "dtype"), [("<u2", "uint16"), (">u2", "uint16"), ("<i2", "int16"), (">i2", "int16")])
+@pytest.mark.parametrize(
+    ("wire", "dtype"), [("<u2", "uint16"), (">u2", "uint16"), ("<i2", "int16"), (">i2", "int16")]
+)
 def test_sixteen_bits_and_their_byte_order(wire: str, dtype: str) -> None:
     """Sixteen bits and their byte order."""
     values = matrix(3, 100, 24, 900) - (450 if "i" in wire else 0)
@@ -77,7 +91,8 @@ def test_a_count_of_the_frames_behind_the_marker_is_no_taxel(size: int) -> None:
     values = matrix(5, 600, 16, 200).astype("u1")
     values[:, 0] = 0  # an untouched taxel, which could be the count's next byte
     frames = [
-        b"\xa5\x5a" + (i % 256**size).to_bytes(size, "little") + frame.tobytes() for i, frame in enumerate(values)
+        b"\xa5\x5a" + (i % 256**size).to_bytes(size, "little") + frame.tobytes()
+        for i, frame in enumerate(values)
     ]
     best = first(analyse(reads(frames)))
     assert (best.mark, best.sequence, best.values) == (b"\xa5\x5a", f"uint{8 * size}", 16)
@@ -93,11 +108,15 @@ def test_lost_and_foreign_bytes_do_not_hide_the_pattern() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "dtype"), [(lambda v: f"{v:.0f}", "uint16"), (lambda v: f"{v - 100:.0f}", "int16"), (str, "float32")]
+    ("number", "dtype"),
+    [(lambda v: f"{v:.0f}", "uint16"), (lambda v: f"{v - 100:.0f}", "int16"), (str, "float32")],
 )
 def test_lines_of_numbers_are_frames(number, dtype: str) -> None:
     """Lines of numbers are frames."""
-    frames = [(",".join(number(float(v)) for v in frame) + "\n").encode() for frame in matrix(7, 50, 16, 200)]
+    frames = [
+        (",".join(number(float(v)) for v in frame) + "\n").encode()
+        for frame in matrix(7, 50, 16, 200)
+    ]
     best = first(analyse(reads(frames)))
     assert (best.framing, best.length, best.values, best.dtype) == ("text", 1, 16, dtype)
     assert best.grids[0] == (4, 4, 1)
@@ -109,7 +128,12 @@ def test_lines_that_a_shorter_one_ends_are_one_frame() -> None:
 
     def frame(values: np.ndarray) -> bytes:
         """frame"""
-        return b"".join(" ".join(f"{v:.0f}" for v in row).encode() + b"\n" for row in values.reshape(16, 16)) + b"\n"
+        return (
+            b"".join(
+                " ".join(f"{v:.0f}" for v in row).encode() + b"\n" for row in values.reshape(16, 16)
+            )
+            + b"\n"
+        )
 
     best = first(analyse(reads([frame(v) for v in matrix(8, 40, 256, 200)])))
     assert (best.length, best.values, best.grids[0]) == (16, 256, (16, 16, 1))

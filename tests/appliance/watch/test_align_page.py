@@ -28,9 +28,20 @@ from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, un
 PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
 VIEW = View(
-    7, "usb", "tubes 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1", "move the skin", (4, 4),
-    LOADS, 80.0, (3.8, 6.0), (6.0, 6.0), PLACE,
-)  # fmt: skip
+    7,
+    "usb",
+    "tubes 3, 9f3c2a1b",
+    "streaming",
+    "off",
+    "2.2 mm too far towards row 1",
+    "move the skin",
+    (4, 4),
+    LOADS,
+    80.0,
+    (3.8, 6.0),
+    (6.0, 6.0),
+    PLACE,
+)
 
 
 @pytest.fixture
@@ -56,7 +67,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """The running command with the simulated skin, and the address of its page."""
     command = [sys.executable, "-m", "appliance", "align", "--sim", "rest", "--web", "0"]
-    with subprocess.Popen([*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        [*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE
+    ) as run:
         address = run.stdout.readline().decode().removeprefix("page: ").strip()
         yield run, address
         run.stdout.close()
@@ -65,13 +78,16 @@ def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
 
 @pytest.mark.slow
 def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
-    """The real command: the page waits for contact, advises, follows the next touch; when it ends, "no connection"."""
+    """The real command: the page waits for contact, advises, follows the next touch; when it ends,
+    "no connection"."""
     run, address = box
     context = browser.new_context(viewport={"width": 820, "height": 1180})
     seen = BrowsedPage(context, address)
     seen.state("off")
     until(lambda: seen.text("#message").startswith("2."))
-    assert re.fullmatch(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#message"))
+    assert re.fullmatch(
+        r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1", seen.text("#message")
+    )
     assert "move the skin" in seen.text("#hint")
     assert seen.page.is_visible("#simulated")
     assert seen.text("#state") == "skin streaming"
@@ -92,7 +108,8 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
 
 @pytest.mark.slow
 def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
-    """Loads as shades and numbers, points at their coordinates, the message in large letters and for screen readers."""
+    """Loads as shades and numbers, points at their coordinates, the message in large letters and
+    for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -101,9 +118,13 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
     assert seen.page.get_attribute("#spoken", "aria-live") == "polite"
     assert not seen.page.is_visible("#simulated")
     fills = seen.page.eval_on_selector_all(".tile", FILLS)
-    assert all(light[2] - light[0] <= dark[2] - dark[0] for light, dark in pairwise(fills[:4]))  # bluer with the load
+    assert all(
+        light[2] - light[0] <= dark[2] - dark[0] for light, dark in pairwise(fills[:4])
+    )  # bluer with the load
     assert fills[0] == [0xE9, 0xED, 0xF2]
-    assert seen.page.locator(".count").all_text_contents() == [f"{load:.0f}" for row in LOADS for load in row]
+    assert seen.page.locator(".count").all_text_contents() == [
+        f"{load:.0f}" for row in LOADS for load in row
+    ]
     centre = seen.page.evaluate("new DOMMatrix(document.getElementById('centre').style.transform)")
     assert (centre["e"], centre["f"]) == pytest.approx((6.0 / 4 * 100 + 50, 3.8 / 4 * 100 + 50))
     assert [e["r"] for e in circles(seen, ".halo")] == pytest.approx([15, 15])
@@ -113,12 +134,32 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
     assert seen.text("#message") == "✓ in place"
     assert not seen.page.is_visible("#way")
     assert not seen.page.is_visible("#push")
-    page.show(replace(VIEW, number=9, state="no-skin", skin="absent", message="no skin: absent", load=(), centre=None))
+    page.show(
+        replace(
+            VIEW,
+            number=9,
+            state="no-skin",
+            skin="absent",
+            message="no skin: absent",
+            load=(),
+            centre=None,
+        )
+    )
     seen.state("no-skin")
     assert seen.text("#state") == "skin absent"
     assert set(seen.page.locator(".count").all_text_contents()) == {""}
-    page.show(replace(VIEW, number=10, shape=(2, 3), load=((1.0, 2, 3),) * 2, place=None, state="no-positions", nearest=None,
-                      centre=(0.5, 1.0)))  # fmt: skip
+    page.show(
+        replace(
+            VIEW,
+            number=10,
+            shape=(2, 3),
+            load=((1.0, 2, 3),) * 2,
+            place=None,
+            state="no-positions",
+            nearest=None,
+            centre=(0.5, 1.0),
+        )
+    )
     seen.state("no-positions")
     assert seen.page.locator(".tile").count() == 6
     assert "0.5, column 1.0 taxels" in seen.text("#figures")
@@ -129,11 +170,22 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
 def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     """Centre and radius of each."""
     return seen.page.eval_on_selector_all(
-        which, "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))"
+        which,
+        "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))",
     )
 
 
-FILES = {"/", "/page.css", "/watch.js", "/events.js", "/parts.js", "/skin.js", "/plots.js", "/events", "data:,"}
+FILES = {
+    "/",
+    "/page.css",
+    "/watch.js",
+    "/events.js",
+    "/parts.js",
+    "/skin.js",
+    "/plots.js",
+    "/events",
+    "data:,",
+}
 FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
 
 
@@ -150,15 +202,22 @@ FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number)
 def test_the_arrow_points_where_the_skin_has_to_go(
     browser: Any, page: PageServer, centre: tuple[float, float], message: str, way: tuple[int, int]
 ):
-    """Towards the row or column that the message names, in the picture and beside the words: a skin on which the contact
-    lies too far towards row 1 is moved towards row 1."""
-    nearest = min(zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre))
+    """Towards the row or column that the message names, in the picture and beside the words: a skin
+    on which the contact lies too far towards row 1 is moved towards row 1."""
+    nearest = min(
+        zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre)
+    )
     page.show(replace(VIEW, message=message, centre=centre, nearest=nearest))
     seen = BrowsedPage(browser.new_context(), page.address)
     seen.state("off")
-    path = [float(n) for n in re.findall(r"-?[\d.]+", str(seen.page.locator("#way .line").get_attribute("d")))]
+    path = [
+        float(n)
+        for n in re.findall(r"-?[\d.]+", str(seen.page.locator("#way .line").get_attribute("d")))
+    ]
     drawn = path[2] - path[0], path[3] - path[1]
-    turned = seen.page.evaluate("new DOMMatrix(getComputedStyle(document.querySelector('#push path')).transform)")
+    turned = seen.page.evaluate(
+        "new DOMMatrix(getComputedStyle(document.querySelector('#push path')).transform)"
+    )
     pushed = turned["c"] * -1, turned["d"] * -1  # where the arrow's head, at (0, -1), has got to
     for arrow in (drawn, pushed):
         assert (arrow[0] * way[0] + arrow[1] * way[1]) / hypot(*arrow) > 0.9
@@ -168,8 +227,13 @@ def test_the_arrow_points_where_the_skin_has_to_go(
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
-    """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1, 1.4.3)."""
-    page.show(replace(VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0))
+    """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1,
+    1.4.3)."""
+    page.show(
+        replace(
+            VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0
+        )
+    )
     context = browser.new_context(color_scheme=scheme)
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -182,10 +246,19 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("side", "at"), [("first-row", "top"), ("last-row", "bottom"), ("first-column", "left"), ("last-column", "right")]
+    ("side", "at"),
+    [
+        ("first-row", "top"),
+        ("last-row", "bottom"),
+        ("first-column", "left"),
+        ("last-column", "right"),
+    ],
 )
-def test_the_picture_shows_which_end_is_the_fingertip(browser: Any, page: PageServer, side: str, at: str):
-    """A cap at the side that `sensor.fingertip` names; where it is not set, the page says how to find it out."""
+def test_the_picture_shows_which_end_is_the_fingertip(
+    browser: Any, page: PageServer, side: str, at: str
+):
+    """A cap at the side that `sensor.fingertip` names; where it is not set, the page says how to
+    find it out."""
     seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
     seen.state("off")
     assert seen.page.locator(".finger").count() == 0
@@ -211,7 +284,8 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
 
 @pytest.mark.slow
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
-    """The server still answers, but its loop hangs: after a while the page shows that instead of an old picture."""
+    """The server still answers, but its loop hangs: after a while the page shows that instead of an
+    old picture."""
     context = browser.new_context()
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -224,7 +298,8 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
 
 @pytest.mark.slow
 def test_a_server_that_is_gone_is_no_connection(browser: Any):
-    """The page says so at once and how old its picture is; one that comes back at the same port is shown by itself."""
+    """The page says so at once and how old its picture is; one that comes back at the same port is
+    shown by itself."""
     access = Access(0)
     with PageServer("watch.html", access, SystemClock().now_ns) as page:
         page.show(VIEW)
@@ -242,9 +317,16 @@ def test_a_server_that_is_gone_is_no_connection(browser: Any):
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_it_fits_phone_tablet_and_desktop(browser: Any, page: PageServer, width: int, height: int, scheme: str):
-    """Everything on one screen without scrolling, in the light and the dark scheme; the text has enough contrast."""
-    page.show(replace(VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"))
+def test_it_fits_phone_tablet_and_desktop(
+    browser: Any, page: PageServer, width: int, height: int, scheme: str
+):
+    """Everything on one screen without scrolling, in the light and the dark scheme; the text has
+    enough contrast."""
+    page.show(
+        replace(
+            VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"
+        )
+    )
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = BrowsedPage(context, page.address)
     seen.state("off")

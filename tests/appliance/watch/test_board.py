@@ -55,11 +55,17 @@ def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
     health = events.of("health")[0]
-    assert (health["trial"], health["ready"], health["lost_frames"]) == ("on trial: 12 of 20 sweeps", True, 0)
+    assert (health["trial"], health["ready"], health["lost_frames"]) == (
+        "on trial: 12 of 20 sweeps",
+        True,
+        0,
+    )
 
 
 @pytest.mark.parametrize("status", ["ok", "unsure", "unknown", "gap", "sensor-lost"])
-def test_a_verdict_comes_with_its_probabilities_or_its_reason(board: PageBoard, events: Events, status: str):
+def test_a_verdict_comes_with_its_probabilities_or_its_reason(
+    board: PageBoard, events: Events, status: str
+):
     """Those of all labels, rounded; where there are none, in words what happened and what to do."""
     board.take(feed_lines.verdict(7, 2.0, "wood", status))
     (shown,) = events.of("verdict")
@@ -67,12 +73,15 @@ def test_a_verdict_comes_with_its_probabilities_or_its_reason(board: PageBoard, 
     assert shown["reason"] == REASONS.get(status, "")
     assert bool(shown["reason"]) != bool(shown["label"])
     if shown["label"]:
-        assert shown["scores"][feed_lines.LABELS.index("wood")] == pytest.approx(shown["probability"], abs=1e-4)
+        assert shown["scores"][feed_lines.LABELS.index("wood")] == pytest.approx(
+            shown["probability"], abs=1e-4
+        )
     assert "own" not in shown
 
 
 def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Events):
-    """Load above the lowest, the contact's centre, the way back; five times a second, however many frames come."""
+    """Load above the lowest, the contact's centre, the way back; five times a second, however many
+    frames come."""
     frames(board, 2.0, 0.7, 1.5, 0)
     assert events.of("view")[-1]["state"] == "no-contact"
     frames(board, 3.0, 0.7, 1.5)
@@ -90,31 +99,50 @@ def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Event
 def test_without_a_bundle_the_picture_has_no_positions(events: Events):
     """`palpate record` has none: the load is shown, the centre alone."""
     board = PageBoard(events)
-    board.take({name: value for name, value in feed_lines.hello(bundle="").items() if name != "alignment"})
+    board.take(
+        {name: value for name, value in feed_lines.hello(bundle="").items() if name != "alignment"}
+    )
     board.take(feed_lines.state())
     rng = np.random.default_rng(1)
     for i in range(40):
-        board.take(feed_lines.frame(i / 20, np.round(feed_lines.load(0, 0, 0) + rng.integers(0, 2, (4, 4)))))
+        board.take(
+            feed_lines.frame(
+                i / 20, np.round(feed_lines.load(0, 0, 0) + rng.integers(0, 2, (4, 4)))
+            )
+        )
     frames(board, 3.0, 1.5, 1.5)
     assert events.of("view")[-1]["state"] == "no-positions"
 
 
 def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
-    """State and view say so with the next line; another skin's counts do not begin with this one's lowest."""
+    """State and view say so with the next line; another skin's counts do not begin with this one's
+    lowest."""
     frames(board, 2.0, 1.5, 1.5)
     board.take(feed_lines.state("absent", "check the cable"))
-    assert events.of("state")[-1] == {"skin": "absent", "trouble": "check the cable", "sweeping": False, "ready": False}
-    assert (events.of("view")[-1]["state"], events.of("view")[-1]["hint"]) == ("no-skin", "check the cable")
+    assert events.of("state")[-1] == {
+        "skin": "absent",
+        "trouble": "check the cable",
+        "sweeping": False,
+        "ready": False,
+    }
+    assert (events.of("view")[-1]["state"], events.of("view")[-1]["hint"]) == (
+        "no-skin",
+        "check the cable",
+    )
     board.take(feed_lines.state())
     board.take(feed_lines.frame(9.0, feed_lines.load(1.5, 1.5)))
     assert events.of("view")[-1]["state"] == "wait"
 
 
 def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
-    """Frames and lost frames of each minute, not over a restart, after which the box counts from 0."""
+    """Frames and lost frames of each minute, not over a restart, after which the box counts from
+    0."""
     for at_s in range(2, 125):
         board.take(feed_lines.health(float(at_s), lost_frames=3 if at_s > 70 else 0))
-    assert [(one["frames"], one["lost"]) for one in events.of("minute")] == [(45_000, 0), (45_000, 3)]
+    assert [(one["frames"], one["lost"]) for one in events.of("minute")] == [
+        (45_000, 0),
+        (45_000, 3),
+    ]
     board.away("the box has ended")
     board.take(feed_lines.hello(pid=72))
     for at_s in range(200, 262):
@@ -123,7 +151,8 @@ def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
 
 
 def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Events):
-    """Another process: a note in the history, which names the new bundle; a connection that was only cut is none."""
+    """Another process: a note in the history, which names the new bundle; a connection that was
+    only cut is none."""
     board.away("the connection was cut")
     assert events.of("box")[-1] == {"there": False, "why": "the connection was cut"}
     board.take(feed_lines.hello())

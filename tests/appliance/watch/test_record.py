@@ -1,5 +1,5 @@
-"""The page of a recording without a browser: what it orders is done in the loop, what it must not order is refused, and the
-loop waits for none of it."""
+"""The page of a recording without a browser: what it orders is done in the loop, what it must not
+order is refused, and the loop waits for none of it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,15 @@ from appliance.watch.access import Access
 from appliance.watch.record import MOST_WAITING, CommandQueue, RecordPage, order, trigger_words
 from tests.factories.browser import WAIT_S, until
 from tests.factories.install_scripts import page_secrets
-from tests.factories.page_client import EventReader, PageAddress, ask, connected, port, received_by, status
+from tests.factories.page_client import (
+    EventReader,
+    PageAddress,
+    ask,
+    connected,
+    port,
+    received_by,
+    status,
+)
 from tests.factories.recorded_page import KIND, RecordedPage, key_of, ordered
 from tests.factories.simulated_box import Rigged, idle_devices
 
@@ -51,7 +59,9 @@ class Asking:
     def __init__(self, recorded: RecordedPage, *bodies: dict[str, str]) -> None:
         key, self.answers = key_of(recorded.page.server), []
         self.threads = [
-            threading.Thread(target=lambda b=body: self.answers.append(ordered(recorded.page.server, key, b)))
+            threading.Thread(
+                target=lambda b=body: self.answers.append(ordered(recorded.page.server, key, b))
+            )
             for body in bodies
         ]
         for thread in self.threads:
@@ -72,7 +82,10 @@ def waiting(recorded: RecordedPage) -> int:
 @pytest.mark.parametrize(
     ("body", "command"),
     [
-        (b'{"command": "MATERIAL", "text": " plastic rough "}', Command("MATERIAL", "plastic rough")),
+        (
+            b'{"command": "MATERIAL", "text": " plastic rough "}',
+            Command("MATERIAL", "plastic rough"),
+        ),
         (b'{"command": "POSITION", "text": "\\n7\\t"}', Command("POSITION", "7")),
         (b'{"command": "SESSION", "text": ""}', Command("SESSION")),
         (b'{"command": "NEXT"}', Command("NEXT")),
@@ -87,12 +100,28 @@ def test_an_order_is_a_command_of_the_serial_line(body: bytes, command: Command)
 @pytest.mark.parametrize(
     "body",
     [
-        b"", b"wood", b"[]", b"7", b"null", b"\xff\xfe", b"[" * 1000, b'{"command": 7}', b'{"text": "wood"}', b'{"command": ["NEXT"]}',
-        b'{"command": "START"}', b'{"command": "next"}', b'{"command": "MATERIAL", "text": 7}', b'{"command": "MATERIAL", "text": null}',
-        b'{"command": "NEXT", "more": 1}', b'{"command": "NEXT", "text": "7"}', b'{"command": "DISCARD", "text": "-1"}',
-        '{"command": "DISCARD", "text": "²"}'.encode(), b'{"command": "TEST"}', b'{"command": "MATERIAL\\n"}',
+        b"",
+        b"wood",
+        b"[]",
+        b"7",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 1000,
+        b'{"command": 7}',
+        b'{"text": "wood"}',
+        b'{"command": ["NEXT"]}',
+        b'{"command": "START"}',
+        b'{"command": "next"}',
+        b'{"command": "MATERIAL", "text": 7}',
+        b'{"command": "MATERIAL", "text": null}',
+        b'{"command": "NEXT", "more": 1}',
+        b'{"command": "NEXT", "text": "7"}',
+        b'{"command": "DISCARD", "text": "-1"}',
+        '{"command": "DISCARD", "text": "²"}'.encode(),
+        b'{"command": "TEST"}',
+        b'{"command": "MATERIAL\\n"}',
     ],
-)  # fmt: skip
+)
 def test_what_is_no_order(body: bytes):
     """Each is refused in one line that says what an order is."""
     with pytest.raises(FormatError, match=r"^[^\n]+$"):
@@ -103,7 +132,9 @@ def test_what_is_no_order(body: bytes):
 @pytest.mark.parametrize("name", record.LABELS)
 def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: str, text: str):
     """The same words, before the loop or a capture gets it."""
-    recording = RecordingSession(tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None)
+    recording = RecordingSession(
+        tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None
+    )
     with pytest.raises(ApplianceError) as by_command:
         recording.commands[name](text)
     with pytest.raises(ConfigError) as by_page:
@@ -112,20 +143,37 @@ def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: 
     assert "1 to 24 letters" in str(by_page.value)
 
 
-def test_labels_from_the_page_are_those_of_the_stored_sweep(rigged: Callable[..., Rigged], tmp_path: Path):
-    """On a whole box: set, started and stopped by the page alone, with labels that the robot had set otherwise."""
+def test_labels_from_the_page_are_those_of_the_stored_sweep(
+    rigged: Callable[..., Rigged], tmp_path: Path
+):
+    """On a whole box: set, started and stopped by the page alone, with labels that the robot had
+    set otherwise."""
     simulated, box = idle_devices(), None
-    recording = RecordingSession(tmp_path, skin.FORMAT, Labels(), simulated.clock, lambda line: None)
+    recording = RecordingSession(
+        tmp_path, skin.FORMAT, Labels(), simulated.clock, lambda line: None
+    )
     page = RecordPage(
-        Access(0), skin.FORMAT, "sim", TriggerConfig(mode="serial"), recording.about,
-        lambda command: box.box.obey(command), simulated.clock,
-    )  # fmt: skip
-    box = rigged(simulated, ("trigger.mode=serial",), observers=[recording, page], commands=recording.commands)
+        Access(0),
+        skin.FORMAT,
+        "sim",
+        TriggerConfig(mode="serial"),
+        recording.about,
+        lambda command: box.box.obey(command),
+        simulated.clock,
+    )
+    box = rigged(
+        simulated,
+        ("trigger.mode=serial",),
+        observers=[recording, page],
+        commands=recording.commands,
+    )
 
     def by_page(name: str, text: str = "") -> object:
         answers: list[bytes] = []
         body = {"command": name, "text": text}
-        thread = threading.Thread(target=lambda: answers.append(ordered(page.server, page.server.key, body)))
+        thread = threading.Thread(
+            target=lambda: answers.append(ordered(page.server, page.server.key, body))
+        )
         thread.start()
         until(lambda: page._queue._waiting.qsize() == 1)
         box.box.step()
@@ -145,26 +193,40 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(rigged: Callable[...
         assert by_page("STOP") == []
         box.until(lambda: box.box.answered == 1)
         about = sidecar(tmp_path / "sweep-000001.npy")
-        assert (about["material"], about["position"], about["session"]) == ("plastic rough", "10", "monday")
+        assert (about["material"], about["position"], about["session"]) == (
+            "plastic rough",
+            "10",
+            "monday",
+        )
         assert by_page("DISCARD", "1") == [1, 0, "sweep-000001"]
         assert not (tmp_path / "sweep-000001.npy").exists()
     assert not any(",ANS,START" in line or ",ANS,NEXT" in line for line in box.heard)
 
 
 def test_the_page_hears_what_there_is(recorded: RecordedPage):
-    """Labels, counts, what is missing, what became of the last sweep and its checks; the skin while somebody looks."""
+    """Labels, counts, what is missing, what became of the last sweep and its checks; the skin while
+    somebody looks."""
     reader = EventReader(recorded.page.server)
     assert reader.until("key") == recorded.page.server.key
     until(lambda: recorded.page.server.watched)
     recorded.turn()
     said = reader.until("recording")
-    assert (said["material"], said["position"], said["counts"], said["last"]) == ("metal", "1", [], None)
+    assert (said["material"], said["position"], said["counts"], said["last"]) == (
+        "metal",
+        "1",
+        [],
+        None,
+    )
     assert said["trigger"] == "START and STOP, here or on the serial line"
     assert recorded.sweep(detail="contact not checked") == 1
     assert reader.until("sweep")["detail"] == "contact not checked"
     recorded.turn()
     said = reader.until("recording")
-    assert (said["counts"], said["missing"], said["discard"]) == ([["metal", "1", 1]], "missing: metal at 1: 2", 1)
+    assert (said["counts"], said["missing"], said["discard"]) == (
+        [["metal", "1", 1]],
+        "missing: metal at 1: 2",
+        1,
+    )
     assert (said["last"]["outcome"], said["last"]["detail"]) == ("stored", "sweep-000001")
     before = recorded.page._view_ns
     until(lambda: (recorded.turn(), recorded.page._view_ns != before)[1])
@@ -181,15 +243,26 @@ def test_nothing_is_computed_for_nobody(recorded: RecordedPage, monkeypatch: pyt
 
 
 REFUSED = [
-    (403, {"X_Palpate_Key": None}), (403, {"X_Palpate_Key": "wrong"}), (403, {"X_Palpate_Key": "ö"}), (403, {"Origin": None}),
-    (403, {"Origin": "null"}), (403, {"Origin": "http://evil.example"}), (403, {"Origin": "http://localhost"}), (403, {"Origin": "http://localhost:1"}),
-    (415, {"Content_Type": None}), (415, {"Content_Type": "text/plain"}), (415, {"Content_Type": "application/x-www-form-urlencoded"}),
-]  # fmt: skip
+    (403, {"X_Palpate_Key": None}),
+    (403, {"X_Palpate_Key": "wrong"}),
+    (403, {"X_Palpate_Key": "ö"}),
+    (403, {"Origin": None}),
+    (403, {"Origin": "null"}),
+    (403, {"Origin": "http://evil.example"}),
+    (403, {"Origin": "http://localhost"}),
+    (403, {"Origin": "http://localhost:1"}),
+    (415, {"Content_Type": None}),
+    (415, {"Content_Type": "text/plain"}),
+    (415, {"Content_Type": "application/x-www-form-urlencoded"}),
+]
 
 
 @pytest.mark.parametrize(("answer", "changed"), REFUSED)
-def test_an_order_of_another_site_is_refused(recorded: RecordedPage, answer: int, changed: dict[str, str | None]):
-    """Whatever a page of another site can send: wrong or no key, another origin, a content type that needs no leave."""
+def test_an_order_of_another_site_is_refused(
+    recorded: RecordedPage, answer: int, changed: dict[str, str | None]
+):
+    """Whatever a page of another site can send: wrong or no key, another origin, a content type
+    that needs no leave."""
     server_of, key = recorded.page.server, key_of(recorded.page.server)
     assert status(ordered(server_of, key, WOOD, **changed)) == answer
     assert waiting(recorded) == 0
@@ -207,10 +280,19 @@ def test_a_key_of_another_run_is_refused(recorded: RecordedPage, tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("method", "host", "answer"),
-    [("GET", None, 405), ("PUT", None, 405), ("OPTIONS", None, 405), ("POST", "evil.example", 421), ("POST", "", 421)],
+    [
+        ("GET", None, 405),
+        ("PUT", None, 405),
+        ("OPTIONS", None, 405),
+        ("POST", "evil.example", 421),
+        ("POST", "", 421),
+    ],
 )
-def test_other_ways_to_order_are_refused(recorded: RecordedPage, method: str, host: str | None, answer: int):
-    """Other methods, a preflight of another site among them, and a name that is not this machine's."""
+def test_other_ways_to_order_are_refused(
+    recorded: RecordedPage, method: str, host: str | None, answer: int
+):
+    """Other methods, a preflight of another site among them, and a name that is not this
+    machine's."""
     page = recorded.page.server
     host = f"localhost:{port(page)}" if host is None else host
     more = f"Origin: http://{host}\r\nX-Palpate-Key: {page.key}\r\nContent-Type: {KIND}\r\nContent-Length: 2\r\n"
@@ -221,7 +303,10 @@ def test_other_ways_to_order_are_refused(recorded: RecordedPage, method: str, ho
 @pytest.mark.parametrize("chunked", [False, True])
 def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
     """Announced or in chunks: it is not read to its end, and the next request is answered."""
-    page, body = recorded.page.server, json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode()
+    page, body = (
+        recorded.page.server,
+        json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode(),
+    )
     if chunked:
         body = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body)
         answer = ordered(page, page.key, body, Content_Length=None, Transfer_Encoding="chunked")
@@ -248,7 +333,9 @@ def test_refusals_say_why(recorded: RecordedPage):
     page = recorded.page.server
     answer = ordered(page, page.key, {"command": "MATERIAL", "text": "-1"})
     assert (status(answer), b"text/plain" in answer) == (409, True)
-    assert answer.endswith(b"material '-1' cannot be used: take 1 to 24 letters, digits, spaces, '.', '_' or '-'")
+    assert answer.endswith(
+        b"material '-1' cannot be used: take 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+    )
     assert status(ordered(page, page.key, b"{}")) == 400
     asking = Asking(recorded, {"command": "DISCARD"})
     until(lambda: waiting(recorded) == 1)
@@ -258,7 +345,8 @@ def test_refusals_say_why(recorded: RecordedPage):
 
 
 def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: RecordedPage):
-    """Those beyond MOST_WAITING are refused at once, while the loop stands; then each turn carries out one, and not more."""
+    """Those beyond MOST_WAITING are refused at once, while the loop stands; then each turn carries
+    out one, and not more."""
     asking = Asking(recorded, *[WOOD] * (MOST_WAITING + 6))
     until(lambda: len(asking.answers) == 6)
     assert waiting(recorded) == MOST_WAITING
@@ -280,8 +368,11 @@ def test_a_loop_that_takes_nothing_up(recorded: RecordedPage, monkeypatch: pytes
     assert recorded.done == []
 
 
-def test_a_command_that_takes_long_is_not_called_undone(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """It is under way when DONE_S is over, on a slow disk: the page is not told that nothing happened."""
+def test_a_command_that_takes_long_is_not_called_undone(
+    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch
+):
+    """It is under way when DONE_S is over, on a slow disk: the page is not told that nothing
+    happened."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
     answered = threading.Event()
     monkeypatch.setattr(recorded.page, "_obey", lambda command: [answered.wait(WAIT_S)])
@@ -295,7 +386,9 @@ def test_a_command_that_takes_long_is_not_called_undone(recorded: RecordedPage, 
     assert b"it may still be carried out" in asking.answers[0]
 
 
-def test_the_end_of_the_recording_answers_who_waits(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_the_end_of_the_recording_answers_who_waits(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
     """With the reason; nothing is carried out any more."""
     one = RecordedPage(tmp_path, Labels())
     with one.page:
@@ -323,10 +416,13 @@ def test_commands_that_nobody_wants_any_more_take_no_turn():
 
 
 def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """However often its picture is asked for; only the last sweep has one, and none without a window."""
+    """However often its picture is asked for; only the last sweep has one, and none without a
+    window."""
     drawn: list[int] = []
     draw = record.picture
-    monkeypatch.setattr(record, "picture", lambda window: (drawn.append(window.sweep), draw(window))[1])
+    monkeypatch.setattr(
+        record, "picture", lambda window: (drawn.append(window.sweep), draw(window))[1]
+    )
     page = recorded.page.server
     recorded.sweep()
     recorded.sweep()
@@ -341,17 +437,21 @@ def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("mode", "words"),
     [
-        ("two-lines", "lines START and STOP"), ("one-line", "line START"), ("serial", "here or on the serial line"),
-        ("key", "space bar in the terminal"), ("timed", "the clock: 3 s in every 5 s"),
+        ("two-lines", "lines START and STOP"),
+        ("one-line", "line START"),
+        ("serial", "here or on the serial line"),
+        ("key", "space bar in the terminal"),
+        ("timed", "the clock: 3 s in every 5 s"),
     ],
-)  # fmt: skip
+)
 def test_the_trigger_is_named(mode: str, words: str):
     """Each mode in words."""
     assert words in trigger_words(TriggerConfig(mode=mode))
 
 
 def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
-    """As the watch page: without the token an order is not even looked at, over plain HTTP neither."""
+    """As the watch page: without the token an order is not even looked at, over plain HTTP
+    neither."""
     page_secrets(tmp_path / "secrets")
     settings = WatchConfig(address="0.0.0.0", names="localhost", folder=str(tmp_path / "secrets"))
     token = (tmp_path / "secrets" / "token").read_text().strip()
@@ -374,10 +474,24 @@ def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_command_records_what_its_page_orders(tmp_path: Path):
-    """The real command without a serial line: its page sets the label, starts and stops; it ends with the page open."""
-    command = [sys.executable, "-m", "appliance", "record", "--sim", "skin", "--trigger", "serial", "--web", "0"]
+    """The real command without a serial line: its page sets the label, starts and stops; it ends
+    with the page open."""
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "record",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--web",
+        "0",
+    ]
     options = ["--out", str(tmp_path), "--set", "feed.socket="]
-    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
+    with subprocess.Popen(
+        [*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as run:
         there = PageAddress(re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1])
         draining = threading.Thread(target=run.stderr.read, daemon=True)
         draining.start()
@@ -395,11 +509,14 @@ def test_the_command_records_what_its_page_orders(tmp_path: Path):
         draining.join(WAIT_S)
 
 
-def test_a_serial_trigger_needs_a_line_or_a_page(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+def test_a_serial_trigger_needs_a_line_or_a_page(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
     """Without either, the error names both ways."""
     from appliance.__main__ import main
 
     assert (
-        main(["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)]) == ConfigError.exit_code
+        main(["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)])
+        == ConfigError.exit_code
     )
     assert "or the page of palpate record --web" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""The page of `palpate record --web` in a headless browser: what it shows, how labels are set, how it looks at three sizes."""
+"""The page of `palpate record --web` in a headless browser: what it shows, how labels are set, how
+it looks at three sizes."""
 
 from __future__ import annotations
 
@@ -46,7 +47,9 @@ def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
         yield one
 
 
-def opened(browser: Any, recorded: RecordedPage, width: int = 1024, height: int = 768, **more: Any) -> BrowsedPage:
+def opened(
+    browser: Any, recorded: RecordedPage, width: int = 1024, height: int = 768, **more: Any
+) -> BrowsedPage:
     """The page in a browser, with all that there is."""
     context = browser.new_context(viewport={"width": width, "height": height}, **more)
     seen = BrowsedPage(context, recorded.page.server.address)
@@ -62,13 +65,19 @@ def labels(recorded: RecordedPage) -> tuple[str, str, str]:
 
 
 def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage):
-    """A row for each material, a column for each position, what is done and what is not; the trigger in words."""
+    """A row for each material, a column for each position, what is done and what is not; the
+    trigger in words."""
     seen = opened(browser, recorded)
     assert seen.page.locator("#counts th").all_inner_texts() == ["1", "2", "metal", "wood"]
     fields = seen.page.locator("#counts button")
     assert fields.all_inner_texts() == ["4 of 3", "3 of 3", "1 of 3", "0 of 3"]
     assert [one.get_attribute("class") for one in fields.all()] == ["done", "done", "", ""]
-    assert [one.get_attribute("aria-pressed") for one in fields.all()] == ["false", "false", "true", "false"]
+    assert [one.get_attribute("aria-pressed") for one in fields.all()] == [
+        "false",
+        "false",
+        "true",
+        "false",
+    ]
     assert seen.text("#missing") == "missing: wood at 1: 2, wood at 2: 3"
     assert seen.text("#now") == "wood at 1"
     assert seen.text("#trigger") == "START and STOP, here or on the serial line"
@@ -79,11 +88,15 @@ def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage)
 
 
 def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
-    """Its status, what was checked, where it is; its signal; one with a fault, and one without a window."""
+    """Its status, what was checked, where it is; its signal; one with a fault, and one without a
+    window."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
     until(lambda: seen.text("#outcome") == f"wood at 1, stored as sweep-{number:06d}")
-    assert seen.text("#check") == "checked: contact, saturation, stuck and dead taxels; nothing is wrong"
+    assert (
+        seen.text("#check")
+        == "checked: contact, saturation, stuck and dead taxels; nothing is wrong"
+    )
     until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
     assert "spectrogram up to" in seen.page.get_attribute("#spectrogram", "aria-label")
     recorded.sweep(Status.NO_CONTACT, "taxel 2.2 is loaded most, with 1 count")
@@ -98,16 +111,29 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
 
 
 def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, tmp_path: Path):
-    """Tab reaches every control, each visibly; Enter in a field sets what was changed; the stored sweep has it."""
+    """Tab reaches every control, each visibly; Enter in a field sets what was changed; the stored
+    sweep has it."""
     seen, stops = opened(browser, recorded), []
     for _ in range(11):
         seen.page.keyboard.press("Tab")
-        stops.append(seen.page.evaluate("document.activeElement.id || document.activeElement.textContent"))
+        stops.append(
+            seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
+        )
         outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
         assert float(outline.removesuffix("px")) >= 2
     assert stops == [
-        "material", "position", "session", "set", "next", "start", "stop", "4 of 3", "3 of 3", "1 of 3", "0 of 3",
-    ]  # fmt: skip
+        "material",
+        "position",
+        "session",
+        "set",
+        "next",
+        "start",
+        "stop",
+        "4 of 3",
+        "3 of 3",
+        "1 of 3",
+        "0 of 3",
+    ]
     seen.page.focus("#material")
     seen.page.keyboard.press("Control+A")
     seen.page.keyboard.type("plastic rough")
@@ -122,17 +148,26 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
     assert seen.page.input_value("#position") == "08"
     number = recorded.sweep()
     about = sidecar(tmp_path / f"sweep-{number:06d}.npy")
-    assert (about["material"], about["position"], about["session"]) == ("plastic rough", "08", "monday")
+    assert (about["material"], about["position"], about["session"]) == (
+        "plastic rough",
+        "08",
+        "monday",
+    )
     assert not seen.errors
 
 
 def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: RecordedPage):
-    """In the words of the command, beside the field, which keeps what was typed; a good one then takes it back."""
+    """In the words of the command, beside the field, which keeps what was typed; a good one then
+    takes it back."""
     seen = opened(browser, recorded)
     for wrong in ("-wood", "<b>wood</b>", "Grüße"):
         seen.page.fill("#material", wrong)
         seen.page.click("#set")
-        until(lambda wrong=wrong: f"material '{wrong}' cannot be used: take 1 to 24 letters" in seen.text("#said"))
+        until(
+            lambda wrong=wrong: (
+                f"material '{wrong}' cannot be used: take 1 to 24 letters" in seen.text("#said")
+            )
+        )
         assert seen.page.get_attribute("#material", "aria-invalid") == "true"
         assert seen.page.input_value("#material") == wrong
         assert labels(recorded) == ("wood", "1", "monday")
@@ -146,7 +181,8 @@ def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: Recorded
 
 
 def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: RecordedPage):
-    """The robot sets a label meanwhile: the page shows it, and the field keeps what the person has begun."""
+    """The robot sets a label meanwhile: the page shows it, and the field keeps what the person has
+    begun."""
     seen = opened(browser, recorded)
     seen.page.fill("#material", "pap")
     recorded.recording.commands["MATERIAL"]("cork")
@@ -157,13 +193,16 @@ def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: Recorded
 
 
 def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedPage):
-    """What is missing is chosen by pressing it; it keeps the focus, so that the next one is reached from there."""
+    """What is missing is chosen by pressing it; it keeps the focus, so that the next one is reached
+    from there."""
     seen = opened(browser, recorded)
     seen.page.focus("#counts button[aria-label='wood at 2: 0 of 3']")
     seen.page.keyboard.press("Enter")
     until(lambda: seen.text("#said") == "now wood at 2")
     assert labels(recorded) == ("wood", "2", "monday")
-    until(lambda: seen.page.locator("#counts button").nth(3).get_attribute("aria-pressed") == "true")
+    until(
+        lambda: seen.page.locator("#counts button").nth(3).get_attribute("aria-pressed") == "true"
+    )
     until(lambda: not seen.page.is_disabled("#set"))
     assert seen.page.evaluate("document.activeElement.textContent") == "0 of 3"
 
@@ -182,7 +221,9 @@ def test_start_and_stop(browser: Any, recorded: RecordedPage):
     assert recorded.done == ["START", "STOP"]
 
 
-def test_only_the_sweep_that_was_seen_is_discarded(browser: Any, recorded: RecordedPage, tmp_path: Path):
+def test_only_the_sweep_that_was_seen_is_discarded(
+    browser: Any, recorded: RecordedPage, tmp_path: Path
+):
     """The button names it; one that has come since then is not removed in its place."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
@@ -204,7 +245,8 @@ def test_only_the_sweep_that_was_seen_is_discarded(browser: Any, recorded: Recor
 
 
 def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any, tmp_path: Path):
-    """It says so, and nothing can be pressed; the next run is shown by itself, and takes orders with its own key."""
+    """It says so, and nothing can be pressed; the next run is shown by itself, and takes orders
+    with its own key."""
     first = begun(tmp_path / "a")
     with first:
         seen = opened(browser, first)
@@ -228,7 +270,9 @@ def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any
 def test_a_skin_that_is_away(browser: Any, recorded: RecordedPage):
     """The banner says why."""
     seen = opened(browser, recorded)
-    recorded.health = replace(recorded.health, skin="lost", trouble="the skin was unplugged", ready=False)
+    recorded.health = replace(
+        recorded.health, skin="lost", trouble="the skin was unplugged", ready=False
+    )
     until(lambda: seen.page.is_visible("#banner"))
     assert seen.text("#banner") == "no skin: lost; the skin was unplugged"
     assert seen.text("#state") == "skin lost"
@@ -283,16 +327,21 @@ ATTACKS = """async (page) => {
 def test_no_other_site_sets_a_label(
     browser: Any, recorded: RecordedPage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A page of another origin in the same browser: with and without headers, as a beacon, as a form; and it gets no key."""
+    """A page of another origin in the same browser: with and without headers, as a beacon, as a
+    form; and it gets no key."""
     refused: list[tuple[str, int]] = []
     monkeypatch.setattr(
-        OrderHandler, "on_finish", lambda self: refused.append((self.request.method, self.get_status()))
+        OrderHandler,
+        "on_finish",
+        lambda self: refused.append((self.request.method, self.get_status())),
     )
     with other_site(tmp_path) as address:
         seen = BrowsedPage(browser.new_context(), address)
         said = seen.page.evaluate(ATTACKS, recorded.page.server.address)
         assert said == ["blocked", "blocked", "blocked", "blocked", True, "no key"]
-        until(lambda: refused.count(("POST", 403)) == 4)  # a browser sends these without asking first
+        until(
+            lambda: refused.count(("POST", 403)) == 4
+        )  # a browser sends these without asking first
         assert set(refused) == {("POST", 403), ("OPTIONS", 405)}
         assert (recorded.done, labels(recorded)) == ([], ("wood", "1", "monday"))
         seen.page.context.close()
@@ -300,9 +349,11 @@ def test_no_other_site_sets_a_label(
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_every_text_of_it_can_be_read(browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str):
-    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also of an error and a banner; nothing is too wide, with
-    a name as long as one may be and more positions than fit."""
+def test_every_text_of_it_can_be_read(
+    browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str
+):
+    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also of an error and a banner;
+    nothing is too wide, with a name as long as one may be and more positions than fit."""
     recorded.recording.commands["MATERIAL"]("a material of 24 letters")
     for position in range(3, 15):
         recorded.recording.commands["POSITION"](f"{position}")

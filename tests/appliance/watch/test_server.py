@@ -18,7 +18,14 @@ from appliance.core.config import WatchConfig
 from appliance.core.errors import ConfigError
 from appliance.watch import server
 from appliance.watch.access import Access
-from appliance.watch.server import FOLDER, MOST_HEAD, MOST_OF_ONE, MOST_WAITING, EventLog, PageServer
+from appliance.watch.server import (
+    FOLDER,
+    MOST_HEAD,
+    MOST_OF_ONE,
+    MOST_WAITING,
+    EventLog,
+    PageServer,
+)
 from tests.factories.browser import WAIT_S, until
 from tests.factories.install_scripts import page_secrets
 from tests.factories.page_client import EventReader, ask, connected, port, received_by, status
@@ -32,14 +39,19 @@ def now_ns() -> int:
 @pytest.fixture
 def page() -> Iterator[PageServer]:
     """A page at any free port, which has one event."""
-    with PageServer("watch.html", Access(0), now_ns, {"row": 3}, {"sweep": {"7": {"seconds": 2.0}}.get}) as one:
+    with PageServer(
+        "watch.html", Access(0), now_ns, {"row": 3}, {"sweep": {"7": {"seconds": 2.0}}.get}
+    ) as one:
         one.publish("view", {"number": 1})
         yield one
 
 
 @contextmanager
-def guarded(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
-    """A page on the network, as `make install` sets it up: it, its token, and what a browser that trusts it has."""
+def guarded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
+    """A page on the network, as `make install` sets it up: it, its token, and what a browser that
+    trusts it has."""
     page_secrets(folder)
     settings = WatchConfig(address="0.0.0.0", names="localhost", folder=str(folder))
     token = (folder / "token").read_text().strip()
@@ -50,15 +62,19 @@ def guarded(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Pag
 
 
 def test_events_are_numbered_and_the_newest_are_kept():
-    """Of each name as many as asked for, one without; in order; who has some gets the rest, another server's reader all."""
+    """Of each name as many as asked for, one without; in order; who has some gets the rest, another
+    server's reader all."""
     log = EventLog({"row": 2})
     for i in range(4):
         log.add("row", i)
         log.add("view", 10 * i)
     sent = b"".join(log.since("")).decode()
     assert re.findall(r"event: (\w+)\ndata: (.*)\n", sent) == [
-        ("begin", f'"{log.run}"'), ("row", "2"), ("row", "3"), ("view", "30"),
-    ]  # fmt: skip
+        ("begin", f'"{log.run}"'),
+        ("row", "2"),
+        ("row", "3"),
+        ("view", "30"),
+    ]
     assert [event.split(b"data: ")[1] for event in log.since(f"{log.run}-7")] == [b"30\n\n"]
     assert log.since(f"{log.run}-8") == []
     for other in ("0000-7", f"{log.run}-", f"{log.run}-x", "-7", f"{log.run}-{10**30}"):
@@ -66,16 +82,25 @@ def test_events_are_numbered_and_the_newest_are_kept():
 
 
 def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
-    """First the clock, so that it can tell times; one that comes back gets what it has missed alone."""
+    """First the clock, so that it can tell times; one that comes back gets what it has missed
+    alone."""
     reader = EventReader(page)
-    assert [reader.next() for _ in range(3)] == [("now", now_ns()), ("begin", page.events.run), ("view", {"number": 1})]
+    assert [reader.next() for _ in range(3)] == [
+        ("now", now_ns()),
+        ("begin", page.events.run),
+        ("view", {"number": 1}),
+    ]
     page.publish("row", "first")
     assert reader.next() == ("row", "first")
     reader.socket.close()
     page.publish("row", "second")
     page.publish("view", {"number": 2})
     again = EventReader(page, reader.last)
-    assert [again.next() for _ in range(3)] == [("now", now_ns()), ("row", "second"), ("view", {"number": 2})]
+    assert [again.next() for _ in range(3)] == [
+        ("now", now_ns()),
+        ("row", "second"),
+        ("view", {"number": 2}),
+    ]
     again.socket.close()
 
 
@@ -87,9 +112,12 @@ def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer)
     assert reader.until("view") == {"number": 1}
 
 
-@pytest.mark.parametrize("path", ["/", "/page.css", "/watch.js", "/events", "/sweep/7", "/sweep/8", "/nothing"])
+@pytest.mark.parametrize(
+    "path", ["/", "/page.css", "/watch.js", "/events", "/sweep/7", "/sweep/8", "/nothing"]
+)
 def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
-    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in errors, too."""
+    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in
+    errors, too."""
     with connected(page) as one:
         one.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
         head = b""
@@ -141,8 +169,11 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
         ("/", "GET", "", 421),
     ],
 )
-def test_the_page_for_this_machine_and_no_more(page: PageServer, path: str, method: str, host: str, answer: int):
-    """GET of the page, its files and what it may ask for, under this machine's names; else refused with its HTTP status."""
+def test_the_page_for_this_machine_and_no_more(
+    page: PageServer, path: str, method: str, host: str, answer: int
+):
+    """GET of the page, its files and what it may ask for, under this machine's names; else refused
+    with its HTTP status."""
     assert status(ask(page, path, method, host)) == answer
     assert status(ask(page)) == 200
 
@@ -151,7 +182,9 @@ def test_the_page_for_this_machine_and_no_more(page: PageServer, path: str, meth
     "sent",
     [
         b"\x00\x01\x02\r\n\r\n",
-        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(64) + b"\r\n\r\n",  # TLS spoken to plain HTTP
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"
+        + bytes(64)
+        + b"\r\n\r\n",  # TLS spoken to plain HTTP
         b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n",
         b"GET /\r\n\r\n",
         b"GET / HTTP/1.1\r\n\r\n",
@@ -166,8 +199,11 @@ def test_the_page_for_this_machine_and_no_more(page: PageServer, path: str, meth
         "GET /ö HTTP/1.1\r\nHost: localhost\r\n\r\n".encode(),
     ],
 )
-def test_malformed_requests_are_refused(page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]):
-    """Each ends with an error or a closed connection, prints nothing, and the next one is served."""
+def test_malformed_requests_are_refused(
+    page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]
+):
+    """Each ends with an error or a closed connection, prints nothing, and the next one is
+    served."""
     with connected(page) as one:
         with suppress(OSError):
             one.sendall(sent)
@@ -177,11 +213,18 @@ def test_malformed_requests_are_refused(page: PageServer, sent: bytes, capfd: py
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)])
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)]
+)
 def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, sent: bytes):
-    """It gets no answer and a closed connection, even if its other side goes on sending; others are served."""
+    """It gets no answer and a closed connection, even if its other side goes on sending; others are
+    served."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
-    with PageServer("watch.html", Access(0), now_ns) as page, connected(page) as slow, connected(page) as dripping:
+    with (
+        PageServer("watch.html", Access(0), now_ns) as page,
+        connected(page) as slow,
+        connected(page) as dripping,
+    ):
         slow.sendall(sent)
         dripping.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
         assert status(ask(page)) == 200
@@ -199,7 +242,8 @@ def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, se
 
 
 def test_an_endless_head_is_not_read_on(page: PageServer):
-    """After MOST_HEAD bytes without an empty line the connection is closed at once, long before the deadline."""
+    """After MOST_HEAD bytes without an empty line the connection is closed at once, long before the
+    deadline."""
     with connected(page) as one:
         with suppress(OSError):
             one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 10 * MOST_HEAD)
@@ -207,7 +251,8 @@ def test_an_endless_head_is_not_read_on(page: PageServer):
 
 
 def test_a_thousand_connections_are_turned_away(page: PageServer):
-    """Those beyond MOST_OF_ONE are closed at once; the rest are served, and when these are gone, new ones are."""
+    """Those beyond MOST_OF_ONE are closed at once; the rest are served, and when these are gone,
+    new ones are."""
     with ExitStack() as stack:
         first = [stack.enter_context(connected(page)) for _ in range(MOST_OF_ONE)]
         turned_away = 0
@@ -222,7 +267,8 @@ def test_a_thousand_connections_are_turned_away(page: PageServer):
 
 
 def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
-    """A browser listens and never reads: it is cut off when too much waits for it, and the others get everything."""
+    """A browser listens and never reads: it is cut off when too much waits for it, and the others
+    get everything."""
     lazy = EventReader(page)
     busy = EventReader(page)
     until(lambda: len(page.queues) == 2)
@@ -261,7 +307,8 @@ def test_a_browser_that_goes_is_forgotten(page: PageServer, rudely: bool):
 
 
 def test_another_server_at_the_port_begins_anew(page: PageServer):
-    """What a browser has of the one before is no number of this one: it gets `begin` and everything."""
+    """What a browser has of the one before is no number of this one: it gets `begin` and
+    everything."""
     reader = EventReader(page)
     reader.until("view")
     with PageServer("watch.html", Access(0), now_ns) as other:
@@ -285,16 +332,23 @@ def test_a_port_that_is_taken_is_named(page: PageServer):
 
 
 def test_the_pages_hold_everything_they_show():
-    """No address but the namespace of SVG, no sources elsewhere, and nothing that could send or keep data."""
+    """No address but the namespace of SVG, no sources elsewhere, and nothing that could send or
+    keep data."""
     names = {f.name for f in FOLDER.iterdir()}
     for file in FOLDER.iterdir():
         text = file.read_text(encoding="utf-8")
         assert set(re.findall(r"https?://[^\"' ]+", text)) <= {"http://www.w3.org/2000/svg"}, file
-        assert not re.search(r"@import|url\(|<form|innerHTML|eval\(|localStorage|document\.cookie|style=\"", text), file
-        assert {path for path in re.findall(r'(?:src|href|from) ?=? ?"/([\w.]+)"', text)} <= names, file
+        assert not re.search(
+            r"@import|url\(|<form|innerHTML|eval\(|localStorage|document\.cookie|style=\"", text
+        ), file
+        assert {
+            path for path in re.findall(r'(?:src|href|from) ?=? ?"/([\w.]+)"', text)
+        } <= names, file
 
 
-@pytest.mark.parametrize("command", [["align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]])
+@pytest.mark.parametrize(
+    "command", [["align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]]
+)
 def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[str]):
     """One line that names the extra; nothing else of the box needs it."""
     command += ["--out", str(tmp_path)] if "record" in command else []
@@ -310,13 +364,16 @@ def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[s
 
 
 def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Without: the page that asks for it, and nothing else. With, as a header or as the cookie that it gives: everything.
-    The certificate is valid for a browser that trusts it."""
+    """Without: the page that asks for it, and nothing else. With, as a header or as the cookie that
+    it gives: everything. The certificate is valid for a browser that trusts it."""
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
         answer = ask(page, tls=trusts)
         assert status(answer) == 401
         assert b"/enter.js" in answer
-        assert [status(ask(page, path, tls=trusts)) for path in ("/enter.js", "/page.css")] == [200, 200]
+        assert [status(ask(page, path, tls=trusts)) for path in ("/enter.js", "/page.css")] == [
+            200,
+            200,
+        ]
         for path in ("/events", "/watch.js", "/watch.html", "/sweep/1", "/enter", "/nothing"):
             assert status(ask(page, path, tls=trusts)) == 401
         answer = ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts)
@@ -327,15 +384,30 @@ def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.Mon
         answer = ask(page, more=f"Cookie: {cookie.split(';')[0]}\r\n", tls=trusts)
         assert status(answer) == 200
         assert b"/watch.js" in answer
-        assert status(ask(page, host="evil.example", more=f"Authorization: Bearer {token}\r\n", tls=trusts)) == 421
         assert (
-            status(ask(page, host=f"{socket.gethostname()}:1", more=f"Authorization: Bearer {token}\r\n", tls=trusts))
+            status(
+                ask(
+                    page, host="evil.example", more=f"Authorization: Bearer {token}\r\n", tls=trusts
+                )
+            )
+            == 421
+        )
+        assert (
+            status(
+                ask(
+                    page,
+                    host=f"{socket.gethostname()}:1",
+                    more=f"Authorization: Bearer {token}\r\n",
+                    tls=trusts,
+                )
+            )
             == 200
         )
 
 
 def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The token would be read by others: without TLS there is no answer, and a handshake that never ends is cut off."""
+    """The token would be read by others: without TLS there is no answer, and a handshake that never
+    ends is cut off."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
         assert status(ask(page, more=f"Authorization: Bearer {token}\r\n")) == 0
@@ -344,8 +416,11 @@ def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: 
         assert status(ask(page, tls=trusts)) == 401
 
 
-def test_wrong_tokens_are_slowed_and_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """Each waits for WRONG_S; the first is a warning that names the address, further ones are silent."""
+def test_wrong_tokens_are_slowed_and_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
+    """Each waits for WRONG_S; the first is a warning that names the address, further ones are
+    silent."""
     waited = []
 
     async def sleep(seconds: float) -> None:
@@ -357,8 +432,14 @@ def test_wrong_tokens_are_slowed_and_logged_once(tmp_path: Path, monkeypatch: py
         for wrong in ("x", token[:-1], token + "0", "ö", "x" * 4000):
             answer = ask(page, "/enter", more=f"Authorization: Bearer {wrong}\r\n", tls=trusts)
             assert status(answer) == 401
-            assert status(ask(page, "/events", more=f"Cookie: __Host-palpate={wrong}\r\n", tls=trusts)) == 401
-        assert status(ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts)) == 204
+            assert (
+                status(ask(page, "/events", more=f"Cookie: __Host-palpate={wrong}\r\n", tls=trusts))
+                == 401
+            )
+        assert (
+            status(ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts))
+            == 204
+        )
     assert len(waited) == 10
     assert [line for line in logged if "token" in line] == [
         "<4>page: wrong token from 127.0.0.1; further ones are not logged"
@@ -366,7 +447,8 @@ def test_wrong_tokens_are_slowed_and_logged_once(tmp_path: Path, monkeypatch: py
 
 
 def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path):
-    """Each file that is missing or cannot be used is named with what makes it; an address that is none, too."""
+    """Each file that is missing or cannot be used is named with what makes it; an address that is
+    none, too."""
     network = WatchConfig(address="0.0.0.0", folder=str(tmp_path))
     with pytest.raises(ConfigError, match=r"token cannot be read: No such file.*make install"):
         Access.configured(network, 0)
@@ -389,12 +471,15 @@ def test_a_token_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "read_text", denied)
-    with pytest.raises(ConfigError, match=r"token may not be read by this user; .*usermod -aG GROUP USER"):
+    with pytest.raises(
+        ConfigError, match=r"token may not be read by this user; .*usermod -aG GROUP USER"
+    ):
         Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0)
 
 
 def test_what_install_makes_is_for_the_unit_alone(tmp_path: Path):
-    """Token, key and certificate stay as they are on another install; nobody but root and the group reads them."""
+    """Token, key and certificate stay as they are on another install; nobody but root and the group
+    reads them."""
     page_secrets(tmp_path)
     first = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
     assert sorted(first) == ["certificate.pem", "key.pem", "token"]

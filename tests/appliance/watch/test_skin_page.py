@@ -1,4 +1,5 @@
-"""The page of `palpate skin show` in a real browser: what it shows of a skin, at three widths, in both modes."""
+"""The page of `palpate skin show` in a real browser: what it shows of a skin, at three widths, in
+both modes."""
 
 from __future__ import annotations
 
@@ -14,11 +15,26 @@ from appliance.watch.access import Access
 from appliance.watch.server import PageServer
 from tests.factories.browser import BrowsedPage, contrast, until
 
-LOAD = tuple(tuple(tuple(float(20 * a + 10 * r + c) for c in range(4)) for r in range(3)) for a in range(3))
+LOAD = tuple(
+    tuple(tuple(float(20 * a + 10 * r + c) for c in range(4)) for r in range(3)) for a in range(3)
+)
 VIEW = LiveView(
-    1, "sim", "mine 3x4x3 int16 at 100 Hz", "streaming", "", (3, 4, 3), LOAD, 63.0, 99.8, LOAD, ("1.2 axis 3",),
-    ("2.1 axis 1",), (), 12345, None,
-)  # fmt: skip
+    1,
+    "sim",
+    "mine 3x4x3 int16 at 100 Hz",
+    "streaming",
+    "",
+    (3, 4, 3),
+    LOAD,
+    63.0,
+    99.8,
+    LOAD,
+    ("1.2 axis 3",),
+    ("2.1 axis 1",),
+    (),
+    12345,
+    None,
+)
 
 
 @pytest.fixture
@@ -31,7 +47,8 @@ def page() -> Iterator[PageServer]:
 
 @pytest.mark.slow
 def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
-    """A map for each axis with its counts; faulty taxels outlined and named; loss that cannot be known is not called 0."""
+    """A map for each axis with its counts; faulty taxels outlined and named; loss that cannot be
+    known is not called 0."""
     seen = BrowsedPage(browser.new_context(), page.address)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.text("#lost") == "cannot be known"
@@ -43,7 +60,16 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     faulty = seen.page.eval_on_selector_all(".taxel.faulty", "all => all.map(e => e.title)")
     assert [title.split(":")[0] for title in faulty] == ["taxel 2.1 axis 1", "taxel 1.2 axis 3"]
     asked = {request.removeprefix(page.address).split("?")[0] for request in seen.requests}
-    assert asked <= {"/", "/page.css", "/skin_show.js", "/events.js", "/parts.js", "/skin.js", "/events", "data:,"}
+    assert asked <= {
+        "/",
+        "/page.css",
+        "/skin_show.js",
+        "/events.js",
+        "/parts.js",
+        "/skin.js",
+        "/events",
+        "data:,",
+    }
     assert not seen.errors
     seen.page.close()
 
@@ -72,7 +98,8 @@ def test_nothing_is_cut_off(browser: Any, page: PageServer, width: int, scheme: 
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     tiles, counts = (
-        seen.page.eval_on_selector_all(".taxel", COLOURS % which) for which in ("backgroundColor", "color")
+        seen.page.eval_on_selector_all(".taxel", COLOURS % which)
+        for which in ("backgroundColor", "color")
     )
     assert len(tiles) == 36
     assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5

@@ -16,14 +16,20 @@ from tests.factories import feed_lines
 def test_the_window_is_the_one_that_was_sent():
     """Bytes, shape and type; several axes, too."""
     counts = np.arange(2 * 3 * 4 * 3, dtype="<i2").reshape(2, 3, 4, 3) - 7
-    line = {"sweep": 5, "shape": [2, 3, 4, 3], "dtype": "int16", "data": b64encode(counts.tobytes()).decode()}
+    line = {
+        "sweep": 5,
+        "shape": [2, 3, 4, 3],
+        "dtype": "int16",
+        "data": b64encode(counts.tobytes()).decode(),
+    }
     found = window(line, 100.0)
     assert (found.sweep, found.rate_hz) == (5, 100.0)
     np.testing.assert_array_equal(found.taxels, counts)
 
 
 def test_a_vibration_stands_at_its_frequency():
-    """45 Hz: the strongest band of every moment is the one from 40 to 60 Hz; two seconds in steps of 50 ms."""
+    """45 Hz: the strongest band of every moment is the one from 40 to 60 Hz; two seconds in steps
+    of 50 ms."""
     shown = picture(window(feed_lines.sweep(1, hz=45.0), feed_lines.RATE_HZ))
     assert shown["seconds"] == 2.0
     shares = np.array(shown["spectrogram"])
@@ -42,7 +48,9 @@ def test_no_peak_is_lost(frames: int):
     for i, one in enumerate(shown["taxels"]):
         assert len(one["low"]) == len(one["high"]) <= FINEST
         series = counts.reshape(frames, 4)[:, i]
-        assert (min(one["low"]), max(one["high"])) == pytest.approx((series.min(), series.max()), abs=0.01)
+        assert (min(one["low"]), max(one["high"])) == pytest.approx(
+            (series.min(), series.max()), abs=0.01
+        )
 
 
 def test_of_a_large_skin_the_most_loaded_taxels_are_drawn():
@@ -53,7 +61,9 @@ def test_of_a_large_skin_the_most_loaded_taxels_are_drawn():
     shown = picture(Window(1, 100.0, counts))
     assert len(shown["taxels"]) == MOST_TAXELS
     assert shown["of"] == 384
-    assert [one["name"] for one in shown["taxels"]] == [f"{r}.{c}" for r in range(5, 9) for c in range(11, 15)]
+    assert [one["name"] for one in shown["taxels"]] == [
+        f"{r}.{c}" for r in range(5, 9) for c in range(11, 15)
+    ]
 
 
 def _nan() -> NDArray[np.float32]:

@@ -1,4 +1,5 @@
-"""Pictures of sweeps in a terminal: a tone stands where it should, every form fits, and a terminal that stands still."""
+"""Pictures of sweeps in a terminal: a tone stands where it should, every form fits, and a terminal
+that stands still."""
 
 from __future__ import annotations
 
@@ -32,12 +33,15 @@ def tone(hz: float, fmt: SweepFormat = skin.FORMAT) -> np.ndarray:
     """A window [T, R, C] or [T, R, C, A] in which all taxels swing, the louder the later."""
     t = np.arange(fmt.window) / fmt.rate_hz
     wave = 100 + 40 * t / t[-1] * (1 + np.sin(2 * np.pi * hz * t))
-    return np.broadcast_to(wave.reshape(-1, *(1,) * len(fmt.shape)), (fmt.window, *fmt.shape)).astype(fmt.numpy_type)
+    return np.broadcast_to(
+        wave.reshape(-1, *(1,) * len(fmt.shape)), (fmt.window, *fmt.shape)
+    ).astype(fmt.numpy_type)
 
 
 @pytest.mark.parametrize(("hz", "row"), [(10, 5), (100, 4), (340, 0)])
 def test_a_tone_stands_in_its_band(hz: float, row: int) -> None:
-    """The band with the darkest fields is the one that holds the frequency; 0 Hz is below, 375 Hz above."""
+    """The band with the darkest fields is the one that holds the frequency; 0 Hz is below, 375 Hz
+    above."""
     lines = picture(tone(hz), RATE, 80, colours=False)[HIGH : HIGH + BANDS]
     assert (lines[0].split()[0], lines[-1].split()[0]) == ("375", "0")
     dark = [line[NAME + 1 :].count("█") for line in lines]
@@ -45,7 +49,8 @@ def test_a_tone_stands_in_its_band(hz: float, row: int) -> None:
 
 
 def test_the_signal_rises_where_the_load_does() -> None:
-    """The bars of the last columns are higher than those of the first; highest and lowest mean are named."""
+    """The bars of the last columns are higher than those of the first; highest and lowest mean are
+    named."""
     lines = picture(tone(20), RATE, 80, colours=False)
     columns = list(zip(*(line[NAME + 1 :].ljust(40) for line in lines[:HIGH]), strict=True))
     heights = [sum(c != " " for c in column) for column in columns]
@@ -59,13 +64,18 @@ def test_the_signal_rises_where_the_load_does() -> None:
 @pytest.mark.parametrize(
     "fmt",
     [
-        skin.FORMAT, SweepFormat(3, 3, 100, 200, "float32", 3), SweepFormat(1, 1, 35, 70, "int16"),
-        SweepFormat(2, 2, 10, 20, "uint16"), SweepFormat(2, 2, 1000, 1, "uint8"), SweepFormat(16, 16, 66, 132, "uint16"),
+        skin.FORMAT,
+        SweepFormat(3, 3, 100, 200, "float32", 3),
+        SweepFormat(1, 1, 35, 70, "int16"),
+        SweepFormat(2, 2, 10, 20, "uint16"),
+        SweepFormat(2, 2, 1000, 1, "uint8"),
+        SweepFormat(16, 16, 66, 132, "uint16"),
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_every_form_fits(fmt: SweepFormat, width: int) -> None:
-    """No line is wider than the terminal; where a rate is too low for a spectrogram the reason stands there."""
+    """No line is wider than the terminal; where a rate is too low for a spectrogram the reason
+    stands there."""
     taxels = tone(3, fmt) if fmt.window > 1 else np.ones((1, *fmt.shape), fmt.numpy_type)
     lines = picture(taxels, fmt.rate_hz, width, colours=True)
     assert max(len(plain(line)) for line in lines) <= max(width, NAME + 2)
@@ -108,7 +118,11 @@ def test_each_sweep_is_printed_with_the_counts(screen: tuple[int, TextIO]) -> No
     far, out = screen
     printer = SweepPrinter(out, RATE, about)
     printer.sweep(
-        replace(cut(), frames=Frames(*(a[:0] for a in (cut().frames.t_ns, cut().frames.seq, tone(9))))), OK, {}
+        replace(
+            cut(), frames=Frames(*(a[:0] for a in (cut().frames.t_ns, cut().frames.seq, tone(9))))
+        ),
+        OK,
+        {},
     )
     assert os.read(far, 65536).decode().split() == ["1", "wood", "4"]
     n = np.arange(1500)
@@ -119,7 +133,8 @@ def test_each_sweep_is_printed_with_the_counts(screen: tuple[int, TextIO]) -> No
 
 
 def test_a_terminal_that_stands_still_keeps_nobody_waiting(screen: tuple[int, TextIO]) -> None:
-    """Ctrl-S, or a connection that hangs: sweeps are not printed, and the printer returns at once."""
+    """Ctrl-S, or a connection that hangs: sweeps are not printed, and the printer returns at
+    once."""
     _, out = screen
     os.set_blocking(out.fileno(), False)
     while True:  # until the terminal takes nothing more

@@ -1,4 +1,5 @@
-"""`palpate watch` in a terminal: what it shows of the feed's lines, on any terminal and without one, and that it lasts."""
+"""`palpate watch` in a terminal: what it shows of the feed's lines, on any terminal and without
+one, and that it lasts."""
 
 from __future__ import annotations
 
@@ -32,7 +33,10 @@ def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list
     peer = offered.peer()
     peer.ask('{"frames": 20, "sweeps": true}')
     offered.turns(2)
-    for verdict in (OK, replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), moved="")):
+    for verdict in (
+        OK,
+        replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), moved=""),
+    ):
         offered.feed.frames(frames(1, fmt, first=int(verdict.sweep) * 5))
         offered.feed.answered(verdict)
         offered.turns(4)
@@ -65,7 +69,8 @@ def drawn(state: WatchedBox, width: int = 80, height: int = 24, **more: Any) -> 
 
 
 def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
-    """Skin, bundle, state, load, probabilities, counters, latency, last verdicts the newest first."""
+    """Skin, bundle, state, load, probabilities, counters, latency, last verdicts the newest
+    first."""
     shown = drawn(state_of(lines_of(tmp_path, trial="7 of 20 sweeps")))
     text = "\n".join(shown)
     assert "palpate 4x4 uint8 at 750 Hz" in shown[0]
@@ -84,11 +89,20 @@ def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(80, 24), (40, 12), (132, 50), (20, 8)])
 @pytest.mark.parametrize(
-    "fmt", [skin.FORMAT, SweepFormat(16, 16, 100, 200, "uint16"), SweepFormat(3, 3, 100, 200, "float32", 3)], ids=str
+    "fmt",
+    [
+        skin.FORMAT,
+        SweepFormat(16, 16, 100, 200, "uint16"),
+        SweepFormat(3, 3, 100, 200, "float32", 3),
+    ],
+    ids=str,
 )
 @pytest.mark.parametrize("colours", [True, False])
-def test_it_fits_any_terminal(tmp_path: Path, size: tuple[int, int], fmt: SweepFormat, colours: bool) -> None:
-    """No line is wider, no picture higher; the state, the skin and the last verdict are in it where it is 80x24."""
+def test_it_fits_any_terminal(
+    tmp_path: Path, size: tuple[int, int], fmt: SweepFormat, colours: bool
+) -> None:
+    """No line is wider, no picture higher; the state, the skin and the last verdict are in it where
+    it is 80x24."""
     state = state_of(lines_of(tmp_path, fmt, trial="7 of 20 sweeps", shadow="x" * 200))
     raw = picture(state, 5 * SECOND, *size, colours=colours)
     assert len(raw) <= size[1]
@@ -109,10 +123,19 @@ def test_a_terminal_without_utf_8_gets_plain_signs(tmp_path: Path) -> None:
 
 
 def test_text_from_outside_does_not_steer_the_terminal(tmp_path: Path) -> None:
-    """Names of skins and labels, and what a device says: control characters become question marks."""
+    """Names of skins and labels, and what a device says: control characters become question
+    marks."""
     lines = lines_of(tmp_path)
     lines[0] |= {"skin": "\033[2Ja", "labels": ["\033]0;b", "wood"], "bundle": "\a"}
-    lines.append({"type": "state", "skin": "absent", "trouble": "\033[Hgone\n", "sweeping": False, "ready": False})
+    lines.append(
+        {
+            "type": "state",
+            "skin": "absent",
+            "trouble": "\033[Hgone\n",
+            "sweeping": False,
+            "ready": False,
+        }
+    )
     state = state_of(lines)
     shown = drawn(state)
     assert "?[2Ja" in shown[0]
@@ -124,20 +147,32 @@ def test_text_from_outside_does_not_steer_the_terminal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"type": "hello", "format": {"rows": 0}}, {"type": "hello", "labels": 7}, {"type": "health", "lost_frames": "many"},
-        {"type": "verdict", "status": "fine"}, {"type": "verdict", "latency_ns": None}, {"type": "verdict", "scores": ["a"]},
-        {"type": "frame", "taxels": []}, {"type": "frame", "taxels": [[1, 2], [3]]}, {"type": "frame", "taxels": 5},
-        {"type": "frame", "taxels": [["x"]]}, {"type": "lost", "lines": "many"}, {"type": "sweep", "data": "AAAA"},
-        {"type": "sweep", "dtype": "object"}, {"type": "sweep", "shape": [6000, 4]}, {"type": "sweep", "shape": [0, 4, 4]},
+        {"type": "hello", "format": {"rows": 0}},
+        {"type": "hello", "labels": 7},
+        {"type": "health", "lost_frames": "many"},
+        {"type": "verdict", "status": "fine"},
+        {"type": "verdict", "latency_ns": None},
+        {"type": "verdict", "scores": ["a"]},
+        {"type": "frame", "taxels": []},
+        {"type": "frame", "taxels": [[1, 2], [3]]},
+        {"type": "frame", "taxels": 5},
+        {"type": "frame", "taxels": [["x"]]},
+        {"type": "lost", "lines": "many"},
+        {"type": "sweep", "data": "AAAA"},
+        {"type": "sweep", "dtype": "object"},
+        {"type": "sweep", "shape": [6000, 4]},
+        {"type": "sweep", "shape": [0, 4, 4]},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_a_line_that_is_not_as_it_must_be_is_named(tmp_path: Path, change: dict[str, Any]) -> None:
     """An error of one line, and the state can still be shown."""
     lines = [*lines_of(tmp_path), {"type": "lost", "lines": 1}]
     state = state_of(lines)
     whole = next(line for line in lines if line["type"] == change["type"])
-    with pytest.raises(FormatError, match=f"the feed's line {change['type']} is not as it must be") as e:
+    with pytest.raises(
+        FormatError, match=f"the feed's line {change['type']} is not as it must be"
+    ) as e:
         state.take(whole | change)
     assert str(e.value).isprintable()
     assert drawn(state)
@@ -150,7 +185,8 @@ def test_lines_of_a_later_version_are_passed_over(tmp_path: Path) -> None:
 
 
 def test_while_sweeps_are_recorded_the_last_one_is_shown(tmp_path: Path) -> None:
-    """No labels: beside the skin stand the sweep's signal and spectrogram, and below what is missing."""
+    """No labels: beside the skin stand the sweep's signal and spectrogram, and below what is
+    missing."""
     lines = lines_of(tmp_path, recorded="missing: wood at 1: 7")
     lines[0] |= {"labels": [], "bundle": ""}
     shown = drawn(state_of(lines))
@@ -190,7 +226,9 @@ def offered(tmp_path: Path) -> Iterator[Offered]:
     one.feed.stopping()
 
 
-def test_it_draws_and_gives_the_terminal_back(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_draws_and_gives_the_terminal_back(
+    offered: Offered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Frames are asked for; the picture has the box in it; at the end the screen is as before."""
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setattr(terminal, "READ_S", 0.01)
@@ -212,8 +250,11 @@ def test_it_draws_and_gives_the_terminal_back(offered: Offered, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_without_a_terminal_each_event_is_a_line(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Connection, verdict, change of the state, the end of the box and its return; no frames are asked for."""
+def test_without_a_terminal_each_event_is_a_line(
+    offered: Offered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Connection, verdict, change of the state, the end of the box and its return; no frames are
+    asked for."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     out = io.StringIO()
     watch = TerminalWatch(str(offered.path), out, SystemClock())
@@ -243,7 +284,9 @@ def test_without_a_terminal_each_event_is_a_line(offered: Offered, monkeypatch: 
     again.feed.stopping()
 
 
-def test_what_cannot_be_read_is_said_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_read_is_said_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A verdict of another form: one line that says so, and the connection is closed."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     offered = Offered(tmp_path / "feed.sock")

@@ -1,4 +1,5 @@
-"""The page of `palpate watch --web` in a headless browser: what it shows, how it is used, how it looks at three sizes."""
+"""The page of `palpate watch --web` in a headless browser: what it shows, how it is used, how it
+looks at three sizes."""
 
 from __future__ import annotations
 
@@ -27,12 +28,17 @@ NOW_S = 400.0
 
 
 class Shown:
-    """A page whose lines of the feed a test writes. While it is entered, browsers hear twice a second whether there is a box:
-    as in the command, which is never silent for longer, however slow the machine is."""
+    """A page whose lines of the feed a test writes. While it is entered, browsers hear twice a
+    second whether there is a box: as in the command, which is never silent for longer, however slow
+    the machine is."""
 
     def __init__(self, access: Access) -> None:
         self.server = PageServer(
-            "watch.html", access, lambda: round(NOW_S * feed_lines.SECOND), KEPT, {"sweep": self._sweep}
+            "watch.html",
+            access,
+            lambda: round(NOW_S * feed_lines.SECOND),
+            KEPT,
+            {"sweep": self._sweep},
         )
         self.board = PageBoard(self._publish)
         self._box: object = None
@@ -63,7 +69,8 @@ class Shown:
         return self.board.sweep(which)
 
     def shift(self) -> None:
-        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of the last twenty."""
+        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of
+        the last twenty."""
         self.board.take(feed_lines.hello())
         for number in range(1, 41):
             status = {5: "unsure", 11: "gap", 17: "unsure", 23: "no-contact"}.get(number, "ok")
@@ -86,22 +93,29 @@ def shown() -> Iterator[Shown]:
         yield one
 
 
-def opened(browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40) -> BrowsedPage:
+def opened(
+    browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40
+) -> BrowsedPage:
     """The page in a browser, with all of the shift."""
-    seen = BrowsedPage(browser.new_context(viewport={"width": width, "height": height}), shown.server.address)
+    seen = BrowsedPage(
+        browser.new_context(viewport={"width": width, "height": height}), shown.server.address
+    )
     until(lambda: seen.page.locator(".row").count() == rows)
     return seen
 
 
 def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
-    """Letters that are read from two metres: 20' of arc are 12 mm there, 57 px of a tablet's 0.2 mm; less at no size."""
+    """Letters that are read from two metres: 20' of arc are 12 mm there, 57 px of a tablet's 0.2
+    mm; less at no size."""
     for width, height in SIZES:
         seen = opened(browser, shown, width, height)
         assert seen.text("#label") == feed_lines.LABELS[40 % 6]
         assert seen.text("#sure") == "96.2 %"
         assert seen.text("#which").startswith("sweep 40, ")
         label = seen.page.locator("#label")
-        assert float(label.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")) >= (57 if width > 400 else 40)
+        assert float(label.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")) >= (
+            57 if width > 400 else 40
+        )
         box = label.bounding_box()
         assert box["y"] + box["height"] <= height  # without scrolling
         assert not seen.errors
@@ -141,13 +155,16 @@ def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
 
 
 def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, shown: Shown):
-    """The last one by itself; another by a click, until the latest is asked for; an old one has no signal any more."""
+    """The last one by itself; another by a click, until the latest is asked for; an old one has no
+    signal any more."""
     seen = opened(browser, shown)
     scores = seen.page.locator("#scores li").all_inner_texts()
     assert len(scores) == 6
     assert scores[0].split("\n") == [feed_lines.LABELS[40 % 6], "96.2 %"]
     until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
-    assert re.search(r"strongest at about [57]0 Hz", seen.page.get_attribute("#spectrogram", "aria-label"))
+    assert re.search(
+        r"strongest at about [57]0 Hz", seen.page.get_attribute("#spectrogram", "aria-label")
+    )
     seen.page.click(".row:nth-child(3)")
     until(lambda: seen.text("#sweep-title").startswith("Sweep 38"))
     shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
@@ -156,7 +173,9 @@ def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, sh
     seen.page.click("#follow")
     until(lambda: seen.text("#sweep-title").startswith("Sweep 41"))
     assert not seen.page.is_visible("#follow")
-    until(lambda: "not kept" in str(seen.page.get_attribute("#signal", "aria-label")))  # no `sweep` line came with it
+    until(
+        lambda: "not kept" in str(seen.page.get_attribute("#signal", "aria-label"))
+    )  # no `sweep` line came with it
     assert not seen.errors
 
 
@@ -178,9 +197,12 @@ def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
 
 
 def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
-    """The verdict says it, and leads to the view that shows where the skin has to go, with the service running."""
+    """The verdict says it, and leads to the view that shows where the skin has to go, with the
+    service running."""
     seen = opened(browser, shown)
-    shown.board.take(feed_lines.verdict(41, 390.0, "wood", moved="moved 2.2 mm too far towards row 1"))
+    shown.board.take(
+        feed_lines.verdict(41, 390.0, "wood", moved="moved 2.2 mm too far towards row 1")
+    )
     until(lambda: seen.text("#moved") == "moved 2.2 mm too far towards row 1: align the skin")
     seen.page.click("#moved a")
     seen.state("off")
@@ -196,7 +218,8 @@ def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
-    """12 x 32 taxels: a few rows and columns by their number, none over another; the contact's ring is large enough."""
+    """12 x 32 taxels: a few rows and columns by their number, none over another; the contact's ring
+    is large enough."""
     shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
     known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
     shown.board.take(feed_lines.hello(format=shape, alignment=known))
@@ -211,8 +234,12 @@ def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width
     assert len(boxes) == 4 + 9 + 1
     for i, one in enumerate(boxes):
         for other in boxes[:i]:
-            apart = max(one["x"] - other["x"] - other["width"], other["x"] - one["x"] - one["width"],
-                        one["y"] - other["y"] - other["height"], other["y"] - one["y"] - one["height"])  # fmt: skip
+            apart = max(
+                one["x"] - other["x"] - other["width"],
+                other["x"] - one["x"] - one["width"],
+                one["y"] - other["y"] - other["height"],
+                other["y"] - one["y"] - one["height"],
+            )
             assert apart >= -1
     assert seen.page.locator("#centre").bounding_box()["width"] > 12
     seen.page.context.close()
@@ -225,14 +252,20 @@ def test_loss_latency_and_the_box(browser: Any, shown: Shown):
     assert seen.text("#loss-said") == "3 of 270,003 since the start"
     assert "in 5 minutes" in seen.page.get_attribute("#loss", "aria-label")
     facts = seen.text("#facts dl")
-    for text in ("tubes 3, 6 labels (9f3c2a1b)", "on trial: 12 of 20 sweeps", "4x4 uint8 at 750 Hz", "process 71"):
+    for text in (
+        "tubes 3, 6 labels (9f3c2a1b)",
+        "on trial: 12 of 20 sweeps",
+        "4x4 uint8 at 750 Hz",
+        "process 71",
+    ):
         assert text in facts
     shown.board.take(feed_lines.health(380.0, loss_known=False, lost_frames=2))
     until(lambda: "at least 2" in seen.text("#loss-said"))
 
 
 def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
-    """While a setting allows them, at every size, without scrolling and beside whatever else is there; else not."""
+    """While a setting allows them, at every size, without scrolling and beside whatever else is
+    there; else not."""
     for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
         shown.board.take(feed_lines.health(380.0, unsigned=text))
         for width, height in SIZES:
@@ -247,12 +280,15 @@ def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
 
 
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
-    """It says so at once, why, and how old what it shows is; the box is there again by itself, with its new bundle."""
+    """It says so at once, why, and how old what it shows is; the box is there again by itself, with
+    its new bundle."""
     seen = opened(browser, shown)
     assert not seen.page.is_visible("#banner")
     shown.board.take({"type": "closed", "why": "the box is stopping"})
     until(lambda: seen.page.is_visible("#banner"))
-    said = re.compile(r"the box is away; last heard of it (?:(\d+) min )?(\d+) s ago: the box is stopping")
+    said = re.compile(
+        r"the box is away; last heard of it (?:(\d+) min )?(\d+) s ago: the box is stopping"
+    )
 
     def age_s() -> int:
         minutes, seconds = said.fullmatch(seen.text("#banner")).groups("0")
@@ -272,7 +308,8 @@ def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, sho
 
 
 def test_a_page_program_that_dies_and_comes_back(browser: Any):
-    """The connection is gone: said at once, tried again, and what the new program knows is shown in place of the old."""
+    """The connection is gone: said at once, tried again, and what the new program knows is shown in
+    place of the old."""
     first = Shown(Access(0))
     with first:
         first.shift()
@@ -293,22 +330,38 @@ def test_a_page_program_that_dies_and_comes_back(browser: Any):
 def test_a_skin_that_is_away_is_not_a_box_that_is_away(browser: Any, shown: Shown):
     """The banner names the skin and what to do."""
     seen = opened(browser, shown)
-    shown.board.take(feed_lines.health(NOW_S, skin="absent", trouble="no skin on USB; check the cable", ready=False))
+    shown.board.take(
+        feed_lines.health(
+            NOW_S, skin="absent", trouble="no skin on USB; check the cable", ready=False
+        )
+    )
     until(lambda: seen.page.is_visible("#banner"))
     assert seen.text("#banner") == "no skin: absent; no skin on USB; check the cable"
     assert seen.text("#state") == "skin absent"
 
 
 def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
-    """Tab goes from the views over the filter to the sweeps, each visibly; arrows choose a sweep, space a status."""
+    """Tab goes from the views over the filter to the sweeps, each visibly; arrows choose a sweep,
+    space a status."""
     seen = opened(browser, shown)
     stops = []
     for _ in range(8):
         seen.page.keyboard.press("Tab")
-        stops.append(seen.page.evaluate("document.activeElement.id || document.activeElement.textContent"))
+        stops.append(
+            seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
+        )
         outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
         assert float(outline.removesuffix("px")) >= 2
-    assert stops == ["Watch", "Align", "all 40", "ok 36", "unsure 2", "gap 1", "no-contact 1", "rows"]
+    assert stops == [
+        "Watch",
+        "Align",
+        "all 40",
+        "ok 36",
+        "unsure 2",
+        "gap 1",
+        "no-contact 1",
+        "rows",
+    ]
     seen.page.keyboard.press("ArrowDown")
     until(lambda: seen.text("#sweep-title").startswith("Sweep 39"))
     seen.page.keyboard.press("End")
@@ -322,7 +375,8 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
 
 
 def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
-    """Sections, pictures, lists and buttons, for who does not see them; what is urgent is spoken."""
+    """Sections, pictures, lists and buttons, for who does not see them; what is urgent is
+    spoken."""
     seen = opened(browser, shown)
     unnamed = seen.page.evaluate(
         """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")].filter((e) => !(e.textContent.trim()
@@ -338,10 +392,17 @@ def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), SIZES)
 @pytest.mark.parametrize("at", ["/", "/#align"])
-def test_every_text_can_be_read(browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str):
-    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also with a banner and each tone; nothing is too wide."""
+def test_every_text_can_be_read(
+    browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str
+):
+    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also with a banner and each tone;
+    nothing is too wide."""
     for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
-        shown.board.take(feed_lines.verdict(number, 390.0, "wood", status, moved="moved 2 mm too far towards row 1"))
+        shown.board.take(
+            feed_lines.verdict(
+                number, 390.0, "wood", status, moved="moved 2 mm too far towards row 1"
+            )
+        )
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = BrowsedPage(context, shown.server.address + at)
     until(lambda: seen.page.locator(".row").count() == 44 or bool(at[1:]))
@@ -362,8 +423,12 @@ def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
     seen = opened(browser, shown)
     boxes = "() => [...document.querySelectorAll('#watch > section')].map((e) => [e.offsetLeft, e.offsetTop, e.offsetWidth, e.offsetHeight])"
     before = seen.page.evaluate(boxes)
-    for number, (label, status) in enumerate([("foam", "ok"), ("", "no-start"), ("plastic smooth", "unsure")], 41):
-        moved = "moved 2.2 mm too far towards row 1 and 1.1 mm towards column 4" * (status == "unsure")
+    for number, (label, status) in enumerate(
+        [("foam", "ok"), ("", "no-start"), ("plastic smooth", "unsure")], 41
+    ):
+        moved = "moved 2.2 mm too far towards row 1 and 1.1 mm towards column 4" * (
+            status == "unsure"
+        )
         shown.board.take(feed_lines.verdict(number, 390.0, label, status, moved=moved))
         until(lambda number=number: seen.text("#which").startswith(f"sweep {number}"))
         shown.board.take(feed_lines.frame(380.0 + number, feed_lines.load(2.0, 2.0)))
@@ -374,8 +439,8 @@ def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
 
 
 def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
-    """Over TLS: the token is asked for; a wrong one is refused; with the right one, or a link that holds it, the page is
-    there, and a reload needs no token. The address shows none."""
+    """Over TLS: the token is asked for; a wrong one is refused; with the right one, or a link that
+    holds it, the page is there, and a reload needs no token. The address shows none."""
     page_secrets(tmp_path)
     token = (tmp_path / "token").read_text().strip()
     shown = Shown(Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0))
@@ -385,7 +450,10 @@ def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
         context = browser.new_context(ignore_https_errors=True)
         seen = BrowsedPage(context, address)
         assert seen.page.evaluate("document.activeElement.id") == "token"
-        for wrong, said in (("nonsense", "this is not the token"), ("schlüssel €", "letters and digits")):
+        for wrong, said in (
+            ("nonsense", "this is not the token"),
+            ("schlüssel €", "letters and digits"),
+        ):
             seen.page.fill("#token", wrong)
             seen.page.keyboard.press("Enter")
             until(lambda said=said: said in seen.text("#said"))

@@ -1,4 +1,5 @@
-"""`palpate watch --web` on a feed: what comes through, and what it survives: a box that ends, restarts, or is none."""
+"""`palpate watch --web` on a feed: what comes through, and what it survives: a box that ends,
+restarts, or is none."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def heard(watcher: PageWatcher, offered: Offered | None, name: str, reader: Even
 
 
 def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
-    """Verdicts with their probabilities, views of the frames, the sweep's picture under the number that is told."""
+    """Verdicts with their probabilities, views of the frames, the sweep's picture under the number
+    that is told."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "hello", reader)["labels"] == ["plastic rough", "wood"]
@@ -68,7 +70,8 @@ def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
 
 
 def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path: Path):
-    """With the first browser they come, with the last one they end: nobody's page costs the box nothing."""
+    """With the first browser they come, with the last one they end: nobody's page costs the box
+    nothing."""
     offered = Offered(path)
     until(lambda: (offered.turns(3), watcher.step(), watcher.feed.connected)[-1])
 
@@ -86,7 +89,8 @@ def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path:
 
 
 def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher, path: Path):
-    """The page hears at once that it is away, and why; then it is there again, and the history says what has changed."""
+    """The page hears at once that it is away, and why; then it is there again, and the history says
+    what has changed."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "box", reader) == {"there": True, "why": ""}
@@ -94,13 +98,18 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
     offered.feed.stopping()
     assert heard(watcher, None, "box", reader) == {"there": False, "why": "the box is stopping"}
     again = Offered(path)
-    again.feed._hello = again.feed._hello.replace(b"9f3c2a1b", b"aaaa0001").replace(b'"pid": ', b'"pid": 1')
+    again.feed._hello = again.feed._hello.replace(b"9f3c2a1b", b"aaaa0001").replace(
+        b'"pid": ', b'"pid": 1'
+    )
     assert heard(watcher, again, "box", reader) == {"there": True, "why": ""}
     assert "aaaa0001 in place of 9f3c2a1b" in heard(watcher, again, "note", reader)["text"]
 
 
-def test_a_box_that_is_not_there_is_shown_as_away(watcher: PageWatcher, path: Path, logged: list[str]):
-    """Again and again, so that browsers know that the page's program is there; the log has it once."""
+def test_a_box_that_is_not_there_is_shown_as_away(
+    watcher: PageWatcher, path: Path, logged: list[str]
+):
+    """Again and again, so that browsers know that the page's program is there; the log has it
+    once."""
     reader = EventReader(watcher.server)
     for _ in range(2):
         said = heard(watcher, None, "box", reader)
@@ -110,14 +119,23 @@ def test_a_box_that_is_not_there_is_shown_as_away(watcher: PageWatcher, path: Pa
 
 
 RUBBISH = [
-    b"\x00\xff\xfe\n", b"{}\n", b"[" * 100_000 + b"\n", b'{"type": "hello", "schema": 99}\n', b"x" * (2 << 20),
-    b'{"type": "health"}\n', (json.dumps(feed_lines.hello() | {"format": 7}) + "\n").encode(), b"",
-]  # fmt: skip
+    b"\x00\xff\xfe\n",
+    b"{}\n",
+    b"[" * 100_000 + b"\n",
+    b'{"type": "hello", "schema": 99}\n',
+    b"x" * (2 << 20),
+    b'{"type": "health"}\n',
+    (json.dumps(feed_lines.hello() | {"format": 7}) + "\n").encode(),
+    b"",
+]
 
 
 @pytest.mark.parametrize("sent", RUBBISH, ids=range(len(RUBBISH)))
-def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(watcher: PageWatcher, path: Path, sent: bytes):
-    """Whatever it sends: the page says that there is no box, the server goes on, and a real feed is read when it comes."""
+def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
+    watcher: PageWatcher, path: Path, sent: bytes
+):
+    """Whatever it sends: the page says that there is no box, the server goes on, and a real feed is
+    read when it comes."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()
@@ -151,8 +169,18 @@ def test_a_skin_that_is_lost_comes_with_its_reason(watcher: PageWatcher, path: P
 
 @pytest.mark.slow
 def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
-    """The real command: its address on standard error, the page, a box that is away, exit 0 at SIGTERM."""
-    command = [sys.executable, "-m", "appliance", "watch", "--web", "0", "--set", f"feed.socket={tmp_path}/none.sock"]
+    """The real command: its address on standard error, the page, a box that is away, exit 0 at
+    SIGTERM."""
+    command = [
+        sys.executable,
+        "-m",
+        "appliance",
+        "watch",
+        "--web",
+        "0",
+        "--set",
+        f"feed.socket={tmp_path}/none.sock",
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         address = re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1]
         there = PageAddress(address)

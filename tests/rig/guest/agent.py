@@ -1,4 +1,5 @@
-"""In the guest: runs shell lines for whoever sits at the other end of a virtio port. One JSON line in, one out.
+"""In the guest: runs shell lines for whoever sits at the other end of a virtio port. One JSON line
+in, one out.
 
 In: {"run": "...", "timeout_s": 30}. Out: {"rc": 0, "out": "..."}; rc 124 where the time was up.
 """
@@ -16,9 +17,13 @@ def answer(request: dict) -> dict:
     given = base64.b64decode(request.get("stdin", ""))
     try:
         done = subprocess.run(
-            ["/bin/sh", "-c", request["run"]], input=given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            timeout=request["timeout_s"], check=False,
-        )  # fmt: skip
+            ["/bin/sh", "-c", request["run"]],
+            input=given,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=request["timeout_s"],
+            check=False,
+        )
     except subprocess.TimeoutExpired as e:
         return {"rc": 124, "out": base64.b64encode(e.stdout or b"").decode()}
     return {"rc": done.returncode, "out": base64.b64encode(done.stdout).decode()}

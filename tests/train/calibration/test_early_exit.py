@@ -1,4 +1,5 @@
-"""Early decisions on the desktop: the rule on constructed tenths, heads, and the graph against what the box computes."""
+"""Early decisions on the desktop: the rule on constructed tenths, heads, and the graph against what
+the box computes."""
 
 from dataclasses import replace
 
@@ -20,7 +21,8 @@ from train.onnx_tools.graph_builder import run
 
 
 def tenths(n: int, places: int = 8, seed: int = 0, strength=None):
-    """Features [N, 10, 5] of n sweeps of three materials at each position, better separated with each tenth."""
+    """Features [N, 10, 5] of n sweeps of three materials at each position, better separated with
+    each tenth."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(3), n), places)
     means = 4 * np.eye(5)[:3]
@@ -30,8 +32,8 @@ def tenths(n: int, places: int = 8, seed: int = 0, strength=None):
 
 
 def certain(labels, when, wrong=()):
-    """Probabilities [n, 10, 3]: .4 of another material before the step `when` [n] and .9996 from then on; `wrong` sweeps name another
-    until the last."""
+    """Probabilities [n, 10, 3]: .4 of another material before the step `when` [n] and .9996 from
+    then on; `wrong` sweeps name another until the last."""
     p = np.full((len(labels), 10, 3), 0.3)
     for i, (k, w) in enumerate(zip(labels, when, strict=True)):
         p[i, :w, (k + 2) % 3] = 0.4
@@ -43,7 +45,8 @@ def certain(labels, when, wrong=()):
 
 
 def test_the_rule_decides_when_the_steps_are_certain():
-    """All sweeps are clear from the third tenth on: decided there with one step, and nothing is lost."""
+    """All sweeps are clear from the third tenth on: decided there with one step, and nothing is
+    lost."""
     labels = np.arange(300) % 3
     found = early_exit.find_rule(certain(labels, np.full(300, 2)), labels)
     assert found.early
@@ -52,7 +55,8 @@ def test_the_rule_decides_when_the_steps_are_certain():
 
 
 def test_a_rule_asks_for_agreement_where_one_step_deceives():
-    """A tenth that is certain and wrong for 2 % of the sweeps, once: two steps that agree are not deceived."""
+    """A tenth that is certain and wrong for 2 % of the sweeps, once: two steps that agree are not
+    deceived."""
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
@@ -65,7 +69,8 @@ def test_a_rule_asks_for_agreement_where_one_step_deceives():
 
 @pytest.mark.parametrize(("wrong", "off"), [(1, False), (2, True)])
 def test_half_a_point_and_no_more(wrong: int, off: bool):
-    """Of 300 sweeps one may turn wrong, a third of a point; two, which stay wrong until the end, may not."""
+    """Of 300 sweeps one may turn wrong, a third of a point; two, which stay wrong until the end,
+    may not."""
     labels = np.arange(300) % 3
     found = early_exit.find_rule(certain(labels, np.full(300, 2), range(wrong)), labels)
     assert (found.early is None) is off
@@ -88,12 +93,16 @@ def test_no_looser_level_after_one_that_lost():
     p[np.arange(200), 4, labels] = 0.9  # right at .9
     p[:10, 2] = 0.02
     p[np.arange(10), 2, (labels[:10] + 1) % 3] = 0.96  # ten are wrong at .96
-    assert early_exit.find_rule(p, labels).early is None or early_exit.find_rule(p, labels).early.least[0] > 0.96
+    assert (
+        early_exit.find_rule(p, labels).early is None
+        or early_exit.find_rule(p, labels).early.least[0] > 0.96
+    )
 
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
 def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
-    """early.decide against the appliance's inference.early_exit on random probabilities, some levels above 1."""
+    """early.decide against the appliance's inference.early_exit on random probabilities, some
+    levels above 1."""
     rng = np.random.default_rng(agree)
     p = classifier.softmax(2 * rng.standard_normal((200, 10, 3)))
     rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)
@@ -105,7 +114,8 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 
 @pytest.mark.slow
 def test_temperatures_calibrate_each_step():
-    """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every step."""
+    """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every
+    step."""
     x, y, at = tenths(40)
     done = posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool)))
     new, labels, _ = tenths(60, seed=9)
@@ -119,9 +129,13 @@ def test_temperatures_calibrate_each_step():
 def test_each_step_has_its_own_temperature():
     """The last temperature is the whole sweep's, each other one its own step's."""
     x, y, at = tenths(10, places=3, seed=3)
-    # the sweeps of a material at one position lie together: the heads are too sure of other positions
+    # the sweeps of a material at one position lie together: the heads are too sure of other
+    # positions
     x = x + 3 * np.random.default_rng(4).standard_normal((9, 1, 5))[3 * at + y]
-    done, every = posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool))), np.ones(len(y), bool)
+    done, every = (
+        posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool))),
+        np.ones(len(y), bool),
+    )
     logits, numbers = early_exit.cross_fitted_logits(x, y, at, every)
     cooler = early_exit.fit_temperatures(logits, y[numbers], at[numbers])
     assert len(set(cooler)) > 2
@@ -132,7 +146,8 @@ def test_each_step_has_its_own_temperature():
 
 @pytest.mark.slow
 def test_a_material_of_one_place_and_two_materials():
-    """A material that only one place has is still learned; of two materials, too: nothing is NaN."""
+    """A material that only one place has is still learned; of two materials, too: nothing is
+    NaN."""
     x, y, at = tenths(20)
     keep = (y != 2) | (at == 0)
     done = posthoc.fit_posthoc(plain_inputs(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool)))
@@ -144,28 +159,48 @@ def test_a_material_of_one_place_and_two_materials():
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk, one of whose features is untrained: Posthoc, features, raw counts, labels, Bundle."""
+    """A bundle's parts on the toy trunk, one of whose features is untrained: Posthoc, features, raw
+    counts, labels, Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
-    counts = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[None, ..., 0].repeat(72, 0)
+    counts = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[
+        None, ..., 0
+    ].repeat(72, 0)
     counts = np.rint(counts + rng.normal(0, 5, counts.shape)).astype(np.int16)
     trunks = trunk(FORM, True)
     x, size = run(trunks, counts), 1
-    done = posthoc.fit_posthoc(plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size))
+    done = posthoc.fit_posthoc(
+        plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
+    )
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = done.graph(trunk(FORM), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
-    manifest = Manifest("toy", "1", FORM, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0),
-                        {k: bundle.file_entry(v) for k, v in files.items()}, early=done.rule.early, known=done.known())  # fmt: skip
+    manifest = Manifest(
+        "toy",
+        "1",
+        FORM,
+        "raw",
+        ("a", "b", "c"),
+        Thresholds(1.0, 32767.0),
+        {k: bundle.file_entry(v) for k, v in files.items()},
+        early=done.rule.early,
+        known=done.known(),
+    )
     whole = bundle.Bundle(
-        manifest, "0", files[bundle.MODEL], counts[:2], run(model, counts[:2]), done.embedding.classes()
+        manifest,
+        "0",
+        files[bundle.MODEL],
+        counts[:2],
+        run(model, counts[:2]),
+        done.embedding.classes(),
     )
     return done, x, counts, labels, whole
 
 
 def test_the_graph_gives_what_training_computed(made):
-    """Logits, embedding and the heads of all tenths in the box's classifier are those of Posthoc."""
+    """Logits, embedding and the heads of all tenths in the box's classifier are those of
+    Posthoc."""
     done, x, counts, _, whole = made
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()
@@ -184,19 +219,24 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
-            classifier.softmax(run(model, counts[:2])), classifier.softmax(done.logits(x[:2, -1])), atol=1e-3
+            classifier.softmax(run(model, counts[:2])),
+            classifier.softmax(done.logits(x[:2, -1])),
+            atol=1e-3,
         )
 
 
 def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
     """What is left without `early` is, byte for byte, the model that was never given tenths."""
     done, _, _, _, whole = made
-    assert prune(whole.model, {"logits", "embedding"}) == done.graph(trunk(FORM)).SerializeToString()
+    assert (
+        prune(whole.model, {"logits", "embedding"}) == done.graph(trunk(FORM)).SerializeToString()
+    )
     assert len(prune(whole.model, {"early"})) < len(whole.model)
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
-    """enrolled_logits against appliance.inference.enrolment on the same sweeps, up to a term that all labels share."""
+    """enrolled_logits against appliance.inference.enrolment on the same sweeps, up to a term that
+    all labels share."""
     done, x, counts, labels, whole = made
     drawn = np.flatnonzero(labels == 1)[:3]
     new = enrolment.enrol(whole, "new", counts[drawn]).bundle
@@ -204,4 +244,6 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     means = Means(new.classes, new.manifest.known, new.manifest.labels)
     want = means.logits(means.distances(z)) * done.warmth
     have = uncertainty.enrolled_logits(done.embedding, z, z[drawn])
-    assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02)
+    assert np.allclose(
+        have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02
+    )

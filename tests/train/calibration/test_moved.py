@@ -1,4 +1,5 @@
-"""Sweeps of a moved skin, on Gaussians: what copies vary in makes nothing unknown, the rest does; certainty is limited."""
+"""Sweeps of a moved skin, on Gaussians: what copies vary in makes nothing unknown, the rest does;
+certainty is limited."""
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ MEANS = 8 * np.eye(4)[:3]
 
 
 def sweeps(n: int, seed: int, spread: float = 0.0):
-    """n sweeps of each of three materials at each of eight positions, features [N, 4], of which the last two are untrained;
-    the third varies by `spread` more."""
+    """n sweeps of each of three materials at each of eight positions, features [N, 4], of which the
+    last two are untrained; the third varies by `spread` more."""
     rng = np.random.default_rng(seed)
     labels, groups = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
     x = MEANS[labels] + rng.standard_normal((len(labels), 4))
@@ -22,7 +23,8 @@ def sweeps(n: int, seed: int, spread: float = 0.0):
 
 
 def made(n: int = 20, wrong: float = 0.0):
-    """A MovedFit; of the held-out copies the share `wrong` is named wrongly, less surely than the others are rightly."""
+    """A MovedFit; of the held-out copies the share `wrong` is named wrongly, less surely than the
+    others are rightly."""
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
     copies, copied_labels, copied_groups = sweeps(n, 1, spread=10)
@@ -35,15 +37,28 @@ def made(n: int = 20, wrong: float = 0.0):
 
 
 def test_copies_that_judge_are_moved_and_nothing_else():
-    """The skin's place, its contact and its gains change; what the sensor adds or loses does not."""
+    """The skin's place, its contact and its gains change; what the sensor adds or loses does
+    not."""
     usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
     judging = moved.displaced(usual)
-    assert (judging.noise, judging.noisy, judging.silent, judging.drift, judging.hum, judging.clipped) == (0,) * 6
-    assert (judging.shift, judging.damped, judging.gains) == (usual.shift, usual.damped, usual.gains)
+    assert (
+        judging.noise,
+        judging.noisy,
+        judging.silent,
+        judging.drift,
+        judging.hum,
+        judging.clipped,
+    ) == (0,) * 6
+    assert (judging.shift, judging.damped, judging.gains) == (
+        usual.shift,
+        usual.damped,
+        usual.gains,
+    )
 
 
 def test_what_the_copies_vary_in_makes_nothing_unknown():
-    """Far in the copies' direction: beyond the limit in place, within that of moved sweeps; in another direction beyond both."""
+    """Far in the copies' direction: beyond the limit in place, within that of moved sweeps; in
+    another direction beyond both."""
     z, fit, _ = made()
     assert fit
     x = sweeps(50, 5, spread=10)[0]
@@ -63,11 +78,14 @@ def test_the_box_measures_the_same_distances():
     assert classes.moved
     x = sweeps(3, 7)[0]
     away = (z(x) @ classes.moved.turn)[:, None] - classes.moved.means
-    assert (away**2).sum(axis=2) == pytest.approx(fit.turned.distances(fit.turned(z(x))), rel=1e-3, abs=1e-3)
+    assert (away**2).sum(axis=2) == pytest.approx(
+        fit.turned.distances(fit.turned(z(x))), rel=1e-3, abs=1e-3
+    )
 
 
 def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
-    """Ten in a hundred wrong with a probability of .62: more is asked for; where all are right, no more than for any sweep."""
+    """Ten in a hundred wrong with a probability of .62: more is asked for; where all are right, no
+    more than for any sweep."""
     _, fit, _ = made()
     assert fit
     assert (fit.rule.unsure, fit.rule.temperature) == (moved.UNSURE[0], 1)
@@ -91,7 +109,8 @@ def test_copies_that_are_surely_wrong_leave_no_sure_answer():
 
 
 def test_without_copies_that_judge_there_is_no_rule():
-    """No copies of held-out sweeps; a material without copies; a material that only held-out sweeps have."""
+    """No copies of held-out sweeps; a material without copies; a material that only held-out sweeps
+    have."""
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])

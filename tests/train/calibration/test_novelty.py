@@ -1,4 +1,5 @@
-"""Novelty on Gaussians whose truth is known: the embedding is LDA, the limit keeps the share that it states."""
+"""Novelty on Gaussians whose truth is known: the embedding is LDA, the limit keeps the share that
+it states."""
 
 import numpy as np
 import pytest
@@ -19,22 +20,32 @@ def gaussians(n: int, means, seed: int = 0, mix=None):
 
 @pytest.mark.parametrize("fixed", [0, 3])
 def test_the_embedding_is_lda(fixed: int):
-    """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the covariance is 1."""
+    """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the
+    covariance is 1."""
     mix = np.random.default_rng(1).standard_normal((7, 7))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
     one = novelty.embed(x, y, fixed)
     assert one.means.shape == (4, 3 + fixed)
-    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(x, y)
+    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(
+        x, y
+    )
     want = x @ lda.coef_.T + lda.intercept_
     have = one.logits(x)
-    assert np.allclose(have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=1e-3)
+    assert np.allclose(
+        have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=1e-3
+    )
     half = -one.distances(one(x)) / 2
-    assert np.allclose(half - half.mean(1, keepdims=True), have - have.mean(1, keepdims=True), atol=1e-3)
-    assert np.allclose(one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + fixed), atol=1e-3)
+    assert np.allclose(
+        half - half.mean(1, keepdims=True), have - have.mean(1, keepdims=True), atol=1e-3
+    )
+    assert np.allclose(
+        one.projection.T @ lda.covariance_ @ one.projection, np.eye(3 + fixed), atol=1e-3
+    )
 
 
 def test_untrained_features_are_kept_completely():
-    """With `fixed` all directions of the last features are kept: the distance is the full Mahalanobis distance there."""
+    """With `fixed` all directions of the last features are kept: the distance is the full
+    Mahalanobis distance there."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
     unknown = np.array([[0.0, 0.0, 20.0]])
     assert novelty.embed(x, y, 0).novelty(unknown)[0] < 10
@@ -42,16 +53,21 @@ def test_untrained_features_are_kept_completely():
 
 
 def test_each_material_has_its_own_shape_in_untrained_features():
-    """Of a material whose sweeps hardly vary, one that others' sweeps reach is unlike it; of few sweeps the shape is common."""
+    """Of a material whose sweeps hardly vary, one that others' sweeps reach is unlike it; of few
+    sweeps the shape is common."""
     x, y = gaussians(400, [[0, 0, 0], [60, 0, 0]])
     x[y == 0, 2] *= 0.1
     one = novelty.embed(x, y, 1)
     narrow, wide = one.novelty(np.array([[0, 0, 2.0], [60, 0, 2.0]]))
     assert narrow > 20 * wide
-    assert np.allclose(np.abs(one.shapes[1]), 1 / np.sqrt(2), rtol=0.2)  # its variance is twice the common one
+    assert np.allclose(
+        np.abs(one.shapes[1]), 1 / np.sqrt(2), rtol=0.2
+    )  # its variance is twice the common one
     few = novelty.embed(*gaussians(2, [[0, 0, 0], [60, 0, 0]]), 3)
     assert np.isfinite(few.shapes).all()
-    assert (np.linalg.eigvalsh(few.shapes.astype(float) @ few.shapes.astype(float).swapaxes(1, 2)) < 2).all()
+    assert (
+        np.linalg.eigvalsh(few.shapes.astype(float) @ few.shapes.astype(float).swapaxes(1, 2)) < 2
+    ).all()
     assert novelty.embed(x, y).shapes.shape == (2, 0, 0)
 
 
@@ -78,10 +94,14 @@ def test_what_cannot_be_embedded_is_refused(labels, why: str):
 
 
 def test_the_limit_keeps_what_it_promises():
-    """Over many draws a limit of 99 sweeps keeps what is asked for of new ones; with few sweeps it is the largest."""
+    """Over many draws a limit of 99 sweeps keeps what is asked for of new ones; with few sweeps it
+    is the largest."""
     rng = np.random.default_rng(0)
     for asked in (0.95, novelty.KEPT):
-        kept = [np.mean(rng.chisquare(5, 500) <= novelty.limit(rng.chisquare(5, 99), asked)) for _ in range(200)]
+        kept = [
+            np.mean(rng.chisquare(5, 500) <= novelty.limit(rng.chisquare(5, 99), asked))
+            for _ in range(200)
+        ]
         assert abs(np.mean(kept) - asked) < 0.006
     assert novelty.limit(np.array([1.0, 7.0, 3.0])) == 7.0
     with pytest.raises(FormatError, match="several positions"):
@@ -89,7 +109,8 @@ def test_the_limit_keeps_what_it_promises():
 
 
 def test_the_limit_knows_positions_that_were_not_seen():
-    """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within them it does not."""
+    """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within
+    them it does not."""
 
     def drawn(places, seed):
         x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)
@@ -100,10 +121,17 @@ def test_the_limit_knows_positions_that_were_not_seen():
     one, every = novelty.embed(x, y, 2), np.ones(len(y), bool)
     across = novelty.limit(novelty.cross_fitted_distances(x, y, at, every, 2), 0.95)
     assert 0.93 < np.mean(one.novelty(new) <= across) < 0.97
-    seven = at < 7  # with few places the covariance is too small, and what fits itself is far too narrow
-    narrow, mine, them = novelty.embed(x[seven], y[seven], 2), (x[seven], y[seven], at[seven]), every[seven]
+    seven = (
+        at < 7
+    )  # with few places the covariance is too small, and what fits itself is far too narrow
+    narrow, mine, them = (
+        novelty.embed(x[seven], y[seven], 2),
+        (x[seven], y[seven], at[seven]),
+        every[seven],
+    )
     itself, others = (
-        novelty.limit(s, 0.95) for s in (narrow.novelty(x[seven]), novelty.cross_fitted_distances(*mine, them, 2))
+        novelty.limit(s, 0.95)
+        for s in (narrow.novelty(x[seven]), novelty.cross_fitted_distances(*mine, them, 2))
     )
     kept = [np.mean(narrow.novelty(new) <= at_most) for at_most in (itself, others)]
     assert kept[0] < 0.9 < kept[1]
@@ -135,8 +163,9 @@ def test_auroc_of_a_known_separation():
 
 
 def test_untrained_features_are_selected_and_not_multiplied():
-    """Where there are more features than directions the projection is that of all features, from a matrix for the trained
-    ones alone: the covariance of z is 1, and the last features decide by themselves in their own span."""
+    """Where there are more features than directions the projection is that of all features, from a
+    matrix for the trained ones alone: the covariance of z is 1, and the last features decide by
+    themselves in their own span."""
     mix = np.random.default_rng(1).standard_normal((20, 20))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)) @ mix, mix=mix)
     one = novelty.embed(x, y, 5)

@@ -17,13 +17,17 @@ def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features [N, 10, 4] of three materials at eight places, labels [N], places [N]."""
     labels, places = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
     means = 9 * np.eye(3, 4)
-    x = means[labels][:, None] + np.random.default_rng(1).standard_normal((len(labels), 1, 4)) + np.zeros((1, 10, 1))
+    x = (
+        means[labels][:, None]
+        + np.random.default_rng(1).standard_normal((len(labels), 1, 4))
+        + np.zeros((1, 10, 1))
+    )
     return x, labels, places
 
 
 def test_a_disturbed_sweep_of_a_known_material_stays_known():
-    """One in ten of the sweeps is disturbed: then others are no longer unknown. A third material still is, and head, temperature and
-    what judges are as they were."""
+    """One in ten of the sweeps is disturbed: then others are no longer unknown. A third material
+    still is, and head, temperature and what judges are as they were."""
     x, y, at = world()
     known = y < 2
     one = np.arange(known.sum()) % ONE_IN == 0
@@ -38,7 +42,9 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     assert kept[0] < 0.3
     assert kept[1] > 0.8
     assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limit) < 0.05
-    np.testing.assert_array_equal(sturdy.weight * sturdy.temperature, plain.weight * plain.temperature)
+    np.testing.assert_array_equal(
+        sturdy.weight * sturdy.temperature, plain.weight * plain.temperature
+    )
     assert (sturdy.held.numbers < known.sum()).all()
 
 
@@ -46,8 +52,19 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten of them, changed, of the same materials and groups; none judges."""
     fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
     given = posthoc_inputs(fit)
-    tenths, labels, groups, judged, disturbed = given.tenths, given.labels, given.groups, given.judged, given.disturbed
-    assert len(tenths) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + disturbed.sum()
+    tenths, labels, groups, judged, disturbed = (
+        given.tenths,
+        given.labels,
+        given.groups,
+        given.judged,
+        given.disturbed,
+    )
+    assert (
+        len(tenths)
+        == len(labels)
+        == len(groups)
+        == len(fit.train) + len(fit.held) + disturbed.sum()
+    )
     assert disturbed.sum() == -(-len(fit.train) // ONE_IN)
     assert not (judged & disturbed).any()
     assert not set(groups[disturbed]) & set(groups[judged])

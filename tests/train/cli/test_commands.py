@@ -27,7 +27,17 @@ from train.models.compact.fit import Fit
 def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """What was not trained on is written as a set, recordings kept; together it is everything."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
-    args = ["fit", "--set", str(tmp_path / "easy.npz"), "--seed", "1", "--steps", "4", "--only", "speed<=2"]
+    args = [
+        "fit",
+        "--set",
+        str(tmp_path / "easy.npz"),
+        "--seed",
+        "1",
+        "--steps",
+        "4",
+        "--only",
+        "speed<=2",
+    ]
     args += [
         "--split",
         "recording:0.7",
@@ -40,7 +50,9 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     made, rest = Fit.load(tmp_path / "new" / "fit.npz"), sets.load(str(tmp_path / "rest.npz"))
     parts = [set(s.groups["recording"]) for s in (made.train, made.held, rest)]
     whole = easy(20, pieces=2).select(["speed<=2"])
-    assert sum(map(len, parts)) == len(set.union(*parts)) == len(np.unique(whole.groups["recording"]))
+    assert (
+        sum(map(len, parts)) == len(set.union(*parts)) == len(np.unique(whole.groups["recording"]))
+    )
     assert len(made.train) + len(made.held) + len(rest) == len(whole)
     out = capsys.readouterr().out
     figure = r"\d+\.\d % \[\d+\.\d, \d+\.\d\] of \d+"
@@ -55,24 +67,42 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         (["--set", "sim:T-LAB:1:1", "--only", "force=1"], "no group 'force'"),
         (["--set", "sim:T-LAB:1:1", "--split", "recording"], "split 'recording' cannot be read"),
         (["--set", "sim:T-LAB:1:1", "--rest", "rest.npz"], "--rest needs --split"),
-        (["--set", "sim:T-LAB:1:1", "--seed", "-1"], "--seed -1 is out of range; use a whole number from 0 on"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--seed", "-1"],
+            "--seed -1 is out of range; use a whole number from 0 on",
+        ),
         (["--set", "sim:T-LAB:1:1", "--steps", "-1"], "--steps -1 is out of range"),
         (["--set", "sim:T-LAB:1:1", "--steps", "x"], "--steps x is out of range"),
-        (["--set", "sim:T-LAB:1:1", "--steps", "0", "--size", "1k"], "--steps 0 trains no network; use 2 or more"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--steps", "0", "--size", "1k"],
+            "--steps 0 trains no network; use 2 or more",
+        ),
         (
             ["--set", "sim:T-LAB:1:1", "--reattached", "--size", "1k"],
             "--reattached is for the default recipe; --size 1k",
         ),
-        (["--set", "sim:T-LAB:1:1", "--row-shift", "3"], "--row-shift 3 is out of range; use a number from 0 to 1"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--row-shift", "3"],
+            "--row-shift 3 is out of range; use a number from 0 to 1",
+        ),
         (["--set", "sim:T-LAB:1:1", "--stretch", "-1"], "--stretch -1 is out of range"),
         (
             ["--set", "sim:T-LAB:1:1", "--out", "/proc/none/fit.npz"],
             "--out /proc/none/fit.npz: cannot be written there",
         ),
         (["--set", "sim:T-LAB:1:1", "--out", "/"], "--out / is a folder; name a file"),
-        (["--set", "sim:T-LAB:1:1", "--rename", "wood"], "--rename 'wood' cannot be read; write OLD=NEW"),
-        (["--set", "sim:T-LAB:1:1", "--rename", "wod=oak"], "no material is called 'wod'; did you mean 'wood'?"),
-        (["--set", "sim:T-LAB:1:1", "--rename", "wood=a", "--rename", "wood=b"], "'wood' two names, 'a' and 'b'"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood"],
+            "--rename 'wood' cannot be read; write OLD=NEW",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wod=oak"],
+            "no material is called 'wod'; did you mean 'wood'?",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a", "--rename", "wood=b"],
+            "'wood' two names, 'a' and 'b'",
+        ),
         (
             ["--set", "sim:T-LAB:1:1", "--rename", "wood=a,b", "--rename", "foam=" + "f" * 33],
             "cannot send 'a,b' (3 charac",
@@ -87,7 +117,10 @@ def test_an_error_of_the_project_is_one_line(
     args: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """The exit code of a FormatError and its message on the error stream."""
-    assert main(["fit", "--seed", "1", "--out", str(tmp_path / "fit.npz"), *args]) == FormatError.exit_code
+    assert (
+        main(["fit", "--seed", "1", "--out", str(tmp_path / "fit.npz"), *args])
+        == FormatError.exit_code
+    )
     err = capsys.readouterr().err
     assert err.startswith("palpate-train: ")
     assert message in err
@@ -98,7 +131,9 @@ def test_an_error_of_the_project_is_one_line(
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
     """`palpate-train methods | head -1`: exit code 1, and nothing on the error stream."""
     command = [sys.executable, "-m", "train", "methods"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout
         assert process.stderr
         process.stdout.close()
@@ -109,15 +144,56 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["choose", "--scene", "none.toml", "--out", "/proc/none/b"], "cannot be written to /proc/none/b"),
-        (["export", "none.npz", "--out", "/proc/none/b", "--name", "b", "--version", "1"], "written to /proc/none/b"),
-        (["pack", "--set", "none", "--method", "H", "--seed", "1", "--out", "/proc/none/b", "--name", "b", "--version", "1"],
-         "written to /proc/none/b"),
-        (["score", "none", "--set", "none.npz", "--json", "/proc/none/x.json"], "--json /proc/none/x.json: cannot be"),
-        (["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--jobs", "0"], "--jobs 0 is out of range"),
-        (["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--effort", "0"], "--effort 0 is out of"),
+        (
+            ["choose", "--scene", "none.toml", "--out", "/proc/none/b"],
+            "cannot be written to /proc/none/b",
+        ),
+        (
+            ["export", "none.npz", "--out", "/proc/none/b", "--name", "b", "--version", "1"],
+            "written to /proc/none/b",
+        ),
+        (
+            [
+                "pack",
+                "--set",
+                "none",
+                "--method",
+                "H",
+                "--seed",
+                "1",
+                "--out",
+                "/proc/none/b",
+                "--name",
+                "b",
+                "--version",
+                "1",
+            ],
+            "written to /proc/none/b",
+        ),
+        (
+            ["score", "none", "--set", "none.npz", "--json", "/proc/none/x.json"],
+            "--json /proc/none/x.json: cannot be",
+        ),
+        (
+            ["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--jobs", "0"],
+            "--jobs 0 is out of range",
+        ),
+        (
+            [
+                "evaluate",
+                "--set",
+                "none",
+                "--protocol",
+                "random:2",
+                "--method",
+                "H",
+                "--effort",
+                "0",
+            ],
+            "--effort 0 is out of",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_written_or_computed_is_refused_first(
     args: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ):
@@ -128,14 +204,27 @@ def test_what_cannot_be_written_or_computed_is_refused_first(
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    (["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"], "the same command goes on where it was"),
-    (["score", str(bundle.DEFAULT), "--set", "x"], "the same command begins anew"),
-    (["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"], "the same command goes on where it was"),
-    (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (
+            ["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"],
+            "the same command goes on where it was",
+        ),
+        (["score", str(bundle.DEFAULT), "--set", "x"], "the same command begins anew"),
+        (
+            ["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"],
+            "the same command goes on where it was",
+        ),
+        (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
+    ],
+)
 def test_an_interrupted_command_says_what_becomes_of_it(
-    args: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    args: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
     """Ctrl-C: exit code 130, one line; whether the next call begins anew."""
 
@@ -153,7 +242,8 @@ def test_an_interrupted_command_says_what_becomes_of_it(
 def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     default_bundle: Bundle, capsys: pytest.CaptureFixture[str], labels: int, told: bool
 ):
-    """Four lines have fifteen codes beside 0: with one label more the figures say how many lines are needed."""
+    """Four lines have fifteen codes beside 0: with one label more the figures say how many lines
+    are needed."""
     manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
     bundles._print(manifest, bundle.DEFAULT)
     line = "answers on lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
@@ -179,7 +269,9 @@ def test_signing_does_without_the_imports_of_training():
     code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "usage: palpate-train sign" in done.stdout
-    assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {*done.stdout.split()}
+    assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {
+        *done.stdout.split()
+    }
 
 
 def few(tmp_path: Path) -> Path:
@@ -195,16 +287,28 @@ def few(tmp_path: Path) -> Path:
 def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], only: list[str]
 ):
-    """Materials without a sweep, which are left out, and taxels that never change; materials that --only leaves out are
-    meant."""
-    args = ["evaluate", "--set", str(few(tmp_path)), "--method", "L-svm", "--protocol", "leave:speed", "--jobs", "1"]
+    """Materials without a sweep, which are left out, and taxels that never change; materials that
+    --only leaves out are meant."""
+    args = [
+        "evaluate",
+        "--set",
+        str(few(tmp_path)),
+        "--method",
+        "L-svm",
+        "--protocol",
+        "leave:speed",
+        "--jobs",
+        "1",
+    ]
     assert main([*args, "--cache", str(tmp_path), *only]) == 0
     err = capsys.readouterr().err
     assert "warning: taxels that never change in any sweep: 1.2;" in err
     assert ("warning: materials without a sweep: ghost;" in err) == (not only)
 
 
-def test_a_material_of_one_recording_is_told_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_material_of_one_recording_is_told_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """By fit, which has nothing to judge with; by export, which refuses such a fit; by evaluate."""
     args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
     why = "split by 'recording' leaves one sweep of 'high'; record more of it"
@@ -214,12 +318,28 @@ def test_a_material_of_one_recording_is_told_by_its_name(tmp_path: Path, capsys:
         f"nothing was held out that could judge the model, so export will refuse it: few.npz: {why}"
         in capsys.readouterr().out
     )
-    assert main(["export", fit, "--out", str(tmp_path / "b"), "--name", "b", "--version", "1"]) == 65
+    assert (
+        main(["export", fit, "--out", str(tmp_path / "b"), "--name", "b", "--version", "1"]) == 65
+    )
     assert why in capsys.readouterr().err
     assert main(["evaluate", *args, "--method", "L-svm", "--protocol", "random:2"]) == 65
     assert "material 'high' has one recording" in capsys.readouterr().err
-    assert main(["evaluate", "--set", str(tmp_path / "few.npz"), "--only", "material=low,middle",
-                 "--method", "L-svm", "--protocol", "random:9"]) == 65  # fmt: skip
+    assert (
+        main(
+            [
+                "evaluate",
+                "--set",
+                str(tmp_path / "few.npz"),
+                "--only",
+                "material=low,middle",
+                "--method",
+                "L-svm",
+                "--protocol",
+                "random:9",
+            ]
+        )
+        == 65
+    )
     assert "'low' has 6: use random:6 or less" in capsys.readouterr().err
 
 

@@ -1,4 +1,5 @@
-"""palpate-train import, as a user calls it: the five commands of docs/import.md, its report, its exit codes."""
+"""palpate-train import, as a user calls it: the five commands of docs/import.md, its report, its
+exit codes."""
 
 from __future__ import annotations
 
@@ -32,8 +33,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ):
-    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, most of the rest is named, and no
-    library says a word."""
+    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, most of the
+    rest is named, and no library says a word."""
     monkeypatch.chdir(tmp_path)
     folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
     assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
@@ -50,15 +51,23 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     out, err = capsys.readouterr()
     assert [*caplog.messages, *re.findall(".*[Ww]arning.*|.*Gemm.*", err)] == []
     assert "they helped to choose the model" in out
-    assert "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n" in out
-    assert f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
+    assert (
+        "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n"
+        in out
+    )
+    assert (
+        f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n"
+        in out
+    )
     assert "left out: README.md: its name does not fit the pattern" in out
     found = re.search(r"named rightly: (\d+) of 18: ", out)
     assert found
     assert int(found[1]) >= 12
 
 
-def test_a_broken_file_is_told_and_the_others_are_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_broken_file_is_told_and_the_others_are_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """Its line, the set of the rest, a report with a line for each file, exit code 65."""
     folder = csv_folder(tmp_path / "r", each=1, positions=1)
     (folder / "foam_p0_1.csv").write_text("time,s0\n0,1\n0,x\n")
@@ -76,7 +85,9 @@ def test_a_broken_file_is_told_and_the_others_are_imported(tmp_path: Path, capsy
     assert main(args) == 65
     told = capsys.readouterr()
     assert "left out: foam_p0_1.csv: line 3, column 2 is 'x', which is no number" in told.out
-    assert told.err.splitlines()[-1].startswith("palpate-train: 1 of 4 files could not be used, as said above")
+    assert told.err.splitlines()[-1].startswith(
+        "palpate-train: 1 of 4 files could not be used, as said above"
+    )
     assert len(sets.load(str(tmp_path / "s.h5"))) == 3
     report = dict(line.split("\t") for line in (tmp_path / "report.txt").read_text().splitlines())
     assert report["metal_p0_1.csv"] == "taken: 1 windows of 2100 frames"
@@ -88,21 +99,35 @@ def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.Cap
     """Five lines of twelve, the rest in one; nothing is written but the report."""
     for k in range(12):
         write(tmp_path / "r" / f"wood_{k:02}.csv", np.zeros((9, 4)), 100.0)
-    args = ["import", str(tmp_path / "r"), "--pattern", "{material}_{trial}.csv", "--rate", "100", "--grid", "4x4"]
+    args = [
+        "import",
+        str(tmp_path / "r"),
+        "--pattern",
+        "{material}_{trial}.csv",
+        "--rate",
+        "100",
+        "--grid",
+        "4x4",
+    ]
     args += ["--out", str(tmp_path / "s.npz"), "--report", str(tmp_path / "report.txt")]
     assert main(args) == 65
     told = capsys.readouterr()
     assert told.out.count("left out: ") == 6
-    assert "left out: 7 more for the same reason: it has 5 columns, a grid of 4x4 takes 16" in told.out
+    assert (
+        "left out: 7 more for the same reason: it has 5 columns, a grid of 4x4 takes 16" in told.out
+    )
     assert "none of 12 files could be taken" in told.err
     assert not (tmp_path / "s.npz").exists()
     assert len((tmp_path / "report.txt").read_text().splitlines()) == 12
 
 
-@pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA names no folder of real sweeps")
+@pytest.mark.skipif(
+    "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA names no folder of real sweeps"
+)
 @pytest.mark.slow
 def test_real_sweeps_come_back_from_csv(tmp_path: Path):
-    """FabricSlide, each window as a CSV file with its force and speed in the name: the same counts and groups come back."""
+    """FabricSlide, each window as a CSV file with its force and speed in the name: the same counts
+    and groups come back."""
     real = sets.load(str(Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"))
     real = real.take(np.arange(len(real)) % 20 == 0)
     for i, counts in enumerate(real.samples):
@@ -116,7 +141,16 @@ def test_real_sweeps_come_back_from_csv(tmp_path: Path):
         "--time",
         "time:ms",
     ]
-    args += ["--grid", "16x1", "--window", "128", "--dtype", real.samples.dtype.name, "--out", str(tmp_path / "s.npz")]
+    args += [
+        "--grid",
+        "16x1",
+        "--window",
+        "128",
+        "--dtype",
+        real.samples.dtype.name,
+        "--out",
+        str(tmp_path / "s.npz"),
+    ]
     assert main(args) == 0
     made = sets.load(str(tmp_path / "s.npz"))
     order = np.argsort(made.groups["number"])
@@ -124,7 +158,9 @@ def test_real_sweeps_come_back_from_csv(tmp_path: Path):
     np.testing.assert_array_equal(made.samples[order], real.samples)
     for group in ("force", "speed"):
         np.testing.assert_array_equal(made.groups[group][order], real.groups[group])
-    assert [made.materials[k] for k in made.labels[order]] == [real.materials[k] for k in real.labels]
+    assert [made.materials[k] for k in made.labels[order]] == [
+        real.materials[k] for k in real.labels
+    ]
 
 
 def test_a_folder_that_may_not_be_read_is_told(
@@ -137,5 +173,10 @@ def test_a_folder_that_may_not_be_read_is_told(
 
     monkeypatch.setattr(Path, "iterdir", denied)
     out = str(tmp_path / "x.npz")
-    assert main(["import", str(tmp_path), "--pattern", "{material}.csv", "--rate", "100", "--out", out]) == 65
+    assert (
+        main(
+            ["import", str(tmp_path), "--pattern", "{material}.csv", "--rate", "100", "--out", out]
+        )
+        == 65
+    )
     assert "the folder cannot be read: Permission denied" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""Progress as a person sees it: a bar on a terminal that leaves nothing behind, lines now and then in a log."""
+"""Progress as a person sees it: a bar on a terminal that leaves nothing behind, lines now and then
+in a log."""
 
 from __future__ import annotations
 
@@ -31,12 +32,17 @@ sys.exit(3)
 
 
 def on_a_terminal(out_too: bool) -> tuple[str, str]:
-    """What the script shows on a terminal of 100 columns, and what it prints where its output goes elsewhere."""
+    """What the script shows on a terminal of 100 columns, and what it prints where its output goes
+    elsewhere."""
     far, near = pty.openpty()
     done = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT], cwd=ROOT, stdin=near, stderr=near, stdout=near if out_too else subprocess.PIPE,
+        [sys.executable, "-c", SCRIPT],
+        cwd=ROOT,
+        stdin=near,
+        stderr=near,
+        stdout=near if out_too else subprocess.PIPE,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
-    )  # fmt: skip
+    )
     os.close(near)
     shown = terminals.read(far, done)
     os.close(far)
@@ -47,16 +53,25 @@ def on_a_terminal(out_too: bool) -> tuple[str, str]:
 
 @pytest.mark.slow
 def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
-    """How much is done, the line as it was written, what is printed above; at the end the cursor is back."""
+    """How much is done, the line as it was written, what is printed above; at the end the cursor is
+    back."""
     shown, printed = on_a_terminal(out_too=False)
-    for text in ("━", "1/4 done, ", "(the first [bold]fold[/bold])", "a line that stays", "not counted {what}"):
+    for text in (
+        "━",
+        "1/4 done, ",
+        "(the first [bold]fold[/bold])",
+        "a line that stays",
+        "not counted {what}",
+    ):
         assert text in shown, text
     assert printed == "a result\n"
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
     assert "a result" in on_a_terminal(out_too=True)[0]
 
 
-def test_a_log_has_a_line_now_and_then(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def test_a_log_has_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     """Whole lines without escapes; none before its time, but for those that are kept."""
     log = options.Log()
     log(ProgressLine.of(1, 2, 3.0, "early"))

@@ -11,9 +11,17 @@ from train.data.file_names import NamePattern, group
 @pytest.mark.parametrize(
     ("pattern", "path", "fields"),
     [
-        ("{material}_{force}N_{trial}.csv", "wood_2.5N_3.csv", {"material": "wood", "force": "2.5", "trial": "3"}),
+        (
+            "{material}_{force}N_{trial}.csv",
+            "wood_2.5N_3.csv",
+            {"material": "wood", "force": "2.5", "trial": "3"},
+        ),
         ("{material}/{speed}/{}.csv", "wood/fast/run 7.csv", {"material": "wood", "speed": "fast"}),
-        ("{material}_{force:d}N.csv", "plastic_rough_5N.csv", {"material": "plastic_rough", "force": "5"}),
+        (
+            "{material}_{force:d}N.csv",
+            "plastic_rough_5N.csv",
+            {"material": "plastic_rough", "force": "5"},
+        ),
         ("{material}_{x:f}.csv", "wood_-0.5.csv", {"material": "wood", "x": "-0.5"}),
         ("{material}.(1).csv", "a+b.(1).csv", {"material": "a+b"}),
         ("{material}.csv", "wood.txt", None),
@@ -28,7 +36,9 @@ def test_a_pattern_reads_a_name(pattern: str, path: str, fields: dict[str, str] 
 
 def test_a_name_that_fits_in_several_ways_is_refused():
     """`plastic_rough_5N_1` may be plastic or plastic_rough; nothing is guessed."""
-    with pytest.raises(FormatError, match="several ways \\(material 'plastic' or 'plastic_rough'\\); say which"):
+    with pytest.raises(
+        FormatError, match="several ways \\(material 'plastic' or 'plastic_rough'\\); say which"
+    ):
         NamePattern("{material}_{force}N_{trial}.csv").read("plastic_rough_5N_1.csv")
 
 
@@ -59,6 +69,7 @@ def test_what_is_no_pattern_is_refused(pattern: str, message: str):
     ],
 )
 def test_texts_become_numbers_that_are_told(texts: list[str], values: list[int], meaning: str):
-    """Whole numbers stay; others are ranked by value, or by name, and the report says what a rank is."""
+    """Whole numbers stay; others are ranked by value, or by name, and the report says what a rank
+    is."""
     numbers, told = group(texts)
     assert (numbers.tolist(), told) == (values, meaning)

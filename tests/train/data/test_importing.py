@@ -1,4 +1,5 @@
-"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; what cannot be used gets one exact line."""
+"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; what cannot be used gets one exact
+line."""
 
 from __future__ import annotations
 
@@ -46,7 +47,9 @@ def reasons(folder: Path, **changes: object) -> dict[str, str]:
 def text(path: Path, counts: np.ndarray = COUNTS, delimiter: str = ",", head: str = "") -> Path:
     """Counts as text, without times."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(head + "".join(delimiter.join(f"{c:g}" for c in row) + "\n" for row in counts.tolist()))
+    path.write_text(
+        head + "".join(delimiter.join(f"{c:g}" for c in row) + "\n" for row in counts.tolist())
+    )
     return path
 
 
@@ -70,7 +73,8 @@ FORMS = {
 
 @pytest.mark.parametrize("suffix", FORMS)
 def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
-    """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its groups."""
+    """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its
+    groups."""
     for name in ("cork_1", "felt_1", "felt_2"):
         FORMS[suffix](tmp_path / f"{name}.{suffix}")
     s = taken(tmp_path).sweeps
@@ -88,7 +92,9 @@ def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
     for name in ("cork_1", "felt_1"):
         with h5py.File(tmp_path / f"{name}.mat", "w") as file:
             file["frames"] = COUNTS.T
-    np.testing.assert_array_equal(taken(tmp_path).sweeps.samples[0], COUNTS[15:25].reshape(10, 2, 2))
+    np.testing.assert_array_equal(
+        taken(tmp_path).sweeps.samples[0], COUNTS[15:25].reshape(10, 2, 2)
+    )
 
 
 def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
@@ -121,7 +127,8 @@ def test_windows_are_cut_as_asked(tmp_path: Path):
 
 
 def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
-    """Times rounded to milliseconds at 300 Hz: the counts are as recorded, the rate is that of the set."""
+    """Times rounded to milliseconds at 300 Hz: the counts are as recorded, the rate is that of the
+    set."""
     for name in ("cork_1", "felt_1"):
         write(tmp_path / f"{name}.csv", COUNTS, 300.0, np.round(1000 * np.arange(40) / 300))
     made = taken(tmp_path, time="time:ms", rate_hz=None)
@@ -131,7 +138,8 @@ def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
 
 
 def test_times_that_wander_are_interpolated(tmp_path: Path):
-    """A ramp sampled at wandering times is a ramp again, in whole counts, and the report says so."""
+    """A ramp sampled at wandering times is a ramp again, in whole counts, and the report says
+    so."""
     late = 25 * np.sin(np.arange(400) / 20)  # ms, of periods of 10 ms
     times = 10 * np.arange(400) + late
     ramp = np.repeat(np.rint(times)[:, None] + 100, 4, axis=1)
@@ -151,10 +159,15 @@ def test_no_window_goes_over_a_gap(tmp_path: Path):
     for name in ("cork_1", "felt_1"):
         write(tmp_path / f"{name}.csv", COUNTS, 100.0, times)
     made = taken(tmp_path, time="time:ms", rate_hz=100.0, every=Length("5", "--every"))
-    starts = [int(np.flatnonzero((w.reshape(10, 4)[0] == COUNTS).all(1))[0]) for w in made.sweeps.samples[:6]]
+    starts = [
+        int(np.flatnonzero((w.reshape(10, 4)[0] == COUNTS).all(1))[0])
+        for w in made.sweeps.samples[:6]
+    ]
     assert starts == [0, 5, 10, 15, 25, 30]
     assert made.taken[0].notes == "1 gaps"
-    why = reasons(tmp_path, time="time:ms", rate_hz=100.0, window=Length("26", "--window"))["cork_1.csv"]
+    why = reasons(tmp_path, time="time:ms", rate_hz=100.0, window=Length("26", "--window"))[
+        "cork_1.csv"
+    ]
     assert why == "has 25 frames in a row (1 gaps), a window takes 26; see --window"
 
 
@@ -184,10 +197,16 @@ def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
         ("uint16", -1, "a count is -1, and uint16 holds 0 to 65535"),
         ("int16", 0.5, "a count is 0.5, and int16 holds whole numbers"),
         ("", 16777217, "a count is 16777217, and float32 would round it; take an offset away"),
-        ("", 1e300, "a count is 1.0000000000000001e+300, and float32 holds -3.40282e+38 to 3.40282e+38"),
+        (
+            "",
+            1e300,
+            "a count is 1.0000000000000001e+300, and float32 holds -3.40282e+38 to 3.40282e+38",
+        ),
     ],
 )
-def test_a_count_that_does_not_fit_leaves_its_file_out(tmp_path: Path, dtype: str, value: float, why: str):
+def test_a_count_that_does_not_fit_leaves_its_file_out(
+    tmp_path: Path, dtype: str, value: float, why: str
+):
     """By name, with the count and what the type holds; the others are taken."""
     for name in ("cork_1", "felt_1", "felt_2"):
         np.save(tmp_path / f"{name}.npy", COUNTS.astype(np.float64))
@@ -202,11 +221,20 @@ BAD = {
     "empty": (b"", "holds no line of numbers"),
     "words": (b"time,a,b\nnone,of,these\n", "holds no line of numbers"),
     "short line": (GOOD.encode() + b"1,2,3\n", "line 21 has 3 columns, line 1 has 4"),
-    "word": (b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n", "line 22, column 3 is 'x', which is no number"),
+    "word": (
+        b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n",
+        "line 22, column 3 is 'x', which is no number",
+    ),
     "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is '', which is no number"),
-    "nan": (GOOD.encode() + b"1,nan,3,4\n", "frame 21, taxel 1, 2 is nan; fill it in or cut it away"),
+    "nan": (
+        GOOD.encode() + b"1,nan,3,4\n",
+        "frame 21, taxel 1, 2 is nan; fill it in or cut it away",
+    ),
     "UTF-16": (GOOD.encode("utf-16"), "is UTF-16; save it as UTF-8"),
-    "wide": (b"1,2,3,4,5\n" * 20, "it has 5 columns, a grid of 2x2 takes 4; see --columns and --grid"),
+    "wide": (
+        b"1,2,3,4,5\n" * 20,
+        "it has 5 columns, a grid of 2x2 takes 4; see --columns and --grid",
+    ),
     "taxels x frames": (
         b"1,2,3,4,5\n" * 4,
         "it has 5 columns, a grid of 2x2 takes 4; it has so many rows, so add --transpose",
@@ -237,10 +265,18 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
             "cannot be read: Object arrays cannot be loaded",
         ),
         ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
-        ("npy", lambda p: np.save(p, np.zeros((20, 3, 3))), "holds frames [3, 3]; leave --columns out"),
+        (
+            "npy",
+            lambda p: np.save(p, np.zeros((20, 3, 3))),
+            "holds frames [3, 3]; leave --columns out",
+        ),
         ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
         ("npz", lambda p: zipped(p, "a.npy", b"nothing"), "cannot be read: 'a' is no array"),
-        ("npz", lambda p: np.savez(p, a=COUNTS, b=COUNTS), "holds 2 arrays of frames; name one with --variable"),
+        (
+            "npz",
+            lambda p: np.savez(p, a=COUNTS, b=COUNTS),
+            "holds 2 arrays of frames; name one with --variable",
+        ),
         (
             "mat",
             lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
@@ -265,29 +301,41 @@ def test_each_bad_binary_gets_one_exact_line(tmp_path: Path, suffix: str, save, 
 
 
 def test_an_array_is_chosen_and_turned(tmp_path: Path):
-    """Of two arrays the one that --variable names; taxels x frames with --transpose; times beside it."""
+    """Of two arrays the one that --variable names; taxels x frames with --transpose; times beside
+    it."""
     for name in ("cork_1", "felt_1"):
-        np.savez(tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50)
+        np.savez(
+            tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50
+        )
     made = taken(tmp_path, variable="frames", transpose=True, time="t:s", rate_hz=None)
     assert made.sweeps.rate_hz == 50
     np.testing.assert_array_equal(made.sweeps.samples[0].reshape(10, 4), COUNTS[15:25])
-    assert "has no array 'x'; it holds other [3, 3]" in reasons(tmp_path, variable="x")["cork_1.npz"]
+    assert (
+        "has no array 'x'; it holds other [3, 3]" in reasons(tmp_path, variable="x")["cork_1.npz"]
+    )
 
 
 @pytest.mark.parametrize(
     ("times", "why"),
     [
-        (np.r_[np.arange(30), 5, np.arange(31, 40)] * 10.0, "the time of frame 31 is before that of frame 30"),
+        (
+            np.r_[np.arange(30), 5, np.arange(31, 40)] * 10.0,
+            "the time of frame 31 is before that of frame 30",
+        ),
         (np.zeros(40), "all its times are the same; give --rate in place of --time"),
         (np.arange(40) // 8 * 80.0, "its frames come in bursts"),
         (np.arange(40) // 4 * 40.0 + np.arange(40) % 4 * 0.1, "its frames come in bursts"),
         (np.arange(40) * 20.0, "is sampled at 50 Hz, the set at 100 Hz; import it by itself"),
-        (np.r_[0:10, 12:30, 29, 30:41] * 10.0, "frames 28 and 29 of a run have the same time; where frames are even"),
+        (
+            np.r_[0:10, 12:30, 29, 30:41] * 10.0,
+            "frames 28 and 29 of a run have the same time; where frames are even",
+        ),
         (np.r_[np.nan, 1:40] * 10.0, "the time of frame 1 is no number"),
     ],
 )
 def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
-    """Back in time, standing still, in bursts, at another rate: the file is left out, the others are taken."""
+    """Back in time, standing still, in bursts, at another rate: the file is left out, the others
+    are taken."""
     for good in ("cork_1", "felt_1"):
         write(tmp_path / f"{good}.csv", COUNTS, 100.0)
     write(tmp_path / "felt_2.csv", COUNTS, 100.0, times)
@@ -299,7 +347,10 @@ def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rate_hz": None}, "how fast frames follow is not known; give --rate HZ, or --time COLUMN:UNIT"),
+        (
+            {"rate_hz": None},
+            "how fast frames follow is not known; give --rate HZ, or --time COLUMN:UNIT",
+        ),
         ({"time": "t"}, "--time t names no unit; write t:s, :ms, :us or :ns"),
         ({"grid": "4"}, "--grid 4 cannot be read; write ROWSxCOLUMNS"),
         ({"dtype": "int8"}, "--dtype int8 is unknown; use one of uint8"),
@@ -326,7 +377,9 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
     """All at once; --rename gives others, and joins two; one that nobody has is refused."""
     for name in ("a,b", "x" * 30, "felt"):
         (tmp_path / f"{name}_1.csv").write_text("nothing to read")
-    with pytest.raises(FormatError, match=r"cannot send 'a,b' \(3 characters\), 'x+' \(30 characters\)"):
+    with pytest.raises(
+        FormatError, match=r"cannot send 'a,b' \(3 characters\), 'x+' \(30 characters\)"
+    ):
         taken(tmp_path)
     for name in ("a,b", "x" * 30, "felt"):
         text(tmp_path / f"{name}_1.csv")

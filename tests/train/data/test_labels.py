@@ -18,7 +18,8 @@ def test_all_names_that_cannot_be_sent_are_listed():
     """Each with its length and the remedy; good ones are not."""
     s = replace(easy(4), materials=("x" * 25, "good one", ""))
     with pytest.raises(
-        FormatError, match=rf"easy: the box cannot send '{'x' * 25}' \(25 characters\), '' \(0 characters\);"
+        FormatError,
+        match=rf"easy: the box cannot send '{'x' * 25}' \(25 characters\), '' \(0 characters\);",
     ):
         labels.check(s)
     assert labels.unsendable(["a", "B 1.2_3-4", "x" * 24]) == ""
@@ -32,7 +33,10 @@ def test_materials_that_get_one_name_become_one():
     assert (joined.materials, joined.labels.tolist()) == (("low", "middle"), [0, 0, 1, 1, 0, 0])
     assert labels.renamed(s, {"other": "x"}) is s
     swapped = labels.renamed(s, {"high": "low", "low": "high"})
-    assert (swapped.materials, np.array_equal(swapped.labels, s.labels)) == (("high", "middle", "low"), True)
+    assert (swapped.materials, np.array_equal(swapped.labels, s.labels)) == (
+        ("high", "middle", "low"),
+        True,
+    )
 
 
 def test_a_description_tells_which_names_must_change(tmp_path: Path):
@@ -44,4 +48,7 @@ def test_a_description_tells_which_names_must_change(tmp_path: Path):
     )
     record(tmp_path / "box" / "1.npy", "a")
     record(tmp_path / "box" / "2.npy", "b$")
-    assert "cannot send 'b$' (2 characters)" in summary.describe(str(tmp_path / "box")).splitlines()[-1]
+    assert (
+        "cannot send 'b$' (2 characters)"
+        in summary.describe(str(tmp_path / "box")).splitlines()[-1]
+    )

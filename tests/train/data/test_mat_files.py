@@ -1,4 +1,5 @@
-"""MAT files: what scipy writes is read as scipy reads it; damage is told and never reaches memory."""
+"""MAT files: what scipy writes is read as scipy reads it; damage is told and never reaches
+memory."""
 
 from __future__ import annotations
 
@@ -24,15 +25,26 @@ def saved(compressed: bool, **values: object) -> bytes:
 
 
 CONTENT = {
-    **{f"a{kind.replace('?', 'logical')}": (np.arange(12).reshape(4, 3) % 2).astype(kind) for kind in TYPES},
-    "cube": np.arange(24.0).reshape(2, 3, 4), "one": 7.0, "empty": np.empty((0, 3)),
-}  # fmt: skip
+    **{
+        f"a{kind.replace('?', 'logical')}": (np.arange(12).reshape(4, 3) % 2).astype(kind)
+        for kind in TYPES
+    },
+    "cube": np.arange(24.0).reshape(2, 3, 4),
+    "one": 7.0,
+    "empty": np.empty((0, 3)),
+}
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_numbers_are_read_as_scipy_reads_them(compressed: bool):
-    """Every class of numbers, cubes, scalars, nothing; what is no plain array of numbers is passed over."""
-    others = {"text": "abc", "cell": np.array([1, "a"], object), "record": {"x": 1.0}, "complex": np.array([1j])}
+    """Every class of numbers, cubes, scalars, nothing; what is no plain array of numbers is passed
+    over."""
+    others = {
+        "text": "abc",
+        "cell": np.array([1, "a"], object),
+        "record": {"x": 1.0},
+        "complex": np.array([1j]),
+    }
     data = saved(compressed, **CONTENT, **others)
     found, second = mat_files.arrays(data), scipy.io.loadmat(io.BytesIO(data))
     assert found.keys() == CONTENT.keys()
@@ -42,7 +54,8 @@ def test_numbers_are_read_as_scipy_reads_them(compressed: bool):
 
 
 def test_the_other_byte_order_is_read():
-    """A file of a big-endian machine, put together by hand: flags, shape, name in its tag, two doubles."""
+    """A file of a big-endian machine, put together by hand: flags, shape, name in its tag, two
+    doubles."""
     flags = b"\0\0\0\6" + b"\0\0\0\x08" + b"\0\0\0\6" + bytes(4)
     shape = b"\0\0\0\5" + b"\0\0\0\x08" + b"\0\0\0\1" + b"\0\0\0\2"
     values = b"\0\0\0\x09" + b"\0\0\0\x10" + np.array([1.5, -2.0], ">f8").tobytes()
@@ -59,7 +72,9 @@ WHOLE = {
 
 @settings(max_examples=300, deadline=None)
 @given(
-    st.booleans(), st.integers(0, 2000), st.lists(st.tuples(st.integers(100, 2000), st.integers(0, 255)), max_size=6)
+    st.booleans(),
+    st.integers(0, 2000),
+    st.lists(st.tuples(st.integers(100, 2000), st.integers(0, 255)), max_size=6),
 )
 def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int]]):
     """Cut anywhere, bytes altered: arrays that fit their shapes, or a FormatError; nothing else."""

@@ -18,7 +18,8 @@ class SteppedClock:
 
 
 def test_progress_shows_how_much_is_left():
-    """Done, all, a time from what the others took, and what was done; the numbers of the line are the same."""
+    """Done, all, a time from what the others took, and what was done; the numbers of the line are
+    the same."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(4, lines.append, clock)
@@ -44,7 +45,14 @@ def test_a_task_that_begins_is_not_done():
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(0, "0 s"), (99, "99 s"), (100, "2 min"), (5999, "100 min"), (6000, "1.7 h"), (36000, "10.0 h")],
+    [
+        (0, "0 s"),
+        (99, "99 s"),
+        (100, "2 min"),
+        (5999, "100 min"),
+        (6000, "1.7 h"),
+        (36000, "10.0 h"),
+    ],
 )
 def test_a_duration_is_said_in_the_unit_that_suits_it(seconds: float, text: str):
     """Seconds, minutes, hours."""

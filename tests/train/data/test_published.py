@@ -1,4 +1,5 @@
-"""The published series that aeon ships: their form, their splits, and what is said where they cannot be had."""
+"""The published series that aeon ships: their form, their splits, and what is said where they
+cannot be had."""
 
 from __future__ import annotations
 
@@ -17,11 +18,15 @@ from train.data.splitters import Protocol
 @pytest.mark.slow
 @pytest.mark.parametrize("name", published.SETS)
 def test_a_set_has_the_published_split_and_what_the_list_says(name: str):
-    """Counts of sweeps, classes, frames and channels; each sweep a recording of its own; the training part is split 0."""
+    """Counts of sweeps, classes, frames and channels; each sweep a recording of its own; the
+    training part is split 0."""
     pytest.importorskip("aeon")
     s = sets.load(f"aeon:{name}")
     first, second, classes, frames = map(
-        int, re.match(r"(\d+) \+ (\d+) sweeps of (\d+) .*?, (\d+) frames", published.SETS[name]).groups()
+        int,
+        re.match(
+            r"(\d+) \+ (\d+) sweeps of (\d+) .*?, (\d+) frames", published.SETS[name]
+        ).groups(),
     )
     assert s.samples.shape == (first + second, frames, 6 if name == "BasicMotions" else 1, 1)
     assert s.samples.dtype == np.float32
@@ -47,7 +52,8 @@ def test_the_series_are_aeons():
 def test_an_unknown_name_is_told_those_that_exist():
     """Before aeon is looked for."""
     with pytest.raises(
-        FormatError, match=r"set 'aeon:GunPiont' is unknown; use aeon:NAME, NAME one of ACSF1, ArrowHead"
+        FormatError,
+        match=r"set 'aeon:GunPiont' is unknown; use aeon:NAME, NAME one of ACSF1, ArrowHead",
     ):
         sets.load("aeon:GunPiont")
 
@@ -55,7 +61,9 @@ def test_an_unknown_name_is_told_those_that_exist():
 def test_without_aeon_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     """As for MiniRocket."""
     monkeypatch.setitem(sys.modules, "aeon.datasets", None)
-    with pytest.raises(FormatError, match=r"'aeon:GunPoint' needs aeon .*pip install 'palpate-train\[minirocket\]'"):
+    with pytest.raises(
+        FormatError, match=r"'aeon:GunPoint' needs aeon .*pip install 'palpate-train\[minirocket\]'"
+    ):
         sets.load("aeon:GunPoint")
 
 
@@ -63,7 +71,9 @@ def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """A version of aeon that lacks the set ends with a message, and its loader is not asked."""
     datasets = pytest.importorskip("aeon.datasets")
     monkeypatch.setattr(datasets, "__file__", str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(datasets, "load_classification", lambda *a, **k: pytest.fail("it would download"))
+    monkeypatch.setattr(
+        datasets, "load_classification", lambda *a, **k: pytest.fail("it would download")
+    )
     with pytest.raises(FormatError, match="this version of aeon does not hold GunPoint"):
         sets.load("aeon:GunPoint")
 
@@ -71,5 +81,8 @@ def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 def test_the_list_of_sets_names_them():
     """`palpate-train sets` prints a line for each."""
     lines = summary.known().splitlines()
-    assert all(any(f"aeon:{name} " in line and what in line for line in lines) for name, what in published.SETS.items())
+    assert all(
+        any(f"aeon:{name} " in line and what in line for line in lines)
+        for name, what in published.SETS.items()
+    )
     assert any("aeon:NAME" in line and "100 Hz" in line for line in lines)

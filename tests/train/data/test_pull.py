@@ -1,7 +1,8 @@
-"""Fetching recordings: only what is new, whole pairs whatever breaks off, nothing overwritten, nothing from elsewhere.
+"""Fetching recordings: only what is new, whole pairs whatever breaks off, nothing overwritten,
+nothing from elsewhere.
 
-The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and tar. One test goes
-through a real sshd where openssh-server is installed.
+The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and
+tar. One test goes through a real sshd where openssh-server is installed.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ class Ground:
 
     def pull(self, *more: str) -> None:
         """The command."""
-        args = parser().parse_args(["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more])
+        args = parser().parse_args(
+            ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
+        )
         args.run(args)
 
     def fetch(self) -> PullReport:
@@ -71,7 +74,11 @@ class Ground:
 
 def files(folder: Path) -> dict[str, bytes]:
     """All files in a folder and below."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.fixture
@@ -105,8 +112,19 @@ def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.Captur
 
 
 def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
-    """Spaces, quotes, dollars, a dash in front, more dots, letters of other languages, and long ones."""
-    for name in ("a b", "it's $HOME", "-rf", "--checkpoint", "v1.2", "Häkelgarn", "x" * 150, "*", "\\n"):
+    """Spaces, quotes, dollars, a dash in front, more dots, letters of other languages, and long
+    ones."""
+    for name in (
+        "a b",
+        "it's $HOME",
+        "-rf",
+        "--checkpoint",
+        "v1.2",
+        "Häkelgarn",
+        "x" * 150,
+        "*",
+        "\\n",
+    ):
         record(ground.box / name / f"{name}.npy", id=1)
     assert len(ground.fetch().fetched) == 13
     assert ground.same()
@@ -114,11 +132,14 @@ def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
 
 @pytest.mark.slow
 def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
-    """Wherever the stream ends: what is here is the box's, byte for byte and in pairs, and the next call has the rest."""
+    """Wherever the stream ends: what is here is the box's, byte for byte and in pairs, and the next
+    call has the rest."""
     whole = sum(len(data) for data in files(ground.box).values()) + 8 * 512
     for cut in [*range(0, whole, 700), whole]:
         ground.ssh("tar", f'sh -c "$command" | head -c {cut}; exit 255')
-        with pytest.raises(ApplianceError, match="user@box: no connection; see that `ssh user@box true` works"):
+        with pytest.raises(
+            ApplianceError, match="user@box: no connection; see that `ssh user@box true` works"
+        ):
             ground.fetch()
         held = files(ground.here) if ground.here.exists() else {}
         assert held.items() <= files(ground.box).items()
@@ -160,32 +181,43 @@ def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
 
 
 def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Without its sidecar, or the sidecar of a sweep in progress: reported and not fetched; the others are."""
+    """Without its sidecar, or the sidecar of a sweep in progress: reported and not fetched; the
+    others are."""
     (ground.box / "run 0" / "sweep-000000.json").unlink()
     (ground.box / "run 1" / "sweep-000003.npy").unlink()
     (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
     ground.pull()
     out = capsys.readouterr().out
     assert out.startswith("fetched 2, there already 0, refused 0\n")
-    assert "run 0/sweep-000000, run 1/sweep-000003: without its .json or .npy on the box; left there\n" in out
+    assert (
+        "run 0/sweep-000000, run 1/sweep-000003: without its .json or .npy on the box; left there\n"
+        in out
+    )
     assert sorted(files(ground.here)) == [
         f"run {i // 2}/sweep-00000{i}.{end}" for i in (1, 2) for end in ("json", "npy")
     ]
 
 
-def test_another_sweep_of_the_same_name_is_never_written_over(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """A box that counts from the start again: both sweeps stay where they are, and the call fails."""
+def test_another_sweep_of_the_same_name_is_never_written_over(
+    ground: Ground, capsys: pytest.CaptureFixture[str]
+):
+    """A box that counts from the start again: both sweeps stay where they are, and the call
+    fails."""
     ground.fetch()
     before = files(ground.here)
     record(ground.box / "run 0" / "sweep-000000.npy", "b", id=77)
     with pytest.raises(FormatError, match="1 recordings of user@box were not taken"):
         ground.pull()
-    assert "run 0/sweep-000000: another sweep on the box under the same name; the one in" in capsys.readouterr().out
+    assert (
+        "run 0/sweep-000000: another sweep on the box under the same name; the one in"
+        in capsys.readouterr().out
+    )
     assert files(ground.here) == before
 
 
 def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """The user may edit a sidecar: it is reported and not a failure; the same for one that was edited on the box."""
+    """The user may edit a sidecar: it is reported and not a failure; the same for one that was
+    edited on the box."""
     ground.fetch()
     mine = ground.here / "run 0" / "sweep-000000.json"
     mine.write_text(json.dumps(json.loads(mine.read_text()) | {"material": "cork"}))
@@ -194,12 +226,15 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
     before = files(ground.here)
     ground.pull()
     out = capsys.readouterr().out
-    assert out.startswith("fetched 0, there already 2, refused 0\nrun 0/sweep-000000, run 0/sweep-000001: described")
+    assert out.startswith(
+        "fetched 0, there already 2, refused 0\nrun 0/sweep-000000, run 0/sweep-000001: described"
+    )
     assert files(ground.here) == before
 
 
 def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Broken on the box: it never takes its name here; the others do. One without frames is a recording."""
+    """Broken on the box: it never takes its name here; the others do. One without frames is a
+    recording."""
     (ground.box / "run 0" / "sweep-000000.npy").write_bytes(b"\x93NUMPY")
     (ground.box / "run 0" / "sweep-000001.json").write_text("{}")
     np.save(ground.box / "run 1" / "sweep-000002.npy", np.array([{}], object), allow_pickle=True)
@@ -210,16 +245,20 @@ def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureF
     assert out.startswith("fetched 2, there already 0, refused 3\n")
     assert "run 0/sweep-000000 (" in out
     assert sorted(files(ground.here)) == [
-        *(f"run 1/sweep-000003.{end}" for end in ("json", "npy")), "sweep-000009.json", "sweep-000009.npy"
-    ]  # fmt: skip
+        *(f"run 1/sweep-000003.{end}" for end in ("json", "npy")),
+        "sweep-000009.json",
+        "sweep-000009.npy",
+    ]
 
 
 def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
     """The bytes that came are not those that were listed."""
     ground.ssh("tar", f"echo >> '{ground.box}/run 0/sweep-000000.json'")
     tally = ground.fetch()
-    assert tally.refused == ["run 0/sweep-000000 (run 0/sweep-000000.json changed while it was fetched; "
-                             "run the same command again)"]  # fmt: skip
+    assert tally.refused == [
+        "run 0/sweep-000000 (run 0/sweep-000000.json changed while it was fetched; "
+        "run the same command again)"
+    ]
     assert len(tally.fetched) == 3
 
 
@@ -258,10 +297,13 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, data: bytes = b"x", link: s
     ],
 )
 def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
-    """Out of the folder, absolute, links, devices, what was not asked for: nothing of it is written."""
+    """Out of the folder, absolute, links, devices, what was not asked for: nothing of it is
+    written."""
     (ground.bin / "archive").write_bytes(archive)
     ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
-    with pytest.raises(FormatError, match=r"the box sends '.*', which was not requested; check that box"):
+    with pytest.raises(
+        FormatError, match=r"the box sends '.*', which was not requested; check that box"
+    ):
         ground.fetch()
     assert not ground.here.exists()
 
@@ -280,10 +322,13 @@ def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
     """In the list already: nothing is asked for under it, and the others are fetched."""
     record(ground.box.parent / "evil.npy")
     (ground.box / "run 0" / "line\nbreak.npy").write_bytes(b"")
-    ground.program("find", f"""#!/bin/sh
+    ground.program(
+        "find",
+        f"""#!/bin/sh
         printf '{"f" * 64}  ./../evil.npy\\0{"f" * 64}  ./../evil.json\\0{"f" * 64}  .//etc/evil.npy\\0'
         exec {shutil.which("find")} "$@"
-    """)  # fmt: skip
+    """,
+    )
     tally = ground.fetch()
     assert [refused.partition(" (")[0] for refused in tally.refused] == [
         "'../evil'",
@@ -297,7 +342,9 @@ def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
 def test_a_shell_that_talks_is_named(ground: Ground):
     """A greeting before the list is no file."""
     ground.ssh("find", "echo Welcome")
-    with pytest.raises(FormatError, match=r"user@box sends b'Welcome.*; see that its shell prints nothing at login"):
+    with pytest.raises(
+        FormatError, match=r"user@box sends b'Welcome.*; see that its shell prints nothing at login"
+    ):
         ground.fetch()
 
 
@@ -308,7 +355,9 @@ def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
     assert not (ground.bin / "asked").exists()
     shutil.rmtree(ground.here)
     ground.program("test", "#!/bin/sh\nexit 1\n")
-    ground.ssh("sh", f'command=$(echo "$command" | sed "s:test -r:{ground.bin}/test -r:")')  # root may read anything
+    ground.ssh(
+        "sh", f'command=$(echo "$command" | sed "s:test -r:{ground.bin}/test -r:")'
+    )  # root may read anything
     assert len(ground.fetch().fetched) == 4
     assert (ground.bin / "asked").exists()
 
@@ -316,22 +365,34 @@ def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
 def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.CaptureFixture[str]):
     """Not there, and sudo wants a password: both in one message, after the words of the box."""
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
-    with pytest.raises(ApplianceError, match=r"^user@box: /nowhere cannot be read; name another with --from, let .*"):
-        pull.pull(RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None)
+    with pytest.raises(
+        ApplianceError,
+        match=r"^user@box: /nowhere cannot be read; name another with --from, let .*",
+    ):
+        pull.pull(
+            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
+        )
     assert capsys.readouterr().err == "user@box: sudo: a password is required\n"
 
 
 def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
     """The folder does not exist, and sudo may look."""
     ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
-    with pytest.raises(ApplianceError, match=r"^user@box: there is no /nowhere: nothing was recorded yet"):
-        pull.pull(RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None)
+    with pytest.raises(
+        ApplianceError, match=r"^user@box: there is no /nowhere: nothing was recorded yet"
+    ):
+        pull.pull(
+            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
+        )
 
 
 def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
-    """Tools that fail or are not there, however their connection ends, never look like a box without recordings."""
+    """Tools that fail or are not there, however their connection ends, never look like a box
+    without recordings."""
     ground.ssh("tar", "exit 0")
-    with pytest.raises(ApplianceError, match="only 0 of 4 recordings came; run the same command again"):
+    with pytest.raises(
+        ApplianceError, match="only 0 of 4 recordings came; run the same command again"
+    ):
         ground.fetch()
     ground.program("find", "#!/bin/sh\nexit 127\n")
     with pytest.raises(ApplianceError, match="cannot be read"):
@@ -341,13 +402,16 @@ def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
 def test_an_npy_takes_its_name_last(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     """As when the box records: none is ever without its sidecar, whenever the power goes."""
     taken = []
-    monkeypatch.setattr(pull.storage, "put_all", lambda held: taken.extend(path.suffix for path in held))
+    monkeypatch.setattr(
+        pull.storage, "put_all", lambda held: taken.extend(path.suffix for path in held)
+    )
     ground.fetch()
     assert taken == [".json", ".npy"] * 4
 
 
 def test_ssh_is_asked_without_questions(ground: Ground):
-    """The user's options go first, so they hold; no password is asked for; a host is never an option."""
+    """The user's options go first, so they hold; no password is asked for; a host is never an
+    option."""
     ground.program("ssh", f'#!/bin/sh\nprintf "%s\\n" "$@" > "{ground.bin}/asked"\nexit 255\n')
     with pytest.raises(ApplianceError, match="no connection"):
         ground.pull("--port", "2222", "--ssh-option", "BatchMode=no")
@@ -372,18 +436,37 @@ def sshd(tmp_path: Path) -> list[str]:
     if os.getuid() == 0:
         Path("/run/sshd").mkdir(exist_ok=True)  # its service makes it
     for name in ("host", "mine"):
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name], check=True)
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name], check=True
+        )
     settings = {
-        "HostKey": tmp_path / "host", "AuthorizedKeysFile": tmp_path / "mine.pub", "PidFile": "none", "StrictModes": "no",
-        "UsePAM": "no", "PasswordAuthentication": "no", "KbdInteractiveAuthentication": "no",
-    }  # fmt: skip
-    (tmp_path / "config").write_text("".join(f"{name} {value}\n" for name, value in settings.items()))
+        "HostKey": tmp_path / "host",
+        "AuthorizedKeysFile": tmp_path / "mine.pub",
+        "PidFile": "none",
+        "StrictModes": "no",
+        "UsePAM": "no",
+        "PasswordAuthentication": "no",
+        "KbdInteractiveAuthentication": "no",
+    }
+    (tmp_path / "config").write_text(
+        "".join(f"{name} {value}\n" for name, value in settings.items())
+    )
     # sshd takes one connection from a socket that ssh itself holds: no port is needed
     proxy = f"ProxyCommand={SSHD} -i -f {tmp_path}/config"
     return [
-        "-F", "none", "-o", proxy, "-o", f"IdentityFile={tmp_path}/mine", "-o", f"UserKnownHostsFile={tmp_path}/known",
-        "-o", "StrictHostKeyChecking=accept-new", "-o", "IdentityAgent=none",
-    ]  # fmt: skip
+        "-F",
+        "none",
+        "-o",
+        proxy,
+        "-o",
+        f"IdentityFile={tmp_path}/mine",
+        "-o",
+        f"UserKnownHostsFile={tmp_path}/known",
+        "-o",
+        "StrictHostKeyChecking=accept-new",
+        "-o",
+        "IdentityAgent=none",
+    ]
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""Readers: HDF5, TactMat and recordings of the box become sets; what is broken is refused by name."""
+"""Readers: HDF5, TactMat and recordings of the box become sets; what is broken is refused by
+name."""
 
 from __future__ import annotations
 
@@ -45,12 +46,18 @@ def before_crc(path: Path) -> None:
 
 
 def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
-    """Names as text or bytes, the rate as a data set or an attribute, another name, another byte order."""
+    """Names as text or bytes, the rate as a data set or an attribute, another name, another byte
+    order."""
     a = sets.load(hdf5(tmp_path / "a.h5"))
     assert (str(a.format), a.materials) == ("2x3 int16 at 50 Hz, window 8", ("a", "b", "ç"))
     np.testing.assert_array_equal(a.samples, held()["samples"])
     np.testing.assert_array_equal(a.groups["speed"], held()["group_speed"])
-    b = hdf5(tmp_path / "b.data", rate_hz=None, materials=np.array([b"a", b"b", "ç".encode()]), samples=None)
+    b = hdf5(
+        tmp_path / "b.data",
+        rate_hz=None,
+        materials=np.array([b"a", b"b", "ç".encode()]),
+        samples=None,
+    )
     with h5py.File(b, "a") as file:
         file["samples"] = held()["samples"].astype(">i2")
         file["notes"] = h5py.ExternalLink("/nowhere.h5", "/x")  # not read
@@ -88,15 +95,24 @@ PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
         ({"samples": ["a"] * 6}, "samples have the shape \\[6\\]"),
         ({"samples": h5py.Empty("u1")}, "samples is no array but .*shape None"),
         ({"labels": PAIR}, "labels holds .*; give one whole number for each of 6"),
-        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
+        (
+            {"labels": np.array([0, 1, 2, 0, 3, 1])},
+            "label 3 of sweep 4 is out of range; there are 3",
+        ),
         ({"labels": np.full(6, 1)}, "only one class, 'b'"),
-        ({"labels": ["a", "b", "c"] * 2}, "label 'c' is not among the materials \\['a', 'b', 'ç'\\]; add it"),
+        (
+            {"labels": ["a", "b", "c"] * 2},
+            "label 'c' is not among the materials \\['a', 'b', 'ç'\\]; add it",
+        ),
         ({"materials": np.arange(3)}, "materials hold int64"),
         ({"materials": np.array([b"a", b"b", b"\xff"])}, "not a sweep set .*: .*utf-8"),
         ({"rate_hz": "fast"}, "rate_hz holds .*fast.*; give one number"),
         ({"rate_hz": [50.0, 60.0]}, "give one number"),
         ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
-        ({"group_speed": h5py.SoftLink("/gone")}, "group_speed is a link to '/gone'; put the data itself"),
+        (
+            {"group_speed": h5py.SoftLink("/gone")},
+            "group_speed is a link to '/gone'; put the data itself",
+        ),
         ({"samples": h5py.ExternalLink("gone.h5", "/samples")}, "samples is a link to '/samples'"),
         ({"samples": h5py.SoftLink("/samples")}, "samples is a link to '/samples'"),
         ({"labels": np.dtype("i8")}, "labels is no array but .*named type"),
@@ -172,7 +188,8 @@ def test_what_is_no_hdf5_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("signature", [b"SNOD", b"HEAP", b"TREE", b"GCOL", b"labels"])
 def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
-    """Whatever table of the file is overwritten, the header of an array (at its address) among them."""
+    """Whatever table of the file is overwritten, the header of an array (at its address) among
+    them."""
     path = tmp_path / "a.h5"
     hdf5(path)
     data = bytearray(path.read_bytes())
@@ -188,7 +205,8 @@ def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
 
 @pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "float64"])
 def test_tactmat_is_read(tmp_path: Path, dtype: str):
-    """Labels from the first axis, repetitions from the second, counts of a byte in whatever type they are stored."""
+    """Labels from the first axis, repetitions from the second, counts of a byte in whatever type
+    they are stored."""
     samples = tactmat(tmp_path / "t.h5", dtype)
     s = sets.load(str(tmp_path / "t.h5"))
     assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
@@ -232,11 +250,18 @@ def test_a_broken_tactmat_is_refused(tmp_path: Path):
 
 
 def test_recordings_are_a_set(tmp_path: Path):
-    """One recording a file, materials and places by name, objects apart in each folder; what is not ok is counted."""
+    """One recording a file, materials and places by name, objects apart in each folder; what is not
+    ok is counted."""
     for i, (material, position, obj) in enumerate(
         [("b", "tip", 0), ("a", "side", 1), ("b", "side", 1), ("a", "tip", 2)]
     ):
-        record(tmp_path / f"run{i // 2}" / f"sweep-{i:06d}.npy", material, id=i, position=position, object=obj)
+        record(
+            tmp_path / f"run{i // 2}" / f"sweep-{i:06d}.npy",
+            material,
+            id=i,
+            position=position,
+            object=obj,
+        )
     record(tmp_path / "run0" / "sweep-000009.npy", status=Status.SATURATED, id=9)
     record(tmp_path / "run1" / "sweep-000010.npy", "", Status.GAP, frames=0)
     (tmp_path / "sweep-000011.npy.part").write_bytes(b"half")
@@ -253,7 +278,8 @@ def test_recordings_are_a_set(tmp_path: Path):
 
 
 def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
-    """Where all names are whole numbers a group has these, so that --only position=12 selects the position named 12."""
+    """Where all names are whole numbers a group has these, so that --only position=12 selects the
+    position named 12."""
     for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups
@@ -267,19 +293,26 @@ def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, position="tip")
     before = sets.digest(sets.load(str(tmp_path)))
     for i in range(2):
-        about = {"device": {"serial": "x"}, "tare": [[0] * 3] * 2, "verdict": {"status": ("unknown", "unsure")[i]}}
+        about = {
+            "device": {"serial": "x"},
+            "tare": [[0] * 3] * 2,
+            "verdict": {"status": ("unknown", "unsure")[i]},
+        }
         save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), about)
     before_crc(tmp_path / "3.json")
     assert sets.digest(sets.load(str(tmp_path))) == before
 
 
 def test_the_unloaded_skin_is_kept(tmp_path: Path):
-    """Of each sweep whose sidecar knows it in numbers, NaN for the others; a set of which none does has no such array."""
+    """Of each sweep whose sidecar knows it in numbers, NaN for the others; a set of which none does
+    has no such array."""
     level = [[1.0, 2, 3], [4, 5, 6]]
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     assert sets.load(str(tmp_path)).unloaded is None
-    for i, known in enumerate([{"level": level, "noise": level}, None, {"level": level, "noise": [[np.nan] * 3] * 2}]):
+    for i, known in enumerate(
+        [{"level": level, "noise": level}, None, {"level": level, "noise": [[np.nan] * 3] * 2}]
+    ):
         save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"unloaded": known})
     unloaded = sets.load(str(tmp_path)).unloaded
     assert unloaded.shape == (4, 2, 2, 3)
@@ -287,28 +320,44 @@ def test_the_unloaded_skin_is_kept(tmp_path: Path):
     assert np.isnan(unloaded[1:]).all()
 
 
-@pytest.mark.parametrize("known", [7, [], {"level": [[1.0] * 3] * 2}, {"level": [1.0], "noise": [1.0]},
-                                   {"level": [["a"] * 3] * 2, "noise": [[1.0] * 3] * 2}])  # fmt: skip
+@pytest.mark.parametrize(
+    "known",
+    [
+        7,
+        [],
+        {"level": [[1.0] * 3] * 2},
+        {"level": [1.0], "noise": [1.0]},
+        {"level": [["a"] * 3] * 2, "noise": [[1.0] * 3] * 2},
+    ],
+)
 def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object):
     """The file, the shape that is wanted and what to do."""
     for i in range(2):
         record(tmp_path / f"{i}.npy", "ab"[i], id=i)
     save(tmp_path / "1.npy", *load(tmp_path / "1.npy"), {"unloaded": known})
     with pytest.raises(
-        FormatError, match=r"1\.npy: `unloaded` of its sidecar has no level and noise of the shape \[2, 3\]"
+        FormatError,
+        match=r"1\.npy: `unloaded` of its sidecar has no level and noise of the shape \[2, 3\]",
     ):
         sets.load(str(tmp_path))
 
 
 def test_what_the_box_refused_is_left_out(tmp_path: Path):
-    """A skin that did not touch, or was broken, whatever its label; an early answer's part of a window."""
+    """A skin that did not touch, or was broken, whatever its label; an early answer's part of a
+    window."""
     for i in range(8):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     for i, status in enumerate(readers.REFUSED):
-        save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), {"verdict": {"status": str(status)}})
+        save(
+            tmp_path / f"{i}.npy",
+            *load(tmp_path / f"{i}.npy"),
+            {"verdict": {"status": str(status)}},
+        )
     record(tmp_path / "9.npy", "a", frames=3, share=0.4)
     s = sets.load(str(tmp_path))
-    assert s.source.endswith("(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 saturated, 1 stuck-taxel)")
+    assert s.source.endswith(
+        "(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 saturated, 1 stuck-taxel)"
+    )
     assert list(s.samples[:, 0, 0, 0]) == [4, 5, 6, 7]
 
 
@@ -352,11 +401,16 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
 
 
 def test_broken_recordings_are_named(tmp_path: Path):
-    """A table cut in two, a sidecar that is missing or empty, nothing that is ok, nothing at all, one material."""
-    with pytest.raises(FormatError, match="no sweep of `palpate record` is in it; record some, or name another"):
+    """A table cut in two, a sidecar that is missing or empty, nothing that is ok, nothing at all,
+    one material."""
+    with pytest.raises(
+        FormatError, match="no sweep of `palpate record` is in it; record some, or name another"
+    ):
         sets.load(str(tmp_path))
     record(tmp_path / "0.npy", status=Status.SHORT)
-    with pytest.raises(FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"):
+    with pytest.raises(
+        FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"
+    ):
         sets.load(str(tmp_path))
     record(tmp_path / "1.npy", "a")
     with pytest.raises(FormatError, match="only one class, 'a'"):
@@ -390,11 +444,13 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
     np.save(tmp_path / "x.npy", np.zeros((9, 4)))
     path = (tmp_path / "x.npy").rename(tmp_path / f"x{suffix}")
     with pytest.raises(
-        FormatError, match=f"x{suffix}: not a sweep set, but a file of frames; palpate-train import .* makes"
+        FormatError,
+        match=f"x{suffix}: not a sweep set, but a file of frames; palpate-train import .* makes",
     ):
         sets.load(str(path))
     with pytest.raises(
-        FormatError, match=f"1 {suffix.lower()} files are: palpate-train import .* makes a set of such files"
+        FormatError,
+        match=f"1 {suffix.lower()} files are: palpate-train import .* makes a set of such files",
     ):
         sets.load(str(tmp_path))
 
@@ -418,7 +474,9 @@ def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.data"])
-def test_a_file_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
+def test_a_file_that_may_not_be_read_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+):
     """The cause, before any library looks into it with words of its own."""
     file = Path(write(tmp_path / "a.npz")).rename(tmp_path / name)
 
@@ -426,26 +484,33 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytes
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "open", denied)
-    with pytest.raises(FormatError, match=rf"{name}: not a sweep set: the file cannot be read: Permission denied"):
+    with pytest.raises(
+        FormatError, match=rf"{name}: not a sweep set: the file cannot be read: Permission denied"
+    ):
         sets.load(str(file))
 
 
 def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
-    """Recordings by name whose unloaded skin read so much, None where it was not noted; what was pressed on it, [8, 2, 3]."""
+    """Recordings by name whose unloaded skin read so much, None where it was not noted; what was
+    pressed on it, [8, 2, 3]."""
     fmt, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():
         n = np.arange(fmt.window)
         taxels = (pressed + (300 if level is None else level)).astype(fmt.numpy_type)
         sweep = Sweep(1, 0, 1, Status.OK, Frames(n, n, taxels), material=name[0])
-        rest = level is not None and {"level": np.full((2, 3), level).tolist(), "noise": np.full((2, 3), 0.5).tolist()}
+        rest = level is not None and {
+            "level": np.full((2, 3), level).tolist(),
+            "noise": np.full((2, 3), 0.5).tolist(),
+        }
         save(folder / f"{name}.npy", sweep, fmt, {"unloaded": rest or None})
     return pressed
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
 def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: str):
-    """Those of a tared skin are moved to where most lie, in whole counts; what drifts a little, and what is not known, stays."""
+    """Those of a tared skin are moved to where most lie, in whole counts; what drifts a little, and
+    what is not known, stays."""
     pressed = tared(tmp_path, {"a0": 300.0, "a1": 301.0, "b0": 0.0, "b1": 300.0, "b2": None}, dtype)
     s = sets.load(str(tmp_path))
     assert s.samples.dtype == dtype
@@ -457,7 +522,8 @@ def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: s
 
 
 def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path: Path):
-    """Each folder is at one level by itself; the smaller is brought to the level of the other, and what is not known stays."""
+    """Each folder is at one level by itself; the smaller is brought to the level of the other, and
+    what is not known stays."""
     pressed = tared(tmp_path / "tared", {"a0": 0.0, "b0": 0.0})
     tared(tmp_path / "raw", {"a0": 300.0, "a1": 300.0, "b0": 300.0})
     joined = sets.join([sets.load(str(tmp_path / name)) for name in ("tared", "raw")])
@@ -472,7 +538,8 @@ def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path:
 
 
 def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
-    """And where one half was tared, the other is moved to a skin that there was; counts end where their type does."""
+    """And where one half was tared, the other is moved to a skin that there was; counts end where
+    their type does."""
     pressed = tared(tmp_path, {"a0": 300.0, "b0": 301.0, "b1": 300.5})
     s = sets.load(str(tmp_path))
     assert s.source == str(tmp_path)

@@ -19,7 +19,8 @@ from train.data import sets
 
 
 def test_a_file_is_read_as_it_is_described(tmp_path: Path):
-    """Format, materials, groups and raw counts come out as they were put in; save writes the same form."""
+    """Format, materials, groups and raw counts come out as they were put in; save writes the same
+    form."""
     s = sets.load(write(tmp_path / "good.npz"))
     assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
     assert s.materials == ("a", "b", "c")
@@ -54,21 +55,48 @@ NAN[4, 7, 1, 2] = np.nan
         ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
         ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
         ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
-        ({"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)}, "shape \\[6, 8, 2, 3, 1\\]; .* axes after them only where"),
+        (
+            {"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)},
+            "shape \\[6, 8, 2, 3, 1\\]; .* axes after them only where",
+        ),
         ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes of each taxel are out of range"),
-        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; use one of uint8.*samples.astype\\('float32'\\)"),
-        ({"samples": np.full((6, 8, 2, 3), -1)}, "samples are int64; .*samples.astype\\('int16'\\)"),
-        ({"samples": np.ones((6, 8, 2, 3), bool)}, "samples are bool; .*samples.astype\\('uint8'\\)"),
-        ({"samples": np.full((6, 8, 2, 3), 1 << 40)}, "samples are int64; .*samples.astype\\('float32'\\)"),
-        ({"samples": np.full((6, 8, 2, 3), 1j)}, "samples are complex128; use one of uint8, int16, uint16, float32$"),
-        ({"samples": np.zeros((6, 8, 256, 1), np.uint8)}, "a grid of 256 x 1 taxels is out of range"),
+        (
+            {"samples": np.zeros((6, 8, 2, 3))},
+            "samples are float64; use one of uint8.*samples.astype\\('float32'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), -1)},
+            "samples are int64; .*samples.astype\\('int16'\\)",
+        ),
+        (
+            {"samples": np.ones((6, 8, 2, 3), bool)},
+            "samples are bool; .*samples.astype\\('uint8'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), 1 << 40)},
+            "samples are int64; .*samples.astype\\('float32'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), 1j)},
+            "samples are complex128; use one of uint8, int16, uint16, float32$",
+        ),
+        (
+            {"samples": np.zeros((6, 8, 256, 1), np.uint8)},
+            "a grid of 256 x 1 taxels is out of range",
+        ),
         ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
         ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
         ({"group_speed": np.ones(6)}, "group_speed holds float64"),
         ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
-        ({"labels": np.arange(5)}, "labels holds int64 \\[5\\]; give one whole number for each of 6"),
+        (
+            {"labels": np.arange(5)},
+            "labels holds int64 \\[5\\]; give one whole number for each of 6",
+        ),
         ({"labels": np.zeros(6)}, "labels holds float64"),
-        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4 is out of range; there are 3"),
+        (
+            {"labels": np.array([0, 1, 2, 0, 3, 1])},
+            "label 3 of sweep 4 is out of range; there are 3",
+        ),
         ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2 is out of range"),
         ({"labels": np.full(6, 2)}, "only one class, 'c'"),
         ({"materials": np.array(["a", "b", "a"])}, "name one twice"),
@@ -77,7 +105,10 @@ NAN[4, 7, 1, 2] = np.nan
         ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
         ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
         ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
-        ({"unloaded": np.zeros((6, 2, 3))}, "unloaded holds float64 \\[6, 2, 3\\]; give floats \\[6, 2, 2, 3\\]"),
+        (
+            {"unloaded": np.zeros((6, 2, 3))},
+            "unloaded holds float64 \\[6, 2, 3\\]; give floats \\[6, 2, 2, 3\\]",
+        ),
         ({"unloaded": np.zeros((6, 2, 2, 3), int)}, "unloaded holds int64"),
     ],
 )
@@ -101,7 +132,8 @@ def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_simulated_sets_have_their_worlds():
-    """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay apart."""
+    """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay
+    apart."""
     real = sets.load("sim:T-REAL:5-6:1")
     assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
     assert len(np.unique(real.groups["position"])) == 18
@@ -111,10 +143,14 @@ def test_simulated_sets_have_their_worlds():
     np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
     shear = sets.load("sim:T-HARDx3:6:1")
     assert (len(shear), str(shear.format)) == (6, "4x4x3 int16 at 750 Hz, window 1500")
-    np.testing.assert_array_equal(shear.samples, skin.sweep_set("T-HARD", 6, 1, skin.World(shear=True))[0])
+    np.testing.assert_array_equal(
+        shear.samples, skin.sweep_set("T-HARD", 6, 1, skin.World(shear=True))[0]
+    )
 
 
-@pytest.mark.parametrize("spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"])
+@pytest.mark.parametrize(
+    "spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"]
+)
 def test_an_unknown_simulated_set_is_refused(spec: str):
     """The message repeats what was asked for."""
     with pytest.raises(FormatError, match=f"^set '{spec}' is "):
@@ -171,7 +207,8 @@ def test_select_names_what_is_wrong(condition: str, message: str):
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
 def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
-    """No recording is on both sides, nothing is lost or doubled, and both sides have each material near the share."""
+    """No recording is on both sides, nothing is lost or doubled, and both sides have each material
+    near the share."""
     s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
     first, second = s.split("recording", share, seed)
     assert not set(first.groups["recording"]) & set(second.groups["recording"])
@@ -216,15 +253,21 @@ def test_split_never_trains_without_a_material():
             outcomes.add(s.split("box", 0.5, seed)[0].labels.max())
         except FormatError as e:
             outcomes.add(str(e))
-    assert outcomes == {2, "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one"}
+    assert outcomes == {
+        2,
+        "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one",
+    }
 
 
 def test_join_keeps_recordings_apart_and_forces_together():
-    """Number 0 of two sets is two recordings, also where one set counts none; a speed of 2 is the same speed."""
+    """Number 0 of two sets is two recordings, also where one set counts none; a speed of 2 is the
+    same speed."""
     a, b = easy(4, pieces=2), easy(4, seed=1)
     both = sets.join([a, b])
     assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
-    np.testing.assert_array_equal(both.groups["speed"], np.append(a.groups["speed"], b.groups["speed"]))
+    np.testing.assert_array_equal(
+        both.groups["speed"], np.append(a.groups["speed"], b.groups["speed"])
+    )
     del b.groups["recording"]
     assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
     with pytest.raises(FormatError, match="differ; join sets of one kind"):
@@ -232,7 +275,8 @@ def test_join_keeps_recordings_apart_and_forces_together():
 
 
 def test_joined_sets_are_told_apart():
-    """`set` counts in the order given, so that one can be trained on and the other be tested on; one alone has none."""
+    """`set` counts in the order given, so that one can be trained on and the other be tested on;
+    one alone has none."""
     real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
     both = sets.join([real, hard])
     np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
@@ -244,7 +288,8 @@ def test_joined_sets_are_told_apart():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
 def test_without_means_leaves_the_texture(dtype: str):
-    """Float32, mean zero, a constant taxel exactly zero, differences in time, labels and groups as they were."""
+    """Float32, mean zero, a constant taxel exactly zero, differences in time, labels and groups as
+    they were."""
     s = easy(4, dtype=dtype)
     s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
     s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of so many 3.3 is not 3.3
@@ -252,21 +297,25 @@ def test_without_means_leaves_the_texture(dtype: str):
     assert bare.samples.dtype == np.float32
     assert np.abs(bare.samples.mean(axis=1, dtype=np.float64)).max() < 1e-6
     assert not bare.samples[2, :, 1, 0].any()
-    np.testing.assert_allclose(np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4)
+    np.testing.assert_allclose(
+        np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4
+    )
     assert (bare.labels is s.labels, bare.groups, bare.materials) == (True, s.groups, s.materials)
 
 
 @pytest.mark.parametrize("name", ["s.npz", "s.h5"])
 def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
-    """Into files of either kind, parts and joined sets, where it is unknown for the sweeps of a set that lacks it; it
-    changes the digest. Counts without their means have none."""
+    """Into files of either kind, parts and joined sets, where it is unknown for the sweeps of a set
+    that lacks it; it changes the digest. Counts without their means have none."""
     known = 0.1 * np.random.default_rng(1).random((12, 2, 2, 2))  # less apart than a load
     s = replace(easy(4), unloaded=known)
     s.save(tmp_path / name)
     again = sets.load(str(tmp_path / name))
     np.testing.assert_array_equal(again.unloaded, known)
     assert sets.digest(again) == sets.digest(s) != sets.digest(easy(4))
-    np.testing.assert_array_equal(s.select(["material=low,high"]).unloaded, np.delete(known, np.s_[4:8], 0))
+    np.testing.assert_array_equal(
+        s.select(["material=low,high"]).unloaded, np.delete(known, np.s_[4:8], 0)
+    )
     both = sets.join([easy(4, seed=1), s])
     assert np.isnan(both.unloaded[:12]).all()
     np.testing.assert_array_equal(both.unloaded[12:], known)
@@ -275,7 +324,8 @@ def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
 
 
 def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
-    """The same for a file read back, whatever its form; another for each thing that could change a result."""
+    """The same for a file read back, whatever its form; another for each thing that could change a
+    result."""
     s = easy(4)
     for name in ("a.npz", "b.h5"):
         s.save(tmp_path / name)
@@ -295,7 +345,9 @@ def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
         replace(s, groups=s.groups | {"speed": s.groups["recording"]}),
     ]
     assert len({sets.digest(x) for x in (s, *changed)}) == 10
-    assert sets.digest(replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))) == sets.digest(s)
+    assert sets.digest(
+        replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))
+    ) == sets.digest(s)
 
 
 def test_a_set_goes_to_another_process():
@@ -311,9 +363,13 @@ def test_labels_may_be_names(tmp_path: Path):
     texts = np.array(["b", "a", "b", "a", "c", "c"])
     bare = sets.load(write(tmp_path / "bare.npz", labels=texts, materials=None))
     assert (bare.materials, bare.labels.tolist()) == (("a", "b", "c"), [1, 0, 1, 0, 2, 2])
-    given = sets.load(write(tmp_path / "given.npz", labels=texts, materials=np.array(["c", "b", "a"])))
+    given = sets.load(
+        write(tmp_path / "given.npz", labels=texts, materials=np.array(["c", "b", "a"]))
+    )
     assert (given.materials, given.labels.tolist()) == (("c", "b", "a"), [1, 2, 1, 2, 0, 0])
-    with pytest.raises(FormatError, match=r"label 'c' is not among the materials \['a', 'b'\]; add it there"):
+    with pytest.raises(
+        FormatError, match=r"label 'c' is not among the materials \['a', 'b'\]; add it there"
+    ):
         sets.load(write(tmp_path / "less.npz", labels=texts, materials=np.array(["a", "b"])))
 
 
@@ -323,7 +379,8 @@ def test_objects_are_refused_with_the_remedy(tmp_path: Path, name: str):
     arrays = held()
     np.savez(tmp_path / "o.npz", **arrays | {name: arrays[name].astype(object)})
     with pytest.raises(
-        FormatError, match=rf"{name} holds objects, which are not read; save np.array\({name}, dtype=str\)"
+        FormatError,
+        match=rf"{name} holds objects, which are not read; save np.array\({name}, dtype=str\)",
     ):
         sets.load(str(tmp_path / "o.npz"))
     with pytest.raises(FormatError, match=r"materials hold .S1; give a list of names, dtype=str"):

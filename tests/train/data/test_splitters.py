@@ -20,11 +20,21 @@ def a_set(labels: list[int], **groups: list[int]) -> Dataset:
     n = len(labels)
     samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
     names = tuple("abcdef"[: max(labels) + 1])
-    return Dataset(samples, np.array(labels), names, 100.0, {k: np.array(v) for k, v in groups.items()}, "made up")
+    return Dataset(
+        samples,
+        np.array(labels),
+        names,
+        100.0,
+        {k: np.array(v) for k, v in groups.items()},
+        "made up",
+    )
 
 
-GRID = a_set([k for _ in range(3) for k in (0, 0, 1, 1)], position=[p for p in range(3) for _ in range(4)],
-             recording=[r for r in range(6) for _ in range(2)])  # fmt: skip
+GRID = a_set(
+    [k for _ in range(3) for k in (0, 0, 1, 1)],
+    position=[p for p in range(3) for _ in range(4)],
+    recording=[r for r in range(6) for _ in range(2)],
+)
 
 
 @pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
@@ -39,7 +49,9 @@ def test_a_protocol_tests_what_it_did_not_train_on(text: str):
 def test_leave_is_scikit_learns_leave_one_group_out():
     """The same folds in the same order."""
     theirs = Theirs().split(GRID.samples, GRID.labels, GRID.groups["position"])
-    for (train, test), (their_train, their_test) in zip(Protocol("leave:position").folds(GRID, 1), theirs, strict=True):
+    for (train, test), (their_train, their_test) in zip(
+        Protocol("leave:position").folds(GRID, 1), theirs, strict=True
+    ):
         assert train.tolist() == their_train.tolist()
         assert test.tolist() == their_test.tolist()
 
@@ -68,7 +80,9 @@ def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed:
 def test_random_folds_follow_their_seed():
     """The same seed, the same folds; another seed, others."""
     sweeps = a_set([0, 1] * 20)
-    one, same, other = ([t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2))
+    one, same, other = (
+        [t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2)
+    )
     assert one == same
     assert one != other
 
@@ -78,13 +92,17 @@ def test_scikit_learn_takes_them_as_splitters(text: str):
     """cross_val_score runs on each."""
     splitter = Protocol(text).splitter(GRID, 1)
     x = GRID.samples.reshape(len(GRID), -1)
-    scores = cross_val_score(GaussianNB(), x, GRID.labels, groups=GRID.groups["recording"], cv=splitter)
+    scores = cross_val_score(
+        GaussianNB(), x, GRID.labels, groups=GRID.groups["recording"], cv=splitter
+    )
     assert len(scores) == splitter.get_n_splits(x, GRID.labels, GRID.groups["recording"])
 
 
 def test_a_material_of_one_recording_needs_more():
     """No number of folds would help; the message does not name one."""
-    with pytest.raises(FormatError, match=r"^material 'b' has one recording; record two of each or more"):
+    with pytest.raises(
+        FormatError, match=r"^material 'b' has one recording; record two of each or more"
+    ):
         Protocol("random:2").folds(a_set([0, 0, 1]), 1)
 
 
@@ -112,7 +130,9 @@ def test_what_cannot_be_split_is_named(text: str, why: str):
 def test_a_group_that_cuts_recordings_is_refused(text: str):
     """Pieces of one recording are never on both sides."""
     sweeps = a_set([0, 0, 1, 1], recording=[0, 0, 1, 1], half=[0, 1, 0, 1])
-    with pytest.raises(FormatError, match="2 recordings, 0 among them, would be trained on and tested on"):
+    with pytest.raises(
+        FormatError, match="2 recordings, 0 among them, would be trained on and tested on"
+    ):
         Protocol(text).folds(sweeps, 1)
 
 
@@ -131,14 +151,16 @@ def test_nothing_left_to_train_on_is_refused():
 
 
 def test_clusters_are_what_was_left_out_or_recordings():
-    """Left-out groups for leave, recordings of several windows else, nothing where each sweep stands alone."""
+    """Left-out groups for leave, recordings of several windows else, nothing where each sweep
+    stands alone."""
     assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
     assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
     assert Protocol("random:3").clusters(a_set([0, 1])) is None
 
 
 def test_a_learning_curve_adds_to_what_was_there():
-    """So many of each material, from the training side alone, the same for the same seed; all where there are fewer."""
+    """So many of each material, from the training side alone, the same for the same seed; all where
+    there are fewer."""
     labels = np.repeat([0, 1, 2], [20, 8, 3])
     train = np.flatnonzero(np.arange(31) % 5)
     few, more = (draw(train, labels, each, 1) for each in (2, 6))

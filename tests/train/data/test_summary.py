@@ -1,4 +1,5 @@
-"""What is in a set, in lines: counts by position and session, what was lost, what keeps it from being trained on."""
+"""What is in a set, in lines: counts by position and session, what was lost, what keeps it from
+being trained on."""
 
 from __future__ import annotations
 
@@ -30,11 +31,15 @@ def command(*words: str) -> None:
 
 
 def test_a_set_is_described():
-    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists shortened."""
+    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists
+    shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
     first, *more = lines(s)
-    assert first == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
+    assert (
+        first
+        == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
+    )
     assert more == [
         "  recordings: 30, of 2 each",
         "  materials: 3: low 20, middle 20, high 20",
@@ -45,7 +50,8 @@ def test_a_set_is_described():
 
 
 def test_what_is_confounded_is_told():
-    """Values that hold one material, a material that one value takes with it, recordings of several; not one value."""
+    """Values that hold one material, a material that one value takes with it, recordings of
+    several; not one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
     text = [
@@ -67,7 +73,8 @@ def test_what_is_confounded_is_told():
 
 
 def test_positions_and_sessions_are_counted_in_tables():
-    """Materials down, positions across, totals at both ends, a dot for a hole; one of many positions has no table."""
+    """Materials down, positions across, totals at both ends, a dot for a hole; one of many
+    positions has no table."""
     s = easy(4)
     s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
     assert lines(s)[3:] == [
@@ -87,14 +94,28 @@ def test_positions_and_sessions_are_counted_in_tables():
     assert "    low     1  1  1  1  ·  ·  ·  ·  ·  ·   ·   ·    4" in lines(s)
     many = easy(13)
     many.groups["position"] = np.arange(39) % 13
-    assert [line.split()[0] for line in lines(many)] == ["easy:", "recordings:", "materials:", "position:", "speed:"]
+    assert [line.split()[0] for line in lines(many)] == [
+        "easy:",
+        "recordings:",
+        "materials:",
+        "position:",
+        "speed:",
+    ]
 
 
 def test_recordings_are_described_by_name(tmp_path: Path):
-    """Places by the names they were given and the numbers that select them; frames lost, what was left out, verdicts."""
+    """Places by the names they were given and the numbers that select them; frames lost, what was
+    left out, verdicts."""
     for i in range(6):
         path = tmp_path / f"run{i // 3}" / f"{i}.npy"
-        record(path, "ab"[i % 2], id=i, position=("tip", "side", "tip")[i % 3], session="7", lost=i // 4)
+        record(
+            path,
+            "ab"[i % 2],
+            id=i,
+            position=("tip", "side", "tip")[i % 3],
+            session="7",
+            lost=i // 4,
+        )
     record(tmp_path / "run0" / "9.npy", "", Status.GAP, frames=0, lost=100)
     s = sets.load(str(tmp_path))
     assert summary.describe(str(tmp_path)).splitlines() == [
@@ -116,7 +137,8 @@ def test_recordings_are_described_by_name(tmp_path: Path):
 
 
 def test_recordings_without_a_tare_are_told(tmp_path: Path):
-    """Where some recordings know the unloaded skin and others do not, both are counted; else there is nothing to say."""
+    """Where some recordings know the unloaded skin and others do not, both are counted; else there
+    is nothing to say."""
     for i in range(5):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     assert "warning" not in summary.describe(str(tmp_path))
@@ -124,18 +146,26 @@ def test_recordings_without_a_tare_are_told(tmp_path: Path):
         path = tmp_path / f"{i}.json"
         rest = {"level": [[1.0] * 3] * 2, "noise": [[0.5] * 3] * 2}
         path.write_text(json.dumps(json.loads(path.read_text()) | {"unloaded": rest}))
-        (found,) = [line for line in summary.describe(str(tmp_path)).splitlines() if "warning" in line] or [""]
-        assert found.startswith(f"  warning: {i + 1} sweeps know the unloaded skin and {4 - i} do not; ") == (i < 4)
+        (found,) = [
+            line for line in summary.describe(str(tmp_path)).splitlines() if "warning" in line
+        ] or [""]
+        assert found.startswith(
+            f"  warning: {i + 1} sweeps know the unloaded skin and {4 - i} do not; "
+        ) == (i < 4)
     sets.load(str(tmp_path)).save(tmp_path / "whole.npz")
     assert "warning" not in summary.describe(str(tmp_path / "whole.npz"))
 
 
 def test_recordings_are_described_while_they_grow(tmp_path: Path):
-    """One material alone, names that are still missing: counted, and the reason why it cannot be trained on is given."""
+    """One material alone, names that are still missing: counted, and the reason why it cannot be
+    trained on is given."""
     record(tmp_path / "0.npy", "a", position="2")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 1: a 1" in text
-    assert text[-1] == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
+    assert (
+        text[-1]
+        == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
+    )
     record(tmp_path / "1.npy", "")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 2: (none) 1, a 1" in text
@@ -145,14 +175,16 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
     record(tmp_path / "2.npy", status=Status.SHORT)
     (tmp_path / "0.npy").unlink()
     (tmp_path / "1.npy").unlink()
-    with pytest.raises(FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"):
+    with pytest.raises(
+        FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"
+    ):
         summary.describe(str(tmp_path))
 
 
 @pytest.mark.slow
 def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
-    """A taxel that no sweep changes is named by row and column from 1, a material without sweeps by its name; a sound set
-    gives no such line."""
+    """A taxel that no sweep changes is named by row and column from 1, a material without sweeps by
+    its name; a sound set gives no such line."""
     sound = easy()
     assert summary.warnings_of(sound) == []
     still = sound.samples.copy()
@@ -167,9 +199,15 @@ def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
 
 
 def test_what_is_known_can_be_loaded():
-    """Every simulated set in the list has as many sweeps as it states (the large one: sixty for each of its scenes)."""
+    """Every simulated set in the list has as many sweeps as it states (the large one: sixty for
+    each of its scenes)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
-    assert stated == {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
+    assert stated == {
+        "sim:T-LAB": "240",
+        "sim:T-REAL": "540",
+        "sim:T-HARD": "60",
+        "sim:T-HARD:1-20": "1200",
+    }
     assert len(sets.load("sim:T-LAB", 1001)) == 240
     assert len(sets.load("sim:T-HARD:1001-1002")) == 120
 

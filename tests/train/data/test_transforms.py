@@ -1,4 +1,5 @@
-"""Reductions: the sweeps that are left are those that a sensor set so would give, and the informative taxels stay."""
+"""Reductions: the sweeps that are left are those that a sensor set so would give, and the
+informative taxels stay."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dat
     n, frames, rows, cols = shape
     taxel = np.arange(rows * cols).reshape(rows, cols)
     x = 1000 * np.arange(n)[:, None, None, None] + 10 * np.arange(frames)[:, None, None] + taxel
-    return Dataset(x.astype(kind), np.arange(n) % 2, ("a", "b"), 60.0, {"day": np.arange(n)}, "counting")
+    return Dataset(
+        x.astype(kind), np.arange(n) % 2, ("a", "b"), 60.0, {"day": np.arange(n)}, "counting"
+    )
 
 
 def test_nothing_left_out_is_the_set_itself():
@@ -32,7 +35,12 @@ def test_the_window_is_the_middle():
     """Of twelve frames the inner six; rate and all else stay."""
     part = Change(window=0.5).of(counting())
     assert part.samples[0, :, 0, 0].tolist() == [30, 40, 50, 60, 70, 80]
-    assert (part.rate_hz, part.format.rows, part.format.cols, part.samples.dtype) == (60, 2, 3, np.int16)
+    assert (part.rate_hz, part.format.rows, part.format.cols, part.samples.dtype) == (
+        60,
+        2,
+        3,
+        np.int16,
+    )
     assert part.groups["day"].tolist() == [0, 1]
     assert Change(window=0.01).of(counting()).format.window == 1
 
@@ -77,12 +85,15 @@ def test_the_unloaded_skin_is_known_of_all_taxels_or_none():
 
 
 def test_a_taxel_goes_with_all_its_axes():
-    """The grid that is left has the axes that it had; a taxel whose shear alone tells materials apart comes first."""
+    """The grid that is left has the axes that it had; a taxel whose shear alone tells materials
+    apart comes first."""
     flat = counting()
     sheared = replace(flat, samples=np.stack([flat.samples, -flat.samples], axis=-1))
     grid = Change(taxels=(5, 3, 0, 2)).of(sheared)
     assert str(grid.format).startswith("2x2x2 int16")
-    np.testing.assert_array_equal(grid.samples[..., 1], -Change(taxels=(5, 3, 0, 2)).of(flat).samples)
+    np.testing.assert_array_equal(
+        grid.samples[..., 1], -Change(taxels=(5, 3, 0, 2)).of(flat).samples
+    )
     told = textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]})
     plain = textured({0: [1, 1, 1, 1]})
     three = replace(told, samples=np.stack([plain.samples, told.samples, plain.samples], axis=-1))
@@ -100,7 +111,8 @@ def test_changes_add_up():
 
 
 def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
-    """White noise of strength 3 on every taxel; `factors_of`: by taxel, how much stronger it is with each material."""
+    """White noise of strength 3 on every taxel; `factors_of`: by taxel, how much stronger it is
+    with each material."""
     kinds = len(next(iter(factors_of.values())))
     labels = np.tile(np.arange(kinds), each)
     rng = np.random.default_rng(5)
@@ -118,7 +130,8 @@ def test_the_informative_taxels_come_first():
 
 
 def test_one_of_two_that_tell_the_same_stays():
-    """Neither is missed when it alone is left out; that must not cost both of them, nor put a weaker one before both."""
+    """Neither is missed when it alone is left out; that must not cost both of them, nor put a
+    weaker one before both."""
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]
@@ -131,6 +144,10 @@ def test_one_of_two_that_tell_the_same_stays():
 def test_any_sweeps_have_an_order(kind: str):
     """Silent ones, one taxel, one frame: every taxel once."""
     shape = {"silent": (4, 20, 2, 2), "one taxel": (4, 20, 1, 1), "one frame": (4, 1, 2, 2)}[kind]
-    x = np.zeros(shape, np.uint8) if kind == "silent" else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
+    x = (
+        np.zeros(shape, np.uint8)
+        if kind == "silent"
+        else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
+    )
     found = transforms.order(Dataset(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
     assert sorted(found) == list(range(shape[2] * shape[3]))

@@ -1,4 +1,5 @@
-"""Tests of `train.evaluation.cnn_curve`: what is tested on, where a curve has points, and how it goes on when interrupted."""
+"""Tests of `train.evaluation.cnn_curve`: what is tested on, where a curve has points, and how it
+goes on when interrupted."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ class CurveInterrupted(Exception):
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A size that is trained in a moment, measured after steps 2 and 4 and the last, kept after each."""
+    """A size that is trained in a moment, measured after steps 2 and 4 and the last, kept after
+    each."""
     layers = paper_cnn.ImageLayers((2, 2), ((5, 2), (5, 2)), 2, False, 4)
     recipe = replace(paper_cnn.PAPER_RECIPE, steps=7, batch=8)
     monkeypatch.setattr(cnn_curve, "SIZES", {"small": cnn_curve.Size(layers, 60, recipe)})
@@ -45,9 +47,14 @@ def follow(out: Path, seed: int = 1, stop_at: int = 0, **options: Any) -> dict[s
 
 
 def test_it_is_tested_on_positions_and_attachments_that_it_never_saw() -> None:
-    """Other attachments for each of the sets, of another world too; T-HARD is numbered as in the paper's experiment."""
+    """Other attachments for each of the sets, of another world too; T-HARD is numbered as in the
+    paper's experiment."""
     drawn = cnn_curve.draw(2, skin.WORLD, 60, FEW)
-    assert {name: len(sweeps) for name, sweeps in drawn.items()} == {"train": 54, "new": 54, "hard": 12}
+    assert {name: len(sweeps) for name, sweeps in drawn.items()} == {
+        "train": 54,
+        "new": 54,
+        "hard": 12,
+    }
     assert all(sweeps.samples.shape[1:] == (60, 4, 4) for sweeps in drawn.values())
     assert len(np.unique(drawn["hard"].group("position"))) == 2
     third = skin.sweep_set("T-HARD", 3, 1)[0][:, :60]
@@ -64,7 +71,8 @@ def test_points_are_doubled_and_the_last_iteration_is_one() -> None:
 
 @pytest.mark.slow
 def test_a_curve_has_all_its_points(tmp_path: Path) -> None:
-    """Shares with intervals, and confusions that add up; nothing else stays on the disk, and it is not trained again."""
+    """Shares with intervals, and confusions that add up; nothing else stays on the disk, and it is
+    not trained again."""
     out = tmp_path / "deeper" / "curve.json"
     result = follow(out)
     assert json.loads(out.read_text()) == json.loads(json.dumps(result))
@@ -94,7 +102,9 @@ def test_an_interrupted_curve_goes_on(centred: bool, tmp_path: Path) -> None:
     with pytest.raises(CurveInterrupted):
         follow(tmp_path / "a.json", stop_at=5, centred=centred)
     assert [p["step"] for p in json.loads((tmp_path / "a.json").read_text())["points"]] == [2, 4]
-    resumed, whole = (follow(tmp_path / name, centred=centred)["points"] for name in ("a.json", "b.json"))
+    resumed, whole = (
+        follow(tmp_path / name, centred=centred)["points"] for name in ("a.json", "b.json")
+    )
     assert resumed == whole
 
 

@@ -1,4 +1,5 @@
-"""The grid of methods, protocols, folds and seeds: what it counts, keeps, resumes, and the form that scripts rely on."""
+"""The grid of methods, protocols, folds and seeds: what it counts, keeps, resumes, and the form
+that scripts rely on."""
 
 from __future__ import annotations
 
@@ -20,7 +21,17 @@ from train.evaluation.evaluate import Plan, Where
 from train.export import pack
 from train.models import methods
 
-KEYS = {"method", "protocol", "means_removed", "seed", "window", "recording", "interval", "fit_s", "ms_p50"}
+KEYS = {
+    "method",
+    "protocol",
+    "means_removed",
+    "seed",
+    "window",
+    "recording",
+    "interval",
+    "fit_s",
+    "ms_p50",
+}
 
 
 def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.Result]:
@@ -36,7 +47,11 @@ HERE = Where(jobs=1, cache=None)
 def test_it_finds_what_distinguishes_materials():
     """Hums of three pitches are distinguished under every protocol, by window and by recording."""
     for result in every(
-        tones(), HERE, "L-gauss", "H-svm", protocols=("leave:session", "random:3", "split:session=0,1->2")
+        tones(),
+        HERE,
+        "L-gauss",
+        "H-svm",
+        protocols=("leave:session", "random:3", "split:session=0,1->2"),
     ):
         figures = result.json()
         assert figures["window"]["right"] >= 0.9 * figures["window"]["total"], figures
@@ -57,9 +72,17 @@ def test_it_finds_nothing_where_there_is_nothing():
 def test_removed_means_are_gone():
     """A material known by its offset alone is not known any more."""
     hidden = tones(offset=40.0, noise=60.0)
-    hidden = Dataset((hidden.samples - hidden.samples % 40).astype(np.int16), hidden.labels, hidden.materials, 100.0,
-                      hidden.groups, "offsets")  # fmt: skip
-    (with_means,), (without,) = (every(hidden, HERE, "static-svm", means_removed=gone) for gone in (False, True))
+    hidden = Dataset(
+        (hidden.samples - hidden.samples % 40).astype(np.int16),
+        hidden.labels,
+        hidden.materials,
+        100.0,
+        hidden.groups,
+        "offsets",
+    )
+    (with_means,), (without,) = (
+        every(hidden, HERE, "static-svm", means_removed=gone) for gone in (False, True)
+    )
     assert with_means.json()["window"]["right"] > without.json()["window"]["right"] + 5
     assert without.json()["means_removed"] is True
     assert np.abs(without.sweeps.samples.mean(axis=1)).max() < 1e-3
@@ -67,12 +90,16 @@ def test_removed_means_are_gone():
 
 @pytest.mark.slow
 def test_the_counts_are_those_of_the_logits():
-    """Windows by the largest logit, recordings by the product of their probabilities, the confusion matrix of both."""
+    """Windows by the largest logit, recordings by the product of their probabilities, the confusion
+    matrix of both."""
     sweeps = tones(noise=150.0)
     (result,) = every(sweeps, HERE, "L-knn")
     figures, labels = result.json(), sweeps.labels[result.test]
     assert sorted(result.test) == list(range(len(sweeps)))
-    assert figures["window"] == {"right": int((result.logits.argmax(1) == labels).sum()), "total": 36}
+    assert figures["window"] == {
+        "right": int((result.logits.argmax(1) == labels).sum()),
+        "total": 36,
+    }
     right = 0
     for number in range(18):
         mine = sweeps.groups["recording"][result.test] == number
@@ -88,11 +115,15 @@ def test_the_counts_are_those_of_the_logits():
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
     """Where it runs does not change what comes out."""
-    one, two = (every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2))
+    one, two = (
+        every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2)
+    )
     assert np.array_equal(one[0].logits, two[0].logits)
 
 
-def test_an_interrupted_evaluation_continues_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_evaluation_continues_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Folds that are done are not trained again; the result is the same."""
     where = Where(jobs=1, cache=tmp_path)
     calls: list[int] = []
@@ -116,7 +147,9 @@ def test_an_interrupted_evaluation_continues_where_it_was(tmp_path: Path, monkey
     (again,) = every(tones(), where, "L-gauss")
     assert len(calls) == 4
     assert np.array_equal(result.logits, again.logits)
-    assert np.array_equal(result.logits, every(tones(), replace(where, kept=True), "L-gauss")[0].logits)
+    assert np.array_equal(
+        result.logits, every(tones(), replace(where, kept=True), "L-gauss")[0].logits
+    )
     assert again.json()["window"] == every(tones(), HERE, "L-gauss")[0].json()["window"]
 
 
@@ -130,7 +163,9 @@ def test_a_broken_cache_file_is_done_again(tmp_path: Path):
     assert np.array_equal(first.logits, again.logits)
 
 
-def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_fold_is_kept_under_all_that_it_depends_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Data, method, effort, seed, split and code: another name for each of them."""
     task = fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
     others = [
@@ -144,23 +179,40 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(tmp_path: Path, monkeypatch
     names = {fold.key(t, "data") for t in [task, *others]} | {fold.key(task, "other data")}
     assert len(names) == 8
     assert (
-        fold.key(fold.FoldTask("L-svm", methods.Effort(0.5), 1, task.train, task.test), "data") in names
+        fold.key(fold.FoldTask("L-svm", methods.Effort(0.5), 1, task.train, task.test), "data")
+        in names
     )  # nothing to it
     monkeypatch.setattr(fold, "version", lambda name: "0")
     assert fold.key(task, "data") not in names
 
 
 def test_a_fold_depends_on_the_code_that_its_method_runs():
-    """What a method imports, directly or not, counts; what stands around it and other methods' networks do not."""
+    """What a method imports, directly or not, counts; what stands around it and other methods'
+    networks do not."""
 
     def reached(method: str) -> set[str]:
         """Without the packages' names."""
-        return {name.split(".")[-1] for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))}
+        return {
+            name.split(".")[-1]
+            for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))
+        }
 
-    assert {"paper_cnn", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached("paper-cnn")
+    assert {"paper_cnn", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached(
+        "paper-cnn"
+    )
     classical = reached("L-svm")
-    assert {"baselines", "linear_head", "graph_builder", "features", "time_series", "prior_work"} <= classical
-    assert not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"} & classical
+    assert {
+        "baselines",
+        "linear_head",
+        "graph_builder",
+        "features",
+        "time_series",
+        "prior_work",
+    } <= classical
+    assert (
+        not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"}
+        & classical
+    )
     assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
 
 
@@ -184,15 +236,37 @@ def command(*args: str, cache: Path) -> int:
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_scripts_rely_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A list of results with the keys of the manual, one for each method and seed, in the order asked for."""
+def test_the_command_writes_what_scripts_rely_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A list of results with the keys of the manual, one for each method and seed, in the order
+    asked for."""
     tones(offset=9.0).save(tmp_path / "tones.npz")
     out = tmp_path / "deep" / "results.json"
-    args = ("--set", str(tmp_path / "tones.npz"), "--protocol", "leave:session", "--method", "H-knn,L-gauss", "--seeds", "2",
-            "--only", "material=a,c", "session<=2", "--remove-means", "--json", str(out))  # fmt: skip
+    args = (
+        "--set",
+        str(tmp_path / "tones.npz"),
+        "--protocol",
+        "leave:session",
+        "--method",
+        "H-knn,L-gauss",
+        "--seeds",
+        "2",
+        "--only",
+        "material=a,c",
+        "session<=2",
+        "--remove-means",
+        "--json",
+        str(out),
+    )
     assert command(*args, cache=tmp_path / "cache") == 0
     results = json.loads(out.read_text())
-    assert [(r["method"], r["seed"]) for r in results] == [("H-knn", 1), ("H-knn", 2), ("L-gauss", 1), ("L-gauss", 2)]
+    assert [(r["method"], r["seed"]) for r in results] == [
+        ("H-knn", 1),
+        ("H-knn", 2),
+        ("L-gauss", 1),
+        ("L-gauss", 2),
+    ]
     for result in results:
         assert set(result) >= KEYS
         assert result["protocol"] == "leave:session"
@@ -212,40 +286,91 @@ def test_the_command_writes_what_scripts_rely_on(tmp_path: Path, capsys: pytest.
 def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
     """Every sweep stands for itself."""
     whole = tones(windows=1)
-    Dataset(whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}).save(
-        tmp_path / "a.npz"
-    )
+    Dataset(
+        whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}
+    ).save(tmp_path / "a.npz")
     out = tmp_path / "r.json"
-    assert command("--set", str(tmp_path / "a.npz"), "--protocol", "leave:day", "--method", "L-svm", "--json", str(out),
-                   cache=tmp_path) == 0  # fmt: skip
+    assert (
+        command(
+            "--set",
+            str(tmp_path / "a.npz"),
+            "--protocol",
+            "leave:day",
+            "--method",
+            "L-svm",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == 0
+    )
     (result,) = json.loads(out.read_text())
     assert "recording" not in result
 
 
-def test_a_method_that_cannot_work_does_not_stop_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Windows too short for a spectrum over time: reported with the reason and an exit code, after all else was done."""
+def test_a_method_that_cannot_work_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Windows too short for a spectrum over time: reported with the reason and an exit code, after
+    all else was done."""
     whole, out = tones(), tmp_path / "r.json"
-    short = Dataset(whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short")
+    short = Dataset(
+        whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short"
+    )
     short.save(tmp_path / "short.npz")
-    assert command("--set", str(tmp_path / "short.npz"), "--protocol", "leave:session", "--method", "minirocket,L-gauss",
-                   "--json", str(out), cache=tmp_path) == FormatError.exit_code  # fmt: skip
+    assert (
+        command(
+            "--set",
+            str(tmp_path / "short.npz"),
+            "--protocol",
+            "leave:session",
+            "--method",
+            "minirocket,L-gauss",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == FormatError.exit_code
+    )
     assert [r["method"] for r in json.loads(out.read_text())] == ["L-gauss"]
-    assert "minirocket cannot be used here: a window of 7 frames is too short" in capsys.readouterr().err
+    assert (
+        "minirocket cannot be used here: a window of 7 frames is too short"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Too few frames for H at this rate: named once, above the final line; kept, so that --kept can say it too."""
+    """Too few frames for H at this rate: named once, above the final line; kept, so that --kept can
+    say it too."""
     whole, out = tones(), tmp_path / "r.json"
-    fast = Dataset(whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "fast")
+    fast = Dataset(
+        whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "fast"
+    )
     fast.save(tmp_path / "fast.npz")
-    args = ("--set", str(tmp_path / "fast.npz"), "--protocol", "leave:session", "--method", "H-svm,L-gauss,H-knn",
-            "--seeds", "2", "--json", str(out))  # fmt: skip
+    args = (
+        "--set",
+        str(tmp_path / "fast.npz"),
+        "--protocol",
+        "leave:session",
+        "--method",
+        "H-svm,L-gauss,H-knn",
+        "--seeds",
+        "2",
+        "--json",
+        str(out),
+    )
     assert command(*args, cache=tmp_path / "cache") == FormatError.exit_code
-    assert [(r["method"], r["seed"]) for r in json.loads(out.read_text())] == [("L-gauss", 1), ("L-gauss", 2)]
+    assert [(r["method"], r["seed"]) for r in json.loads(out.read_text())] == [
+        ("L-gauss", 1),
+        ("L-gauss", 2),
+    ]
     *above, last = capsys.readouterr().err.splitlines()
-    assert [line.split(": ")[0] for line in above] == ["H-svm cannot be used here", "H-knn cannot be used here"]
+    assert [line.split(": ")[0] for line in above] == [
+        "H-svm cannot be used here",
+        "H-knn cannot be used here",
+    ]
     assert all("80 frames are too few" in line for line in above)
     assert "H-svm, H-knn left out of H-svm, L-gauss, H-knn" in last
     kept = every(fast, Where(jobs=1, cache=tmp_path / "cache", kept=True), "H-svm")
@@ -253,8 +378,11 @@ def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize("broken", ["train", "logits", "not finite"])
-def test_a_method_refused_in_one_fold_loses_no_other_result(broken: str, monkeypatch: pytest.MonkeyPatch):
-    """It is named once for a protocol and seed, at once; its other protocols and the other methods are complete."""
+def test_a_method_refused_in_one_fold_loses_no_other_result(
+    broken: str, monkeypatch: pytest.MonkeyPatch
+):
+    """It is named once for a protocol and seed, at once; its other protocols and the other methods
+    are complete."""
     calls: list[int] = []
     (sound,) = methods.find(["L-gauss"])
 
@@ -266,8 +394,12 @@ def test_a_method_refused_in_one_fold_loses_no_other_result(broken: str, monkeyp
         return Spoilt(model, broken) if len(calls) == 2 else model
 
     fragile = replace(sound, name="fragile", train=second_fold_fails)
-    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"fragile": fragile, "L-gauss": sound})
-    results = every(tones(), HERE, "fragile", "L-gauss", protocols=("leave:session", "split:session=0,1->2"))
+    monkeypatch.setattr(
+        methods, "every", lambda effort=methods.FULL_EFFORT: {"fragile": fragile, "L-gauss": sound}
+    )
+    results = every(
+        tones(), HERE, "fragile", "L-gauss", protocols=("leave:session", "split:session=0,1->2")
+    )
     found = [(r.method, r.protocol, bool(r.refused)) for r in results]
     assert found == [
         ("fragile", "leave:session", True),
@@ -299,7 +431,8 @@ class Spoilt:
 
 
 def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):
-    """One sweep at a time, its labels compared with those of all at once; pack names the library."""
+    """One sweep at a time, its labels compared with those of all at once; pack names the
+    library."""
     (sound,) = methods.find(["L-gauss"])
     asked: list[int] = []
 
@@ -314,7 +447,9 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
             asked.append(len(inputs))
             return self.model.logits(inputs)
 
-    alone = replace(sound, name="alone", library="its library", train=lambda *args: Alone(sound.train(*args)))
+    alone = replace(
+        sound, name="alone", library="its library", train=lambda *args: Alone(sound.train(*args))
+    )
     monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"alone": alone})
     monkeypatch.setattr(fold, "TIMED_SWEEPS", 5)
     (result,) = every(tones(), HERE, "alone", protocols=("split:session=0,1->2",))
@@ -323,7 +458,9 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
     assert figures["agreement"] == 1
     assert figures["ms_p50"] > 0
     assert not alone.runs_on_the_box
-    with pytest.raises(FormatError, match="method 'alone' runs in its library alone and has no graph"):
+    with pytest.raises(
+        FormatError, match="method 'alone' runs in its library alone and has no graph"
+    ):
         pack.trained(alone, tones(), 1)
 
 
@@ -336,7 +473,11 @@ def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.M
         seen.append(np.bincount(sweeps.labels))
         return sound.train(sweeps, inputs, seed)
 
-    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"L-gauss": replace(sound, train=watched)})
+    monkeypatch.setattr(
+        methods,
+        "every",
+        lambda effort=methods.FULL_EFFORT: {"L-gauss": replace(sound, train=watched)},
+    )
     (result,) = every(tones(), HERE, "L-gauss", each=5)
     assert np.array(seen).tolist() == [[5, 5, 5]] * 3
     assert result.json()["window"]["total"] == 36
@@ -345,15 +486,38 @@ def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.M
 def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
     """Two sets make one with a group `set`: T-REAL against T-HARD."""
     out = tmp_path / "r.json"
-    assert command("--set", "sim:T-REAL:1001:1", "--set", "sim:T-HARD:1002:1", "--protocol", "split:set=0->1",
-                   "--method", "L-gauss", "--json", str(out), cache=tmp_path) == 0  # fmt: skip
+    assert (
+        command(
+            "--set",
+            "sim:T-REAL:1001:1",
+            "--set",
+            "sim:T-HARD:1002:1",
+            "--protocol",
+            "split:set=0->1",
+            "--method",
+            "L-gauss",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == 0
+    )
     assert json.loads(out.read_text())[0]["window"]["total"] == 6
 
 
 @pytest.mark.parametrize(
-    "args", [("--seeds", "0"), ("--each", "-2"), ("--method", "nobody"), ("--protocol", "loo"), ("--only", "x=1")]
+    "args",
+    [
+        ("--seeds", "0"),
+        ("--each", "-2"),
+        ("--method", "nobody"),
+        ("--protocol", "loo"),
+        ("--only", "x=1"),
+    ],
 )
-def test_bad_arguments_are_one_line(args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_bad_arguments_are_one_line(
+    args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """With the value and what to try."""
     tones().save(tmp_path / "t.npz")
     good = {"--set": str(tmp_path / "t.npz"), "--protocol": "leave:session", "--method": "L-svm"}
@@ -367,8 +531,10 @@ def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[s
     """All that the manual promises, and one that needs an extra says so."""
     assert main(["methods"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    promised = ("L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm st-hmp paper-cnn "
-                "tactnet2 recurrent minirocket compact")  # fmt: skip
+    promised = (
+        "L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm st-hmp paper-cnn "
+        "tactnet2 recurrent minirocket compact"
+    )
     assert {line.split()[0] for line in lines} >= set(promised.split())
     assert all(len(line.split()) > 4 for line in lines)
     assert any("palpate-train[minirocket]" in line for line in lines)

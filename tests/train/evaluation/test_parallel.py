@@ -1,4 +1,5 @@
-"""Many tasks at once: on this machine, and on a real Dask cluster of two workers on loopback, one of which dies."""
+"""Many tasks at once: on this machine, and on a real Dask cluster of two workers on loopback, one
+of which dies."""
 
 from __future__ import annotations
 
@@ -48,11 +49,16 @@ def test_every_task_is_done_once_with_its_data():
 
 
 def test_a_process_that_is_replaced_is_not_spoken_of():
-    """joblib warns where it replaces one whose memory has grown; no task is lost by that, and other warnings are shown."""
+    """joblib warns where it replaces one whose memory has grown; no task is lost by that, and other
+    warnings are shown."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
         assert len(list(parallel.results(add, range(3), [np.arange(3.0)], jobs=1))) == 3
-        warnings.warn("A worker stopped while some jobs were given to the executor.", UserWarning, stacklevel=1)
+        warnings.warn(
+            "A worker stopped while some jobs were given to the executor.",
+            UserWarning,
+            stacklevel=1,
+        )
         warnings.warn("another", UserWarning, stacklevel=1)
     assert [str(one.message) for one in shown] == ["another"]
 
@@ -72,11 +78,17 @@ def test_an_error_in_a_task_is_the_callers():
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
     """A scheduler and two workers without nannies: who dies stays dead."""
-    command, env = (sys.executable, "-m", "dask"), os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    command, env = (
+        (sys.executable, "-m", "dask"),
+        os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+    )
     scheduler = subprocess.Popen(
         (*command, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, env=env,
-    )  # fmt: skip
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        env=env,
+    )
     processes = [scheduler]
     try:
         for line in scheduler.stderr:
@@ -116,7 +128,8 @@ def test_a_cluster_gives_the_same_bits(cluster):
 
 
 def noted(task: int, folder: str, data: np.ndarray) -> float:
-    """A task that leaves a note for each time it was done; the first to do task 7 is killed in the middle of it."""
+    """A task that leaves a note for each time it was done; the first to do task 7 is killed in the
+    middle of it."""
     if task == 7:
         with contextlib.suppress(FileExistsError):
             Path(folder, "killed").touch(exist_ok=False)
@@ -144,12 +157,18 @@ def test_an_error_on_a_worker_is_the_callers(cluster):
         list(parallel.results(add, [99], [np.arange(3.0)], scheduler=cluster[0]))
 
 
-def test_a_cluster_without_the_project_is_named(cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_cluster_without_the_project_is_named(
+    cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """What is to be run is not installed there."""
     (tmp_path / "only_here.py").write_text("def call(task):\n    return task\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(FormatError, match="lacks this version of palpate-train"):
-        list(parallel.results(importlib.import_module("only_here").call, [1], [], scheduler=cluster[0]))
+        list(
+            parallel.results(
+                importlib.import_module("only_here").call, [1], [], scheduler=cluster[0]
+            )
+        )
 
 
 def always_dies(task: int) -> None:
@@ -157,7 +176,9 @@ def always_dies(task: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_task_that_kills_every_worker_ends_with_a_reason(cluster, monkeypatch: pytest.MonkeyPatch):
+def test_a_task_that_kills_every_worker_ends_with_a_reason(
+    cluster, monkeypatch: pytest.MonkeyPatch
+):
     """Nothing hangs when no worker is left."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match=r"died too often|has no worker"):
@@ -165,9 +186,12 @@ def test_a_task_that_kills_every_worker_ends_with_a_reason(cluster, monkeypatch:
 
 
 def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
-    """No scheduler at that address: reported within its deadline, with the command that starts one."""
+    """No scheduler at that address: reported within its deadline, with the command that starts
+    one."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
-    with pytest.raises(FormatError, match=r"no scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"):
+    with pytest.raises(
+        FormatError, match=r"no scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"
+    ):
         list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))
 
 

@@ -1,4 +1,5 @@
-"""Robustness: each corruption does what it says and nothing else, and right answers are counted correctly."""
+"""Robustness: each corruption does what it says and nothing else, and right answers are counted
+correctly."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ BY_NAME = {s.name: s for s in corruptions.CORRUPTIONS}
 DIGITAL = [s.name for s in corruptions.CORRUPTIONS if s.only != "simulated"]
 
 
-def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0) -> Dataset:
+def small(
+    kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0
+) -> Dataset:
     """Sweeps of two materials: the second is stronger and rougher."""
     labels = np.arange(shape[0]) % 2
     each = labels.reshape(-1, *(1,) * (len(shape) - 1))
@@ -68,7 +71,9 @@ def learn(sweeps: Dataset, given: np.ndarray, seed: int) -> NearestMean:
     if given.shape[1] < 20:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 20")
     seen = _figures(given) + seed
-    return NearestMean(np.stack([seen[sweeps.labels == k].mean(axis=0) for k in range(len(sweeps.materials))]))
+    return NearestMean(
+        np.stack([seen[sweeps.labels == k].mean(axis=0) for k in range(len(sweeps.materials))])
+    )
 
 
 FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
@@ -85,7 +90,8 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
 )
 @pytest.mark.parametrize("name", DIGITAL)
 def test_counts_stay_counts(name: str, sweeps: Dataset):
-    """For any grid, rate and type: severity 0 changes no bit, the severest gives another sweep of the same form, repeatably."""
+    """For any grid, rate and type: severity 0 changes no bit, the severest gives another sweep of
+    the same form, repeatably."""
     entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
     assert entry.apply(trial, 0, 3) is sweeps.samples
@@ -99,22 +105,45 @@ def test_counts_stay_counts(name: str, sweeps: Dataset):
 
 @pytest.mark.parametrize("name", [n for n in BY_NAME if BY_NAME[n].only == "simulated"])
 def test_the_scene_is_drawn_anew(name: str):
-    """Each physical corruption changes simulated sweeps, and is refused by name where there is no scene to draw."""
+    """Each physical corruption changes simulated sweeps, and is refused by name where there is no
+    scene to draw."""
     entry = BY_NAME[name]
     assert entry.apply(scene(), 0, 0) is scene().sweeps.samples
     severe = entry.apply(scene(), entry.severities[-1], 0)
     assert (severe.shape, severe.dtype) == (scene().sweeps.samples.shape, np.uint8)
     assert (severe != scene().sweeps.samples).any(axis=(1, 2, 3)).all()
-    with pytest.raises(FormatError, match=f"stress '{name}' draws sweeps anew and small cannot; use sim:NAME"):
+    with pytest.raises(
+        FormatError, match=f"stress '{name}' draws sweeps anew and small cannot; use sim:NAME"
+    ):
         entry.apply(EvaluationSweeps(small()), entry.severities[-1], 0)
 
 
-@pytest.mark.parametrize("name", ["dead", "stuck", "gain-spread", "gain-down", "gain-up", "drift", "bits", "lost",
-                                  "saturation", "hum", "noise", "noisy", "shift-grid", "turn-grid"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dead",
+        "stuck",
+        "gain-spread",
+        "gain-down",
+        "gain-up",
+        "drift",
+        "bits",
+        "lost",
+        "saturation",
+        "hum",
+        "noise",
+        "noisy",
+        "shift-grid",
+        "turn-grid",
+    ],
+)
 def test_a_corruption_only_grows(name: str):
     """The more severe, the further from the sound sweep."""
     trial = EvaluationSweeps(small("float32"))
-    away = [np.abs(BY_NAME[name].apply(trial, s, 1) - trial.sweeps.samples).mean() for s in BY_NAME[name].severities]
+    away = [
+        np.abs(BY_NAME[name].apply(trial, s, 1) - trial.sweeps.samples).mean()
+        for s in BY_NAME[name].severities
+    ]
     assert (np.diff(away) > 0).all() if name != "bits" else (np.diff(away) > -1e-3).all()
 
 
@@ -126,18 +155,22 @@ def test_no_severity_beyond_the_scale(severity: float):
 
 
 def test_corruptions_by_name():
-    """Found by name, unknown ones are refused; simulated sweeps are drawn anew, the raw counts of a file are changed."""
+    """Found by name, unknown ones are refused; simulated sweeps are drawn anew, the raw counts of a
+    file are changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
         corruptions.find(["cold"])
     physical = {"shift-rows", "turn", "force-down", "force-up", "speed-down", "speed-up", "window"}
     instead = {"shift-grid", "turn-grid", "window-held", "stretch", "shorten"}
     assert {s.name for s in corruptions.applicable(scene())} == set(BY_NAME) - instead
-    assert {s.name for s in corruptions.applicable(EvaluationSweeps(small()))} == set(BY_NAME) - physical
+    assert {s.name for s in corruptions.applicable(EvaluationSweeps(small()))} == set(
+        BY_NAME
+    ) - physical
 
 
 def test_the_scene_is_what_the_simulator_draws():
-    """The sound sweeps; one row of shift and 20 degrees of turn are skin.sweep's own, from the same random stream."""
+    """The sound sweeps; one row of shift and 20 degrees of turn are skin.sweep's own, from the same
+    random stream."""
     trial, form = scene(), skin.FORMAT
     assert (trial.scene.draw() == trial.sweeps.samples).all()
     assert sorted(np.bincount(trial.sweeps.labels)) == [4] * 6
@@ -149,7 +182,9 @@ def test_the_scene_is_what_the_simulator_draws():
     ):
         rng = np.random.default_rng([1002, i, *b"stress"])
         whole = skin.sweep("metal", at, rng, rest_s=0.1, slide_s=2.0, after_s=0.1)
-        assert (BY_NAME[name].apply(trial, severity, 0)[i] == whole[75 : 75 + form.window]).all(), name
+        assert (BY_NAME[name].apply(trial, severity, 0)[i] == whole[75 : 75 + form.window]).all(), (
+            name
+        )
 
 
 def test_a_window_error_reaches_into_the_rest():
@@ -176,13 +211,21 @@ def test_force_is_the_worlds():
 
 
 def test_speed_is_the_fingers():
-    """Half as fast, the relief passes at half its frequencies; what friction shakes keeps its own."""
+    """Half as fast, the relief passes at half its frequencies; what friction shakes keeps its
+    own."""
     still = replace(skin.WORLD, off=frozenset({"vibration", "drift", "noise", "spot"}))
     shaken = replace(skin.WORLD, off=frozenset({"texture", "drift", "noise", "spot"}))
 
     def centre_hz(world: skin.World) -> float:
-        power = np.abs(np.fft.rfft(scene().scene.draw(world=world)[:, :, 1, 1].astype(float) - 60, axis=1)) ** 2
-        return float(np.exp(np.average(np.log(np.arange(4, 500)), weights=power[:, 4:500].sum(0))) / 2)
+        power = (
+            np.abs(
+                np.fft.rfft(scene().scene.draw(world=world)[:, :, 1, 1].astype(float) - 60, axis=1)
+            )
+            ** 2
+        )
+        return float(
+            np.exp(np.average(np.log(np.arange(4, 500)), weights=power[:, 4:500].sum(0))) / 2
+        )
 
     usual, slow, fast = (centre_hz(replace(still, speed=v)) for v in (1.0, 0.5, 1.5))
     assert slow < 0.7 * usual < usual < 0.8 * fast
@@ -192,7 +235,8 @@ def test_speed_is_the_fingers():
 
 
 def test_dead_stuck_and_noisy_taxels():
-    """As many taxels as the severity says, the others unchanged; those dead at 1 are dead at 3 too."""
+    """As many taxels as the severity says, the others unchanged; those dead at 1 are dead at 3
+    too."""
     trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
@@ -215,12 +259,15 @@ def test_a_taxel_is_dead_on_all_its_axes():
 
 
 def test_shear_turns_with_the_skin():
-    """A quarter turn: the grid as that of one axis, and shear along the rows becomes shear across; the normal axis stays."""
+    """A quarter turn: the grid as that of one axis, and shear along the rows becomes shear across;
+    the normal axis stays."""
     flat = np.random.default_rng(0).uniform(10, 90, (2, 5, 3, 3)).astype(np.float32)
     along, normal = np.arange(90, dtype=np.float32).reshape(flat.shape), flat
     x = np.stack([along, 0 * along, normal], axis=-1)
     turned = corruptions._regrid(x, 0.0, 90.0, 0.0, np.random.default_rng(0))
-    read = [corruptions._regrid(of, 0.0, 90.0, 0.0, np.random.default_rng(0)) for of in (along, normal)]
+    read = [
+        corruptions._regrid(of, 0.0, 90.0, 0.0, np.random.default_rng(0)) for of in (along, normal)
+    ]
     np.testing.assert_allclose(turned, np.stack([0 * along, -read[0], read[1]], axis=-1), atol=1e-3)
 
 
@@ -231,11 +278,14 @@ def test_a_scene_with_shear_is_drawn_anew():
     assert str(trial.sweeps.format) == "4x4x3 int16 at 750 Hz, window 1500"
     drawn = BY_NAME["force-down"].apply(trial, 0.5, 0)
     assert drawn.shape == trial.sweeps.samples.shape
-    np.testing.assert_array_equal(drawn, trial.scene.draw(world=skin.World(shear=True, force_n=0.5)))
+    np.testing.assert_array_equal(
+        drawn, trial.scene.draw(world=skin.World(shear=True, force_n=0.5))
+    )
 
 
 def test_lost_frames_lie_on_the_line():
-    """About a fifth is lost, never more than two in a row, and each is on the line between those that came."""
+    """About a fifth is lost, never more than two in a row, and each is on the line between those
+    that came."""
     trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
     got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
     lost = (got != was).all(axis=(2, 3))
@@ -247,7 +297,9 @@ def test_lost_frames_lie_on_the_line():
         assert np.allclose(got[i, :, 0, 1], want, atol=1e-4)
 
 
-@pytest.mark.parametrize(("name", "share", "hz"), [("stretch", 0.5, 5), ("shorten", 0.5, 15), ("shorten", 0.2, 12)])
+@pytest.mark.parametrize(
+    ("name", "share", "hz"), [("stretch", 0.5, 5), ("shorten", 0.5, 15), ("shorten", 0.2, 12)]
+)
 def test_stretching_moves_frequencies(name: str, share: float, hz: float):
     """A tone of 10 Hz becomes one of 5, 15 or 12 Hz, as strong as before."""
     tone = np.sin(2 * np.pi * 10 * np.arange(400) / 100).astype(np.float32).reshape(1, 400, 1, 1)
@@ -296,11 +348,15 @@ def test_counts_are_digitized_again():
     sweeps.samples[:, :, 1, 1] = 200
     up = BY_NAME["gain-up"].apply(EvaluationSweeps(sweeps), 0.5, 0)
     assert (up[:, :, 1, 1] == 255).all()
-    assert (BY_NAME["gain-down"].apply(EvaluationSweeps(small()), 0.5, 0) == np.rint(small().samples / 2)).all()
+    assert (
+        BY_NAME["gain-down"].apply(EvaluationSweeps(small()), 0.5, 0)
+        == np.rint(small().samples / 2)
+    ).all()
 
 
 def test_the_grid_is_read_elsewhere():
-    """One row on: each row reads its neighbour, the last the one before it, but for gains that training never saw."""
+    """One row on: each row reads its neighbour, the last the one before it, but for gains that
+    training never saw."""
     trial = EvaluationSweeps(small("float32", (3, 50, 4, 2)))
     was = trial.sweeps.samples
     ratio = BY_NAME["shift-grid"].apply(trial, 1, 0) / was[:, :, [1, 2, 3, 2]]
@@ -308,22 +364,27 @@ def test_the_grid_is_read_elsewhere():
     assert np.abs(np.log(ratio)).max() <= 0.25 / 1.5 + 1e-4
     was[:] = 50 + np.arange(50)[:, None, None]
     turned = BY_NAME["turn-grid"].apply(EvaluationSweeps(trial.sweeps), 30, 0)
-    assert np.ptp(turned / was, axis=1).max() < 1e-4, "a skin that feels the same everywhere may be turned"
+    assert np.ptp(turned / was, axis=1).max() < 1e-4, (
+        "a skin that feels the same everywhere may be turned"
+    )
     was[:] = np.array([[0, 1], [1, 2], [2, 3], [3, 4]]) * 10.0 + 10
     quarter = corruptions._regrid(was[:, :, 1:3], 0.0, 90.0, 0.0, np.random.default_rng(0))[0, 0]
     assert np.allclose(quarter, [[30, 20], [40, 30]])  # x runs down the rows, y along the columns
 
 
 def test_fewer_sweeps_as_many_of_each():
-    """Of a file about `most` are taken, evenly over the materials; what is not more is taken whole."""
+    """Of a file about `most` are taken, evenly over the materials; what is not more is taken
+    whole."""
     sweeps = small("uint8", (40, 20, 1, 1))
     assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
     assert np.bincount(EvaluationSweeps.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]
     assert (
-        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples == EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples
+        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples
+        == EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples
     ).all()
     assert (
-        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples != EvaluationSweeps.of(sweeps, 10, 2).sweeps.samples
+        EvaluationSweeps.of(sweeps, 10, 1).sweeps.samples
+        != EvaluationSweeps.of(sweeps, 10, 2).sweeps.samples
     ).any()
 
 
@@ -335,7 +396,8 @@ def test_an_unknown_scene_is_refused(spec: str):
 
 
 def test_the_fall_is_between_two_severities():
-    """On the line between them; exactly five points are enough; None where it never falls that far."""
+    """On the line between them; exactly five points are enough; None where it never falls that
+    far."""
 
     def at(*accuracy: float) -> float | None:
         return robustness.falls({"severities": [0.0, 1.0, 2.0, 4.0], "accuracy": list(accuracy)})
@@ -349,15 +411,33 @@ def test_the_fall_is_between_two_severities():
 def task(method: str, seed: int, right: list[int], **more) -> dict:
     """What `evaluate_method` returns, by hand: 20 sweeps under one corruption."""
     ends = {"low": [n / 20 - 0.1 for n in right], "high": [n / 20 + 0.05 for n in right]}
-    curve = {"title": "dead taxels", "unit": "taxels", "about": "", "severities": [0.0, 1.0, 2.0], "right": right,
-             "broken": [0, 0, 1]} | ends  # fmt: skip
-    return {"method": method, "seed": seed, "set": "x", "refused": "", "total": 20, "ran": "", "trouble": {},
-            "curves": {"dead": curve}} | more  # fmt: skip
+    curve = {
+        "title": "dead taxels",
+        "unit": "taxels",
+        "about": "",
+        "severities": [0.0, 1.0, 2.0],
+        "right": right,
+        "broken": [0, 0, 1],
+    } | ends
+    return {
+        "method": method,
+        "seed": seed,
+        "set": "x",
+        "refused": "",
+        "total": 20,
+        "ran": "",
+        "trouble": {},
+        "curves": {"dead": curve},
+    } | more
 
 
 def test_merged_by_hand():
     """Sums, band, fall and loss of two seeds; the order in which they ended does not matter."""
-    tasks = [task("a", 0, [18, 16, 10]), task("a", 1, [20, 18, 2], ran="less"), task("b", 0, [10, 10, 10])]
+    tasks = [
+        task("a", 0, [18, 16, 10]),
+        task("a", 1, [20, 18, 2], ran="less"),
+        task("b", 0, [10, 10, 10]),
+    ]
     result = robustness.merge(tasks)
     assert json.dumps(result) == json.dumps(robustness.merge(tasks[::-1]))
     curve = result["methods"]["a"]["curves"]["dead"]
@@ -371,9 +451,17 @@ def test_merged_by_hand():
 
 
 def test_what_breaks_first_comes_first():
-    """By the part of its range that it takes; of two alike what loses more; what never falls is left out."""
-    found = {name: {"lost": lost, "falls": fall, "severities": [0, most]} for name, lost, fall, most in
-             (("a", 0.1, 1.0, 4), ("b", 0.3, 0.1, 0.2), ("c", 0.2, None, 1), ("d", 0.2, 0.25, 1))}  # fmt: skip
+    """By the part of its range that it takes; of two alike what loses more; what never falls is
+    left out."""
+    found = {
+        name: {"lost": lost, "falls": fall, "severities": [0, most]}
+        for name, lost, fall, most in (
+            ("a", 0.1, 1.0, 4),
+            ("b", 0.3, 0.1, 0.2),
+            ("c", 0.2, None, 1),
+            ("d", 0.2, 0.25, 1),
+        )
+    }
     assert robustness.breaks_first(found) == ["d", "a", "b"]
 
 
@@ -402,17 +490,21 @@ def test_one_task_travels_and_counts():
 
 
 def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each method and seed is a task of its own; what is done is not done again; unknown names are refused."""
+    """Each method and seed is a task of its own; what is done is not done again; unknown names are
+    refused."""
     sweeps, trial = small(), EvaluationSweeps(small())
-    monkeypatch.setattr(methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names])
+    monkeypatch.setattr(
+        methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names]
+    )
     monkeypatch.setattr(methods, "module_of", lambda name: "train.models.baselines")
     lines: list[str] = []
     where = Where(jobs=1, cache=tmp_path)
     first = robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2), log=lines.append)
     assert [line.split(" done")[0] for line in lines] == ["1/4", "2/4", "3/4", "4/4"]
-    assert [line.partition("a under" if i in (0, 2) else "b under")[1] != "" for i, line in enumerate(lines)] == [
-        True
-    ] * 4
+    assert [
+        line.partition("a under" if i in (0, 2) else "b under")[1] != ""
+        for i, line in enumerate(lines)
+    ] == [True] * 4
     assert first["methods"]["b"]["seeds"] == [1, 2]
     monkeypatch.setattr(robustness, "evaluate_method", None)
     assert robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2)) == first
@@ -444,12 +536,14 @@ def test_all_applicable_corruptions_by_default():
 
 def test_what_cannot_be_done_is_said():
     """A set of another kind is the caller's mistake; a method that refuses its set is a result."""
-    with pytest.raises(FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"):
+    with pytest.raises(
+        FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"
+    ):
         robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), None, 0)
     short = small(shape=(4, 10, 3, 3))
-    entry = robustness.merge([robustness.evaluate_method(FAKE, short, EvaluationSweeps(short), None, 0)])["methods"][
-        "fake"
-    ]
+    entry = robustness.merge(
+        [robustness.evaluate_method(FAKE, short, EvaluationSweeps(short), None, 0)]
+    )["methods"]["fake"]
     assert entry["refused"] == "a window of 10 frames is too short; use at least 20"
     assert (entry["curves"], entry["clean"]) == ({}, None)
 
@@ -464,27 +558,37 @@ def test_an_answer_that_is_not_finite_is_wrong():
             return logits
 
     model = NanModel(learn(small(), small().samples, 0).means)
-    done = robustness.evaluate_model(FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0)
+    done = robustness.evaluate_model(
+        FAKE, model, EvaluationSweeps(small()), corruptions.find(["dead"]), 0
+    )
     assert done["curves"]["dead"]["right"][0] == 9
     assert done["curves"]["dead"]["broken"] == [3] * 5
-    assert robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small()))["silent"] == "not finite"
+    assert (
+        robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small()))["silent"]
+        == "not finite"
+    )
 
 
 def test_each_answer_to_an_uninformative_sweep_has_a_name():
-    """Sound methods stay finite or refuse; a value that is not finite never reaches them; a crash is reported, and the worst
-    answer counts."""
+    """Sound methods stay finite or refuse; a value that is not finite never reaches them; a crash
+    is reported, and the worst answer counts."""
     model = learn(small(), small().samples, 0)
     found = robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small("float32")))
     assert [found[k] for k in ("silent", "constant", "saturated")] == ["finite"] * 3
     assert found["one-frame"].startswith("refused: 3x3 float32 at 100 Hz, window 1 instead of")
     for name in ("nan", "inf"):
-        assert found[name] == f"refused: {name}: samples[0, 60, 0, 0] is {name}; drop sweep 0 or fill it in"
+        assert (
+            found[name]
+            == f"refused: {name}: samples[0, 60, 0, 0] is {name}; drop sweep 0 or fill it in"
+        )
 
     class Crash:
         def logits(self, given: np.ndarray) -> np.ndarray:
             raise ZeroDivisionError("no contact")
 
-    for name, window in robustness._uninformative(SweepFormat(2, 2, 100.0, 40, "float32", 3), 90.0).items():
+    for name, window in robustness._uninformative(
+        SweepFormat(2, 2, 100.0, 40, "float32", 3), 90.0
+    ).items():
         assert window.shape[1:] == (2, 2, 3), name
     crashed = robustness.uninformative_answers(FAKE, Crash(), EvaluationSweeps(small()))
     assert crashed["silent"] == "crashed: ZeroDivisionError: no contact"
@@ -497,21 +601,28 @@ def test_each_answer_to_an_uninformative_sweep_has_a_name():
 
 
 def test_the_box_answers_with_a_status(default_bundle: bundle.Bundle):
-    """Through sweep cutter and classifier: an uninformative sweep is refused by name, and a sound one is not."""
+    """Through sweep cutter and classifier: an uninformative sweep is refused by name, and a sound
+    one is not."""
     assert robustness.box_answers(default_bundle) == {
-        "silent": "no-contact", "constant": "stuck-taxel", "one-frame": "short", "saturated": "saturated",
-    }  # fmt: skip
+        "silent": "no-contact",
+        "constant": "stuck-taxel",
+        "one-frame": "short",
+        "saturated": "saturated",
+    }
     assert robustness.answer(default_bundle, default_bundle.golden[0]).status is Status.OK
     assert robustness.answer(default_bundle, default_bundle.golden[0][:-1]).status is Status.SHORT
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_a_nan_from_a_float_skin_is_never_an_answer():
-    """A board that sends one NaN: its taxel is dead; a bundle whose input is float32 would take it."""
+    """A board that sends one NaN: its taxel is dead; a bundle whose input is float32 would take
+    it."""
     form = SweepFormat(3, 3, 100.0, 40, "float32")
-    nodes = [helper.make_node("ReduceMean", ["sweep"], ["mean"], axes=[1, 2, 3], keepdims=0),
-             helper.make_node("Unsqueeze", ["mean", "one"], ["column"]),
-             helper.make_node("Concat", ["column", "column"], ["logits"], axis=1)]  # fmt: skip
+    nodes = [
+        helper.make_node("ReduceMean", ["sweep"], ["mean"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("Unsqueeze", ["mean", "one"], ["column"]),
+        helper.make_node("Concat", ["column", "column"], ["logits"], axis=1),
+    ]
     takes = helper.make_tensor_value_info("sweep", TensorProto.FLOAT, [1, 40, 3, 3])
     gives = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, 2])
     one = helper.make_tensor("one", TensorProto.INT64, [1], [1])
@@ -520,7 +631,9 @@ def test_a_nan_from_a_float_skin_is_never_an_answer():
     limits = bundle.Thresholds(contact=1, full_scale=100)
     manifest = bundle.Manifest("mean", "1", form, "raw", ("a", "b"), limits, {})
     nothing = np.zeros((1, 40, 3, 3), np.float32)
-    float_bundle = bundle.Bundle(manifest, "mean", model.SerializeToString(), nothing, np.zeros((1, 2), np.float32))
+    float_bundle = bundle.Bundle(
+        manifest, "mean", model.SerializeToString(), nothing, np.zeros((1, 2), np.float32)
+    )
     found = robustness.box_answers(float_bundle)
     assert found["silent"] == "no-contact"
     assert found["nan"] == "dead-taxel"

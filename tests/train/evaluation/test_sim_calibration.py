@@ -1,4 +1,5 @@
-"""Tests of the simulator's calibration (`train.evaluation.sim_calibration`): the printed numbers, and what is measured beside them."""
+"""Tests of the simulator's calibration (`train.evaluation.sim_calibration`): the printed numbers,
+and what is measured beside them."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ def measured() -> dict:
     with pytest.MonkeyPatch.context() as patch:
         few = {4: "random:2", 6: "random:3"}
         patch.setattr(
-            sim_calibration, "FIGURES", tuple(replace(f, protocol=few.get(f.number, f.protocol)) for f in FIGURES)
+            sim_calibration,
+            "FIGURES",
+            tuple(replace(f, protocol=few.get(f.number, f.protocol)) for f in FIGURES),
         )
         return sim_calibration.measure([SEED], True, jobs=1, per_material=EACH)
 
@@ -39,9 +42,12 @@ def test_the_printed_numbers_are_the_papers() -> None:
 
 
 def test_each_figure_is_measured_on_its_own_sets() -> None:
-    """One attachment in T-LAB, nine in T-REAL, several in T-HARD; Fig. 7 is tested on all of T-HARD and on nothing else."""
+    """One attachment in T-LAB, nine in T-REAL, several in T-HARD; Fig. 7 is tested on all of T-HARD
+    and on nothing else."""
     sweeps = sim_calibration.draw(SEED, per_material=EACH)
-    positions = [sweeps.group("position")[np.isin(sweeps.group("set"), kind)] for kind in (LAB, REAL, HARD)]
+    positions = [
+        sweeps.group("position")[np.isin(sweeps.group("set"), kind)] for kind in (LAB, REAL, HARD)
+    ]
     assert [len(np.unique(p)) for p in positions] == [1, 9, sim_calibration.ATTACHMENTS]
     assert len(np.unique(sweeps.group("position"))) == 10 + sim_calibration.ATTACHMENTS
     assert [f.sets for f in FIGURES] == [(LAB,), (REAL,), (REAL,), (REAL, *HARD)]
@@ -52,20 +58,28 @@ def test_each_figure_is_measured_on_its_own_sets() -> None:
 
 
 def test_the_far_attachments_are_a_row_off() -> None:
-    """The leading row of T-HARD's sweeps carries next to nothing, that of the others does; no two are attached alike."""
+    """The leading row of T-HARD's sweeps carries next to nothing, that of the others does; no two
+    are attached alike."""
     sweeps = sim_calibration.draw(SEED, per_material=1)
     load = sweeps.samples[:, :, 3].mean((1, 2))
     hard = np.isin(sweeps.group("set"), HARD)
     assert (load[hard] < 1).all()
     assert (load[~hard] > 2).all()
-    seconds = [sim_calibration.draw(seed, World(off=EVERYTHING_ELSE), 1) for seed in (SEED, SEED + 1)]
-    loads = np.concatenate([s.samples[np.isin(s.group("set"), HARD) & (s.labels == 0), 0] for s in seconds])
+    seconds = [
+        sim_calibration.draw(seed, World(off=EVERYTHING_ELSE), 1) for seed in (SEED, SEED + 1)
+    ]
+    loads = np.concatenate(
+        [s.samples[np.isin(s.group("set"), HARD) & (s.labels == 0), 0] for s in seconds]
+    )
     assert len(np.unique(loads, axis=0)) == 2 * sim_calibration.ATTACHMENTS
 
 
 def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
-    """The same seed gives the same sweeps; a changed world changes them and keeps labels and places."""
-    one, same, other = (sim_calibration.draw(SEED, w, 1) for w in (WORLD, WORLD, World(off=frozenset({"texture"}))))
+    """The same seed gives the same sweeps; a changed world changes them and keeps labels and
+    places."""
+    one, same, other = (
+        sim_calibration.draw(SEED, w, 1) for w in (WORLD, WORLD, World(off=frozenset({"texture"})))
+    )
     assert np.array_equal(one.samples, same.samples)
     assert not np.array_equal(one.samples, other.samples)
     assert np.array_equal(one.labels, other.labels)
@@ -73,7 +87,8 @@ def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
 
 @pytest.mark.slow
 def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
-    """Four figures by five methods of shares, their differences and what they come to; it is JSON."""
+    """Four figures by five methods of shares, their differences and what they come to; it is
+    JSON."""
     assert json.loads(json.dumps(measured)) == measured
     printed, ours, away = (np.array(measured[k]) for k in ("printed", "ours", "difference"))
     assert printed.shape == ours.shape == away.shape == np.array(measured["spread"]).shape == (4, 5)
@@ -86,7 +101,8 @@ def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
 
 @pytest.mark.slow
 def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
-    """Each row holds the accuracies without the effect and their change; each effect changes some of them."""
+    """Each row holds the accuracies without the effect and their change; each effect changes some
+    of them."""
     assert tuple(measured["without"]) == EFFECTS
     for row in measured["without"].values():
         assert row["change"] == pytest.approx(np.array(row["ours"]) - measured["ours"])
@@ -95,7 +111,8 @@ def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
 
 @pytest.mark.slow
 def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sweeps whose features all equal their label are all named rightly; with shifted labels in the test sets none is."""
+    """Sweeps whose features all equal their label are all named rightly; with shifted labels in the
+    test sets none is."""
     monkeypatch.setattr(sim_calibration, "FIGURES", FIGURES[3:])
     monkeypatch.setattr(sim_calibration, "PRINTED", sim_calibration.PRINTED[3:])
     sweeps = sim_calibration.draw(SEED, per_material=4)
@@ -107,7 +124,9 @@ def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(sim_calibration.methods, "model_inputs", inputs)
     assert (sim_calibration.accuracies(sweeps, SEED) == 1).all()
     labels = np.where(np.isin(sweeps.group("set"), HARD), (sweeps.labels + 1) % 6, sweeps.labels)
-    monkeypatch.setattr(sim_calibration.methods, "model_inputs", lambda kind, of: inputs(kind, sweeps))
+    monkeypatch.setattr(
+        sim_calibration.methods, "model_inputs", lambda kind, of: inputs(kind, sweeps)
+    )
     assert (sim_calibration.accuracies(replace(sweeps, labels=labels), SEED) == 0).all()
 
 
@@ -118,7 +137,9 @@ def test_the_table_shows_every_number(measured: dict) -> None:
     lines = text.splitlines()
     for figure, name in enumerate(measured["figures"]):
         (row,) = [line for line in lines if line.startswith(name) and "±" in line]
-        for printed, ours in zip(measured["printed"][figure], measured["ours"][figure], strict=True):
+        for printed, ours in zip(
+            measured["printed"][figure], measured["ours"][figure], strict=True
+        ):
             assert f"{printed:.2f} {ours:.3f}±".replace("0.", ".") in row
     assert [line.split()[0] for line in lines[-len(EFFECTS) :]] == list(EFFECTS)
     assert f"mean {measured['mean']:.3f}".replace("0.", ".") in text
@@ -128,8 +149,14 @@ def test_without_ablation_nothing_is_switched_off() -> None:
     """`measure` computes nothing beyond what it was asked for, and logs its progress."""
     lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sim_calibration, "accuracies", lambda sweeps, seed: sim_calibration.PRINTED + seed - SEED)
-        result = sim_calibration.measure([SEED, SEED + 2], False, lines.append, jobs=1, per_material=1)
+        patch.setattr(
+            sim_calibration,
+            "accuracies",
+            lambda sweeps, seed: sim_calibration.PRINTED + seed - SEED,
+        )
+        result = sim_calibration.measure(
+            [SEED, SEED + 2], False, lines.append, jobs=1, per_material=1
+        )
     assert not result["without"]
     assert len(lines) == 2
     assert np.allclose(result["difference"], 1)

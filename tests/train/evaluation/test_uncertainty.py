@@ -1,4 +1,5 @@
-"""Uncertainty: figures on Gaussians whose true values are known, and the command from set to page."""
+"""Uncertainty: figures on Gaussians whose true values are known, and the command from set to
+page."""
 
 import json
 import re
@@ -25,13 +26,18 @@ NAMES = ("a", "b", "c", "d")
 
 
 def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
-    """Features [N, 10, 4] of n sweeps of four materials at each place, distinguishable from the middle of the sweep on."""
+    """Features [N, 10, 4] of n sweeps of four materials at each place, distinguishable from the
+    middle of the sweep on."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(4), n), places)
     at = np.repeat(np.arange(places), 4 * n) + first
     grown = np.minimum(np.arange(1, 11) / 5, 1)
     means = apart / np.sqrt(2) * np.eye(4)  # any two are `apart`
-    x = means[labels][:, None] * grown[:, None] + rng.standard_normal((len(labels), 1, 4)) + 0 * grown[:, None]
+    x = (
+        means[labels][:, None] * grown[:, None]
+        + rng.standard_normal((len(labels), 1, 4))
+        + 0 * grown[:, None]
+    )
     return x, labels, at
 
 
@@ -44,7 +50,23 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
     x, y, at = x[keep], y[keep], at[keep]
     seen = at % 2 == 1
     copied = x[:, -1] + np.random.default_rng(9).normal(0, 0.1, (len(x), 4))
-    return Case(left_out, fold, 2, x, y, at, ~seen, copied, y, at, ~seen, new, labels, there, np.zeros(len(y), bool))
+    return Case(
+        left_out,
+        fold,
+        2,
+        x,
+        y,
+        at,
+        ~seen,
+        copied,
+        y,
+        at,
+        ~seen,
+        new,
+        labels,
+        there,
+        np.zeros(len(y), bool),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +77,15 @@ def figures():
 
 
 def test_error_is_the_gap_between_probability_and_accuracy():
-    """A probability of 0.9 with 0.7 right is an error of 0.2, whatever the number; a calibrated one is 0; bins count by
-    their sweeps."""
+    """A probability of 0.9 with 0.7 right is an error of 0.2, whatever the number; a calibrated one
+    is 0; bins count by their sweeps."""
     right = np.arange(100) < 70
     assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
     assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
     confidence = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
-    assert uncertainty.error(confidence, np.concatenate([np.ones(50, bool), np.arange(50) < 5])) == pytest.approx(0.25)
+    assert uncertainty.error(
+        confidence, np.concatenate([np.ones(50, bool), np.arange(50) < 5])
+    ) == pytest.approx(0.25)
     assert uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))[-1] == {
         "said": 1.0,
         "right": 1.0,
@@ -70,7 +94,8 @@ def test_error_is_the_gap_between_probability_and_accuracy():
 
 
 def test_temperature_scaling_corrects_an_overconfident_head():
-    """Positions that shift the materials: LDA is overconfident, the temperature found across positions corrects that."""
+    """Positions that shift the materials: LDA is overconfident, the temperature found across
+    positions corrects that."""
     one = case(apart=2.5, places=12)
     # sweeps of one position close together: their scatter says little of other positions
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
@@ -78,8 +103,13 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     done = fit_posthoc(plain_inputs(one.seen, one.seen_labels, one.seen_groups, one.judged))
     figures = uncertainty.calibration([(one, done)])
     right = figures["accuracy"]["accuracy"]
-    mean = {when: np.average([b["said"] for b in figures[when]["bins"]], weights=[b["n"] for b in figures[when]["bins"]])
-            for when in ("before", "after")}  # fmt: skip
+    mean = {
+        when: np.average(
+            [b["said"] for b in figures[when]["bins"]],
+            weights=[b["n"] for b in figures[when]["bins"]],
+        )
+        for when in ("before", "after")
+    }
     assert figures["n"] == sum(b["n"] for b in figures["after"]["bins"]) == 12 * 4 * 24
     assert done.temperature > 1.3
     assert mean["before"] > right + 0.1
@@ -101,19 +131,32 @@ def test_more_sweeps_for_more_certainty(figures):
 
 def test_the_sequential_test_stops_at_the_wanted_probability():
     """By hand: two objects, one decided at the second sweep, one never; the limit ends it."""
-    fused = np.array([[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]])
+    fused = np.array(
+        [[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]]
+    )
     point = uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.9)
-    assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (2.5, 0.5, 0.5, 1.0)
-    assert uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"] is None
+    assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (
+        2.5,
+        0.5,
+        0.5,
+        1.0,
+    )
+    assert (
+        uncertainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"]
+        is None
+    )
 
 
 def test_unknown_materials_six_deviations_away_are_detected(figures):
-    """A material left out is six deviations from the others, known ones are chi-squared: AUROC above 0.95."""
+    """A material left out is six deviations from the others, known ones are chi-squared: AUROC
+    above 0.95."""
     for row in figures["unknown"]["materials"].values():
         assert row["low"] <= row["auroc"] <= row["high"]
         assert (row["known"], row["unknown"]) == (216, 72)
     assert 0.99 < figures["unknown"]["mean"]["auroc"] <= 1
-    assert figures["unknown"]["scores"]["distance, where trained materials differ"] < 0.95  # among them
+    assert (
+        figures["unknown"]["scores"]["distance, where trained materials differ"] < 0.95
+    )  # among them
     assert figures["unknown"]["mean"]["kept"] > 0.95
     limits = figures["unknown"]["limits"]
     for name in ("kept", "false_known", "kept_twice", "false_known_twice"):
@@ -125,7 +168,8 @@ def test_unknown_materials_six_deviations_away_are_detected(figures):
 
 
 def test_two_sweeps_at_a_place_must_both_pass():
-    """By hand: three known sweeps at one place, of which the middle one does not pass, and two unknown ones, which pass."""
+    """By hand: three known sweeps at one place, of which the middle one does not pass, and two
+    unknown ones, which pass."""
     scores, known = np.array([0.5, 0.9, 2.0, 0.5, 0.8]), np.array([True, False, True, True, False])
     places, labels = np.zeros(5, int), np.array([0, 1, 0, 0, 1])
     assert uncertainty._passed(scores, known, places, labels, 1.0, 1) == (pytest.approx(2 / 3), 1.0)
@@ -137,12 +181,15 @@ def test_two_sweeps_at_a_place_must_both_pass():
 def test_an_unknown_material_that_does_not_differ_is_not_seen():
     """Materials that do not differ: AUROC of a half."""
     held = [case(k, apart=0.0) for k in (0, 1)]
-    done = [(c, fit_posthoc(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged))) for c in held]
+    done = [
+        (c, fit_posthoc(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged))) for c in held
+    ]
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
 
 
 def test_enrolment_from_more_sweeps_comes_nearer(figures):
-    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both places are reported."""
+    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both
+    places are reported."""
     points = {(p["where"], p["sweeps"]): p for p in figures["enrolment"]["points"]}
     assert {w for w, _ in points} == {"same place", "other places"}
     for where in ("same place", "other places"):
@@ -153,7 +200,8 @@ def test_enrolment_from_more_sweeps_comes_nearer(figures):
 
 
 def test_early_needs_half_the_sweep_where_that_suffices(figures):
-    """All is known at the fifth tenth: the share is below 0.6 and accuracy is that of the whole sweep."""
+    """All is known at the fifth tenth: the share is below 0.6 and accuracy is that of the whole
+    sweep."""
     early = figures["early"]
     assert early["share"] < 0.6
     assert abs(early["lost"]) <= 0.02
@@ -162,13 +210,28 @@ def test_early_needs_half_the_sweep_where_that_suffices(figures):
 
 
 def test_of_two_materials_none_is_left_out():
-    """Of two materials none can be left out: calibration, sweeps and early answers are reported, and the page has no more."""
+    """Of two materials none can be left out: calibration, sweeps and early answers are reported,
+    and the page has no more."""
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2
     also = one.copied_labels < 2
-    one = Case(NONE_LEFT_OUT, 0, 2, one.seen[two], one.seen_labels[two], one.seen_groups[two], one.judged[two], one.copied[also],
-               one.copied_labels[also], one.copied_groups[also], one.copied_held[also], one.new[test], one.labels[test], one.places[test],
-               one.disturbed[two])  # fmt: skip
+    one = Case(
+        NONE_LEFT_OUT,
+        0,
+        2,
+        one.seen[two],
+        one.seen_labels[two],
+        one.seen_groups[two],
+        one.judged[two],
+        one.copied[also],
+        one.copied_labels[also],
+        one.copied_groups[also],
+        one.copied_held[also],
+        one.new[test],
+        one.labels[test],
+        one.places[test],
+        one.disturbed[two],
+    )
     figures = uncertainty.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}
     html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
@@ -176,12 +239,28 @@ def test_of_two_materials_none_is_left_out():
     assert "never trained<" not in html
 
 
-ABOUT = ("set", "test", "protocol", "method", "seed", "effort", "folds", "trainings", "sweeps", "tested", "format",
-         "digest", "commit", "machine", "took_s")  # fmt: skip
+ABOUT = (
+    "set",
+    "test",
+    "protocol",
+    "method",
+    "seed",
+    "effort",
+    "folds",
+    "trainings",
+    "sweeps",
+    "tested",
+    "format",
+    "digest",
+    "commit",
+    "machine",
+    "took_s",
+)
 
 
 def test_the_page_stands_alone(figures):
-    """One file without script or address; its pictures are sound XML; each target says whether it was reached."""
+    """One file without script or address; its pictures are sound XML; each target says whether it
+    was reached."""
     html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
     assert not re.search(r"<script(?! type=\"application/json\")|src=|href=\"http", html)
     assert len(pictures) == 5
@@ -197,17 +276,25 @@ def sweeps(materials: int = 3) -> Dataset:
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(materials), 6), 4)
     t = np.arange(128)[:, None] / 36
-    hum = np.stack([np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2) for k in labels])
+    hum = np.stack(
+        [
+            np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2)
+            for k in labels
+        ]
+    )
     x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
     position = np.repeat(np.arange(4), 6 * materials)
     return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
 
 
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):
-    """The whole way with a few iterations: results, pictures and page are there; a second run trains nothing."""
+    """The whole way with a few iterations: results, pictures and page are there; a second run
+    trains nothing."""
     hums, lines = sweeps(), []
     where = Where(jobs=1, cache=tmp_path / "cache")
-    first = uncertainty.run(hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02))
+    first = uncertainty.run(
+        hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02)
+    )
     assert first["trainings"] == 4
     assert "4/4 done" in lines[-2]
     page = uncertainty_report.write(first, tmp_path / "out")
@@ -220,12 +307,26 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
         ]
     )
     again = uncertainty.run(
-        hums, None, "split:position=0,1,2->3", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
+        hums,
+        None,
+        "split:position=0,1,2->3",
+        "compact-1k",
+        replace(where, kept=True),
+        lines.append,
+        Effort(0.02),
     )
-    assert {k: v for k, v in again.items() if k != "took_s"} == {k: v for k, v in first.items() if k != "took_s"}
+    assert {k: v for k, v in again.items() if k != "took_s"} == {
+        k: v for k, v in first.items() if k != "took_s"
+    }
     with pytest.raises(FormatError, match="4 of 4 trainings are not kept"):
         uncertainty.run(
-            hums, None, "split:position=0,1->2", "compact-1k", replace(where, kept=True), lines.append, Effort(0.02)
+            hums,
+            None,
+            "split:position=0,1->2",
+            "compact-1k",
+            replace(where, kept=True),
+            lines.append,
+            Effort(0.02),
         )
 
 
@@ -233,7 +334,13 @@ def test_methods_without_tenths_are_refused(tmp_path):
     """L-gauss has no trunk: refused by name."""
     with pytest.raises(FormatError, match="L-gauss"):
         uncertainty.run(
-            sweeps(), None, "split:position=0,1,2->3", "L-gauss", Where(jobs=1, cache=None), print, Effort(0.02)
+            sweeps(),
+            None,
+            "split:position=0,1,2->3",
+            "L-gauss",
+            Where(jobs=1, cache=None),
+            print,
+            Effort(0.02),
         )
 
 

@@ -1,4 +1,5 @@
-"""A skin with three axes from a set to the box: fit, export, the same answers there and in a replay of what it received."""
+"""A skin with three axes from a set to the box: fit, export, the same answers there and in a replay
+of what it received."""
 
 from __future__ import annotations
 
@@ -24,15 +25,32 @@ from train.export import pack
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(), ("--size", "10k", "--steps", "60")], ids=["chosen", "stages"])
 def test_from_a_set_to_the_answers_of_the_box(
-    rigged: Callable[..., Rigged], size: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rigged: Callable[..., Rigged],
+    size: tuple[str, ...],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
-    """fit and export by command; unseen sweeps over the wire get the labels that the bundle gives on the desktop, and again
-    when they are replayed; the bundle knows positions by the normal axis."""
+    """fit and export by command; unseen sweeps over the wire get the labels that the bundle gives
+    on the desktop, and again when they are replayed; the bundle knows positions by the normal
+    axis."""
     sheared().save(tmp_path / "set.npz")
     fit, out = str(tmp_path / "fit.npz"), tmp_path / "bundle"
     steps = size or ("--steps", "0")
-    assert main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *steps]) == 0
-    export = ["export", fit, "--out", str(out), "--name", "sheared", "--version", "1", "--full-scale", "2047"]
+    assert (
+        main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *steps]) == 0
+    )
+    export = [
+        "export",
+        fit,
+        "--out",
+        str(out),
+        "--name",
+        "sheared",
+        "--version",
+        "1",
+        "--full-scale",
+        "2047",
+    ]
     assert main([*export, "--pitch-mm", str(PITCH_MM)]) == 0
     model = bundle.load(out)
     assert str(model.format) == "2x2x3 int16 at 750 Hz, window 600"
@@ -44,7 +62,8 @@ def test_from_a_set_to_the_answers_of_the_box(
     answers, _ = pack.score(Classifier(model, SystemClock()), unseen)
     labels = [model.manifest.labels[k] if k >= 0 else "" for k in answers]
     assert (
-        np.mean([a == unseen.materials[k] for a, k in zip(labels, unseen.labels, strict=True)]) > 0.5
+        np.mean([a == unseen.materials[k] for a, k in zip(labels, unseen.labels, strict=True)])
+        > 0.5
     )  # by chance a sixth
     acts = list(script.named(f"replay:{tmp_path / 'unseen.npz'}", model.format, 0)[0])
     simulated = devices.build(model.format, acts, rig.VirtualClock(), "replay")
@@ -58,20 +77,41 @@ def test_from_a_set_to_the_answers_of_the_box(
     capsys.readouterr()
     choose = ["--set", f"classifier.bundle={out}"]
     assert palpate(["replay", str(tmp_path / "capture"), *choose]) == 0
-    sentences = [line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line]
+    sentences = [
+        line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line
+    ]
     assert [fields[5] for fields in sentences] == labels
     assert palpate(["replay", str(tmp_path / "kept"), *choose]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{len(acts)} sweeps: {len(acts)} the same"
 
 
 @pytest.mark.slow
-def test_the_demo_slides_a_skin_that_feels_shear(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """With a bundle of the simulated set with three axes `palpate demo` simulates shear by itself, and names most tubes."""
+def test_the_demo_slides_a_skin_that_feels_shear(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """With a bundle of the simulated set with three axes `palpate demo` simulates shear by itself,
+    and names most tubes."""
     fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
-    assert main(["fit", "--set", "sim:T-REALx3:1001:1", "--seed", "1", "--out", fit, "--size", "bands"]) == 0
+    assert (
+        main(
+            ["fit", "--set", "sim:T-REALx3:1001:1", "--seed", "1", "--out", fit, "--size", "bands"]
+        )
+        == 0
+    )
     assert main(["export", fit, "--out", out, "--name", "shear", "--version", "1"]) == 0
     capsys.readouterr()
-    asked = ["demo", "--sim", "skin", "--virtual", "--seed", "3", "--sweeps", "12", "--set", f"classifier.bundle={out}"]
+    asked = [
+        "demo",
+        "--sim",
+        "skin",
+        "--virtual",
+        "--seed",
+        "3",
+        "--sweeps",
+        "12",
+        "--set",
+        f"classifier.bundle={out}",
+    ]
     assert palpate(asked) == 0
     shown = capsys.readouterr().out
     assert shown.count(",RES,") == 12

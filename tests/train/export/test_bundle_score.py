@@ -1,4 +1,5 @@
-"""Scoring a bundle: a set through the box's classifier, what it named, with interval and confusions."""
+"""Scoring a bundle: a set through the box's classifier, what it named, with interval and
+confusions."""
 
 from __future__ import annotations
 
@@ -23,11 +24,18 @@ HERE = [(0, 0), (6, 0), (0, 6)]
 """Embeddings of the toy's three materials."""
 
 
-def sweeps(*embeddings: tuple[float, float], labels: list[int], materials: str = "abc", **groups: list[int]) -> Dataset:
+def sweeps(
+    *embeddings: tuple[float, float], labels: list[int], materials: str = "abc", **groups: list[int]
+) -> Dataset:
     """A set for the toy bundle."""
     samples = np.stack([toy_bundle.window(*z) for z in embeddings])
     return Dataset(
-        samples, np.array(labels), tuple(materials), 100.0, {k: np.array(v) for k, v in groups.items()}, "s.npz"
+        samples,
+        np.array(labels),
+        tuple(materials),
+        100.0,
+        {k: np.array(v) for k, v in groups.items()},
+        "s.npz",
     )
 
 
@@ -38,10 +46,18 @@ def classifier(tmp_path: Path) -> Classifier:
 
 
 def test_what_is_named_is_counted(classifier: Classifier):
-    """Right, taken for another, unsure and unknown, by material; the interval resamples positions."""
+    """Right, taken for another, unsure and unknown, by material; the interval resamples
+    positions."""
     s = sweeps(
-        (0, 0), (0, 0), (6, 0), (0, 6), (3, 0), (40, 40), labels=[0, 0, 0, 2, 1, 2], position=[1, 1, 2, 2, 3, 3]
-    )  # fmt: skip
+        (0, 0),
+        (0, 0),
+        (6, 0),
+        (0, 6),
+        (3, 0),
+        (40, 40),
+        labels=[0, 0, 0, 2, 1, 2],
+        position=[1, 1, 2, 2, 3, 3],
+    )
     found = bundle_score.score(classifier, s)
     assert found.right.tolist() == [True, True, False, True, False, False]
     assert found.answered["a"] == Counter(a=2, b=1)
@@ -57,7 +73,9 @@ def test_what_is_named_is_counted(classifier: Classifier):
     assert lines[1].startswith("named rightly: 3 of 6: 50.0 % [")
     assert lines[1].endswith("95 % interval, by position (3)")
     assert "  a     2 of 3     b 1" in lines
-    assert (found.right == ((pack.score(classifier, s)[0] == s.labels) & pack.score(classifier, s)[1])).all()
+    assert (
+        found.right == ((pack.score(classifier, s)[0] == s.labels) & pack.score(classifier, s)[1])
+    ).all()
 
 
 def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):
@@ -70,7 +88,8 @@ def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier)
 
 
 def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
-    """The last answer to each recording; without several windows there are no recordings to tell of."""
+    """The last answer to each recording; without several windows there are no recordings to tell
+    of."""
     s = sweeps((0, 0), (3, 0), (6, 0), (6, 0), labels=[0, 0, 1, 1], recording=[0, 0, 1, 1])
     found = bundle_score.score(classifier, s)
     assert found.recordings is not None
@@ -84,14 +103,19 @@ def test_a_set_of_another_form_is_refused(classifier: Classifier):
     """Both forms are named; so are the materials where none is the same."""
     s = sweeps(*HERE, labels=[0, 1, 2])
     with pytest.raises(
-        FormatError, match=r"s.npz is of 2x2 int16 at 50 Hz, window 20, the bundle of 2x2 int16 at 100 Hz"
+        FormatError,
+        match=r"s.npz is of 2x2 int16 at 50 Hz, window 20, the bundle of 2x2 int16 at 100 Hz",
     ):
         bundle_score.score(classifier, replace(s, rate_hz=50.0))
-    with pytest.raises(FormatError, match=r"s.npz has x, y, z, the bundle a, b, c; none is the same"):
+    with pytest.raises(
+        FormatError, match=r"s.npz has x, y, z, the bundle a, b, c; none is the same"
+    ):
         bundle_score.score(classifier, replace(s, materials=tuple("xyz")))
 
 
-def test_the_command_prints_and_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_and_writes_what_it_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """`palpate-train score`, with --json and --rename; a bundle that is none is one line."""
     toy_bundle.load(tmp_path / "toy")
     sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
@@ -115,16 +139,26 @@ def test_the_command_prints_and_writes_what_it_found(tmp_path: Path, capsys: pyt
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_sweeps_outside_the_trained_positions_are_told(classifier: Classifier, monkeypatch: pytest.MonkeyPatch):
-    """How many the box calls moved, the most frequent of its words for them, and what to do; nothing where there are none."""
+def test_sweeps_outside_the_trained_positions_are_told(
+    classifier: Classifier, monkeypatch: pytest.MonkeyPatch
+):
+    """How many the box calls moved, the most frequent of its words for them, and what to do;
+    nothing where there are none."""
     s = sweeps(*HERE, (0, 0), labels=[0, 1, 2, 0])
     assert "trained positions" not in bundle_score.score(classifier, s).text()
     given = bundle_score.answers
-    words = {0: "moved 2.1 mm too far towards row 6", 2: "moved 2.1 mm too far towards row 6", 3: "moved 1.9 mm"}
+    words = {
+        0: "moved 2.1 mm too far towards row 6",
+        2: "moved 2.1 mm too far towards row 6",
+        3: "moved 1.9 mm",
+    }
     monkeypatch.setattr(
-        bundle_score, "answers",
-        lambda *args, **more: ((i, replace(verdict, moved=words.get(i, ""))) for i, verdict in given(*args, **more)),
-    )  # fmt: skip
+        bundle_score,
+        "answers",
+        lambda *args, **more: (
+            (i, replace(verdict, moved=words.get(i, ""))) for i, verdict in given(*args, **more)
+        ),
+    )
     found = bundle_score.score(classifier, s)
     assert found.json()["moved"] == 3
     told = "outside the trained positions: 3 sweeps, most often moved 2.1 mm too far towards row 6; record there, too, or align the skin"

@@ -36,26 +36,36 @@ def model(default_bundle: Bundle) -> Bundle:
 
 def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
     """A set with `each` sweeps at each of these places, in taxels."""
-    samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(np.float32)
+    samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(
+        np.float32
+    )
     n = len(samples)
     numbers = {group: 7 + 2 * (np.arange(n) // each)}
     return Dataset(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
 
 
 def test_the_places_of_a_training_set():
-    """One entry per position, in mm; without numbered positions per recording; without both per sweep."""
+    """One entry per position, in mm; without numbered positions per recording; without both per
+    sweep."""
     at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
     for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
-        found = contact_positions.place_of(trained(*at, group=group, each=each), LOADS, pitch_mm=2.0)
+        found = contact_positions.place_of(
+            trained(*at, group=group, each=each), LOADS, pitch_mm=2.0
+        )
         assert (found.pitch_mm, len(found.rows_mm)) == (2.0, entries)
         every = [at[i * len(at) // entries] for i in range(entries)]
         want = [centre(counts(patch(*one)), TARE, 5.0) for one in every]
-        assert np.stack([found.rows_mm, found.cols_mm], 1) == pytest.approx(2.0 * np.array(want), abs=1e-3)
+        assert np.stack([found.rows_mm, found.cols_mm], 1) == pytest.approx(
+            2.0 * np.array(want), abs=1e-3
+        )
 
 
 def test_the_limit_leaves_each_position_out():
-    """It is the largest distance of a sweep from the other positions; with one position an eighth of the pitch."""
-    found = contact_positions.place_of(trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), LOADS, pitch_mm=4.0)
+    """It is the largest distance of a sweep from the other positions; with one position an eighth
+    of the pitch."""
+    found = contact_positions.place_of(
+        trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), LOADS, pitch_mm=4.0
+    )
     assert found.limit_mm == pytest.approx(found.cols_mm[2] - found.cols_mm[1], abs=0.01)
     for positions in ([(1.5, 1.5)], [(1.5, 1.5)] * 3):
         assert contact_positions.place_of(trained(*positions), LOADS, pitch_mm=4.0).limit_mm == 0.5
@@ -75,7 +85,10 @@ def test_many_positions_are_thinned():
 def test_sets_without_positions():
     """Without a pitch, or without contact, there are none; simulated sets have theirs."""
     assert contact_positions.place_of(trained((1.5, 1.5)), LOADS) is None
-    assert contact_positions.place_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0) is None
+    assert (
+        contact_positions.place_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0)
+        is None
+    )
     both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
     found = contact_positions.place_of(both, LOADS)
     assert found.pitch_mm == skin.PITCH_MM
@@ -85,11 +98,18 @@ def test_sets_without_positions():
 
 @pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """A skin in place is not flagged, one that is a row forward always is; figures, picture and lines agree."""
+    """A skin in place is not flagged, one that is a row forward always is; figures, picture and
+    lines agree."""
     monkeypatch.setattr(contact_positions, "OFF_MM", (8.0,))
-    wide = replace(model, manifest=replace(model.manifest, place=ContactPositions(4.0, (5.5,), (6.0,), 1.2)))
+    wide = replace(
+        model, manifest=replace(model.manifest, place=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
+    )
     figures = contact_positions.measure(
-        Classifier(wide, SystemClock()), "sim:T-LAB:3:2", "sim:T-LAB:1:1", "sim:T-HARD:1:1", lambda line: None
+        Classifier(wide, SystemClock()),
+        "sim:T-LAB:3:2",
+        "sim:T-LAB:1:1",
+        "sim:T-HARD:1:1",
+        lambda line: None,
     )
     assert figures["other positions"]["moved"][0] == 0
     assert figures["T-HARD"]["moved"][0] == 1
@@ -102,9 +122,9 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert figures["rows, forwards"]["lost_at_mm"] == 8
     assert ahead["told_mm"] > 1.2 > home["told_mm"]
     for point in (home, ahead):
-        assert point["accuracy"][0] * 12 + point["wrong"] + point["unsure"] + point["unknown"] == pytest.approx(
-            12, abs=0.01
-        )
+        assert point["accuracy"][0] * 12 + point["wrong"] + point["unsure"] + point[
+            "unknown"
+        ] == pytest.approx(12, abs=0.01)
         assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
         assert point["network"][0] >= point["accuracy"][0]
     text = "\n".join(contact_positions.lines(figures))
@@ -116,10 +136,16 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         "| T-HARD, a row ahead and all else anew",
         "| not at all",
     ]
-    assert f"| {home['unsure']} | {home['unknown']} | {100 * home['network'][0]:.1f} % [" in table.splitlines()[-1]
+    assert (
+        f"| {home['unsure']} | {home['unknown']} | {100 * home['network'][0]:.1f} % ["
+        in table.splitlines()[-1]
+    )
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(
-            Classifier(replace(wide, manifest=replace(wide.manifest, place=None, moved=None)), SystemClock()),
+            Classifier(
+                replace(wide, manifest=replace(wide.manifest, place=None, moved=None)),
+                SystemClock(),
+            ),
             "",
             "",
             "",
@@ -133,24 +159,42 @@ def committed() -> dict:
 
 
 def test_the_headline_says_what_was_missed():
-    """In place, false marks, marks where accuracy is lost, wrong answers a row off, the worst distance: from the figures."""
+    """In place, false marks, marks where accuracy is lost, wrong answers a row off, the worst
+    distance: from the figures."""
     figures = committed()
     figures["moved"]["rows"][3]["wrong_unflagged"] = 77
     figures["other positions"]["moved"] = [5 / 432, 0.0, 0.1]
-    figures["rows, forwards"] = {"lost_at_mm": 2.5, "moved": [0.5, 0.4, 0.6], "moved_before": [0.0, 0.0, 0.1]}
-    figures["columns, forwards"] = {"lost_at_mm": None, "moved": [1.0, 0.9, 1.0], "moved_before": [1.0, 0.9, 1.0]}
+    figures["rows, forwards"] = {
+        "lost_at_mm": 2.5,
+        "moved": [0.5, 0.4, 0.6],
+        "moved_before": [0.0, 0.0, 0.1],
+    }
+    figures["columns, forwards"] = {
+        "lost_at_mm": None,
+        "moved": [1.0, 0.9, 1.0],
+        "moved_before": [1.0, 0.9, 1.0],
+    }
     for direction, wrong, told in (("rows", 0.5, 3.25), ("columns", 0.25, 0.75)):
         for point in figures["moved"][direction]:
             if abs(point["mm"]) == 4:
                 point["wrong_share"], point["told_mm"] = [wrong, 0.0, 1.0], told
     text = contact_table.headline(figures)
-    for part in ("5 of 432 at others", "towards row 4, 2.5 mm: 50 % [40, 60]", "towards column 4 nothing is lost up to 6 mm",
-                 "25.0 to 50.0 %", f"77 of 432, at {abs(figures['moved']['rows'][3]['mm']):g} mm", "0.8 to 3.2 mm: too little"):  # fmt: skip
+    for part in (
+        "5 of 432 at others",
+        "towards row 4, 2.5 mm: 50 % [40, 60]",
+        "towards column 4 nothing is lost up to 6 mm",
+        "25.0 to 50.0 %",
+        f"77 of 432, at {abs(figures['moved']['rows'][3]['mm']):g} mm",
+        "0.8 to 3.2 mm: too little",
+    ):
         assert part in text, part
 
 
-def test_the_page_is_drawn_again_without_measuring(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Tables between their markers, the picture; what is missing or another file is named, with what to do."""
+def test_the_page_is_drawn_again_without_measuring(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Tables between their markers, the picture; what is missing or another file is named, with
+    what to do."""
     folder = ROOT / "docs" / "alignment"
     page = (folder / "README.md").read_text()
     cleared = re.sub(r"(?s)(<!-- (in short|alignment) -->).*?(?=<!-- /)", r"\1\n", page)
@@ -161,9 +205,13 @@ def test_the_page_is_drawn_again_without_measuring(tmp_path: Path, capsys: pytes
     assert (tmp_path / "place.svg").read_text() == (folder / "place.svg").read_text()
     capsys.readouterr()
     assert main(["alignment", "--draw", "--out", str(tmp_path / "none")]) == FormatError.exit_code
-    assert "place.json cannot be read: No such file or directory; leave --draw away" in capsys.readouterr().err
+    assert (
+        "place.json cannot be read: No such file or directory; leave --draw away"
+        in capsys.readouterr().err
+    )
     (tmp_path / "place.json").write_text("[1]")
     assert main(["alignment", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
     assert (
-        "place.json is not what palpate-train alignment wrote; leave --draw away to measure" in capsys.readouterr().err
+        "place.json is not what palpate-train alignment wrote; leave --draw away to measure"
+        in capsys.readouterr().err
     )

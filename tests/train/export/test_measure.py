@@ -20,23 +20,42 @@ from train.export.measure import Measurement
 from train.models import minirocket
 from train.reports import chart_report
 
-KEYS = ("method", "precision", "weights", "macs", "file_kb", "rss_mb", "ms_p50", "ms_p99", "touch_s", "runs_on_box")
+KEYS = (
+    "method",
+    "precision",
+    "weights",
+    "macs",
+    "file_kb",
+    "rss_mb",
+    "ms_p50",
+    "ms_p99",
+    "touch_s",
+    "runs_on_box",
+)
 """What chart.json has of each model, beside `accuracy`."""
 
 
 def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
-    """Both precisions load in the box's classifier and answer as the model; the second time nothing is trained."""
+    """Both precisions load in the box's classifier and answer as the model; the second time nothing
+    is trained."""
     calls: list[int] = []
     for _ in range(2):
         made = model_forms.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
     assert calls == [3]
-    assert [(one.form, one.precision, one.runtime) for one in made] == [("", "float", "onnx"), ("int8", "int8", "onnx")]
+    assert [(one.form, one.precision, one.runtime) for one in made] == [
+        ("", "float", "onnx"),
+        ("int8", "int8", "onnx"),
+    ]
     for one in made:
         box = Classifier(bundle.load(one.folder), SystemClock())
         known = sweeps()
         assert [box.logits(counts).argmax() for counts in known.samples] == known.labels.tolist()
         assert one.window_s == 0.4
-        assert measure.sizes(one.folder)[0] == (one.folder / "model.onnx").stat().st_size < measure.sizes(one.folder)[1]
+        assert (
+            measure.sizes(one.folder)[0]
+            == (one.folder / "model.onnx").stat().st_size
+            < measure.sizes(one.folder)[1]
+        )
 
 
 def test_all_take_turns():
@@ -45,12 +64,15 @@ def test_all_take_turns():
     calls = {name: (lambda counts, name=name: order.append(name)) for name in "abc"}
     took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
     assert "".join(order) == "aaabbbccc" + "bbbcccaaa" + "cccaaabbb"
-    assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys("abc", (6, True))
+    assert {name: (len(ms), bool((ms > 0).all())) for name, ms in took.items()} == dict.fromkeys(
+        "abc", (6, True)
+    )
 
 
 @pytest.mark.slow
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
-    """Costs of a real bundle: the keys of chart.json, resident memory of Python with numpy and onnxruntime."""
+    """Costs of a real bundle: the keys of chart.json, resident memory of Python with numpy and
+    onnxruntime."""
     made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
     (costs, _) = model_forms.measured(made, sweeps().samples, 2)
     assert set(KEYS) <= costs.keys()
@@ -58,7 +80,9 @@ def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_p
     assert 15 < costs["rss_mb"] < 150
     assert 0 < costs["ms_p50"] <= costs["ms_p99"]
     assert costs["file_kb"] < costs["bundle_kb"]
-    assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))["runs_on_box"]
+    assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))[
+        "runs_on_box"
+    ]
 
 
 @pytest.mark.slow
@@ -67,7 +91,8 @@ def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
     one, _ = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
     (one.folder / "model.onnx").write_bytes(b"no model")
     with pytest.raises(
-        measure.BundleError, match=r"the model in .*/float does not run in a process of its own.*was altered"
+        measure.BundleError,
+        match=r"the model in .*/float does not run in a process of its own.*was altered",
     ):
         measure.memory(one.folder, sweeps().samples)
 
@@ -91,7 +116,8 @@ def test_torch_runs_what_was_trained(tmp_path: Path):
 
 @pytest.mark.slow
 def test_aeon_runs_what_was_trained(tmp_path: Path):
-    """aeon's transform with the head that was trained on our graph of it gives the graph's logits."""
+    """aeon's transform with the head that was trained on our graph of it gives the graph's
+    logits."""
     pytest.importorskip("aeon")
     known = sweeps()
     state = np.random.get_state()[1].copy()
@@ -103,9 +129,11 @@ def test_aeon_runs_what_was_trained(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Both commands pack the same bundle of a method, measure it with the same function, and take size, time and memory
-    from one record."""
+def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Both commands pack the same bundle of a method, measure it with the same function, and take
+    size, time and memory from one record."""
     measured: dict[str, Measurement] = {}
     digests: dict[str, str] = {}
     measure_all = measure.measure_all
@@ -115,7 +143,9 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: P
         found = measure_all(folders, counts, 2)
         for folder, measurement in zip(folders, found, strict=True):
             held = bundle.load(folder)
-            if held.manifest.name == "L-gauss":  # not the one that `choose` packs at the end, under the scene's name
+            if (
+                held.manifest.name == "L-gauss"
+            ):  # not the one that `choose` packs at the end, under the scene's name
                 measured[command], digests[command] = measurement, held.id
         return found
 
@@ -125,7 +155,19 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: P
     )
     where = ["--jobs", "1", "--cache", str(tmp_path / "cache")]
     command = "choose"
-    assert main(["choose", "--scene", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "b"), *where]) == 0
+    assert (
+        main(
+            [
+                "choose",
+                "--scene",
+                str(tmp_path / "scene.toml"),
+                "--out",
+                str(tmp_path / "b"),
+                *where,
+            ]
+        )
+        == 0
+    )
     monkeypatch.setattr(chart_report, "QUICK", replace(chart_report.QUICK, named=("L-gauss",)))
     command = "chart"
     assert main(["chart", "--quick", "--out", str(tmp_path / "chart"), *where]) == 0
@@ -134,7 +176,9 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(tmp_path: P
     assert digests["choose"] == digests["chart"]
     assert measured["choose"].bundle_bytes == measured["chart"].bundle_bytes
     assert candidate["kb"] == dot["bundle_kb"] == measured["chart"].bundle_kb
-    for key, printed, record in (("choose", (candidate["ms"], candidate["mb"]), measured["choose"]),
-                                 ("chart", (dot["ms_p50"], dot["rss_mb"]), measured["chart"])):  # fmt: skip
+    for key, printed, record in (
+        ("choose", (candidate["ms"], candidate["mb"]), measured["choose"]),
+        ("chart", (dot["ms_p50"], dot["rss_mb"]), measured["chart"]),
+    ):
         assert printed == (record.ms_p50, record.rss_mib), key
     assert candidate["mb"] == pytest.approx(dot["rss_mb"], rel=0.1)

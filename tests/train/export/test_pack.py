@@ -28,14 +28,17 @@ ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box
 
 @pytest.mark.parametrize("name", ON_THE_BOX)
 def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
-    """Trained, packed, loaded, checked by its golden sweeps; each held-out sweep gets the label that training saw."""
+    """Trained, packed, loaded, checked by its golden sweeps; each held-out sweep gets the label
+    that training saw."""
     content = pack.trained(METHODS[name], tones(), 1)
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
     assert manifest.input == METHODS[name].input
     assert manifest.made["method"] == name
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
-    model = METHODS[name].train(content.train, methods.model_inputs(METHODS[name].input, content.train), 1)
+    model = METHODS[name].train(
+        content.train, methods.model_inputs(METHODS[name].input, content.train), 1
+    )
     want = model.logits(methods.model_inputs(METHODS[name].input, content.held_out)).argmax(1)
     assert (pack.score(it, content.held_out)[0] == want).all()
 
@@ -52,10 +55,29 @@ def test_what_the_box_cannot_run_is_refused(name: str):
 
 
 def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`palpate-train pack`, then `palpate check` and a demo with the bundle: features of the paper, SVM in ONNX."""
+    """`palpate-train pack`, then `palpate check` and a demo with the bundle: features of the paper,
+    SVM in ONNX."""
     folder = str(tmp_path / "h")
-    assert main(["pack", "--set", "sim:T-LAB:1001:12", "--method", "H-svm", "--seed", "1", "--out", folder,
-                 "--name", "h", "--version", "2"]) == 0  # fmt: skip
+    assert (
+        main(
+            [
+                "pack",
+                "--set",
+                "sim:T-LAB:1001:12",
+                "--method",
+                "H-svm",
+                "--seed",
+                "1",
+                "--out",
+                folder,
+                "--name",
+                "h",
+                "--version",
+                "2",
+            ]
+        )
+        == 0
+    )
     assert "bundle: h 2," in capsys.readouterr().out
     assert bundle.load(tmp_path / "h").manifest.input == "H"
     chosen = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
@@ -64,8 +86,8 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_golden_sweeps_are_rounded():
-    """To steps of at most COARSEST usual changes; they take less room, and their logits are those of the rounded sweeps,
-    whose probabilities are near those of the exact ones."""
+    """To steps of at most COARSEST usual changes; they take less room, and their logits are those
+    of the rounded sweeps, whose probabilities are near those of the exact ones."""
     content = pack.trained(METHODS["L-gauss"], tones(), 1)
     rng = np.random.default_rng(1)
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
@@ -79,7 +101,9 @@ def test_golden_sweeps_are_rounded():
     samples, stored = bundle._golden(data, arrays)
     usual = np.median(np.abs(np.diff(golden.samples, axis=1)))
     assert 0 < np.abs(samples - golden.samples).max() <= usual * pack.COARSEST / 2
-    again = pack.run(content.model, pack.model_inputs(content.input, replace(golden, samples=samples)))
+    again = pack.run(
+        content.model, pack.model_inputs(content.input, replace(golden, samples=samples))
+    )
     assert np.array_equal(stored, again.astype(np.float32))
     assert stored.argmax(1).tolist() == golden.labels.tolist()
     exact = pack.run(content.model, pack.model_inputs(content.input, golden))
@@ -88,7 +112,8 @@ def test_golden_sweeps_are_rounded():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 def test_rounded_sweeps_keep_their_type(dtype: str):
-    """Each coarser than the next, none beyond what the type holds, whole numbers in steps of 2 or more; constant ones stay."""
+    """Each coarser than the next, none beyond what the type holds, whole numbers in steps of 2 or
+    more; constant ones stay."""
     rng = np.random.default_rng(1)
     top = 255 if dtype == "float32" else np.iinfo(dtype).max
     samples = (top - rng.integers(0, 40, (2, 50, 3, 3))).astype(dtype)
@@ -106,14 +131,20 @@ def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     content = pack.trained(METHODS["L-gauss"], noise, 1)
     content.train.samples[content.train.labels == 0] = 0
     with pytest.raises(
-        BundleError, match="no training sweep of 'a' is recognised: every taxel of its sweeps is constant"
+        BundleError,
+        match="no training sweep of 'a' is recognised: every taxel of its sweeps is constant",
     ):
         pack.pack(content, tmp_path / "b", "any", "1", "")
     logits = np.eye(3)[(content.train.labels + 1) % 3]
     content.train.samples[content.train.labels == 0, 0] = 1
-    with pytest.raises(BundleError, match="'a' is recognised: they look like others; record it at more positions"):
+    with pytest.raises(
+        BundleError, match="'a' is recognised: they look like others; record it at more positions"
+    ):
         pack.golden_sweeps(content.train, logits, logits)
-    few = np.flatnonzero(content.train.labels > 0).tolist() + np.flatnonzero(content.train.labels == 0)[:2].tolist()
+    few = (
+        np.flatnonzero(content.train.labels > 0).tolist()
+        + np.flatnonzero(content.train.labels == 0)[:2].tolist()
+    )
     with pytest.raises(BundleError, match="'a' is recognised: there are 2 of it; record 5 or more"):
         pack.golden_sweeps(content.train.take(np.array(few)), logits[few], logits[few])
     assert not (tmp_path / "b").exists()

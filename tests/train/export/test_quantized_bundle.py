@@ -1,4 +1,5 @@
-"""Export: the content of the graphs, the checks that a bundle must pass, what is refused and why."""
+"""Export: the content of the graphs, the checks that a bundle must pass, what is refused and
+why."""
 
 from __future__ import annotations
 
@@ -48,7 +49,9 @@ def fitted() -> Fit:
     """A fit on the easy set, two sweeps to a recording, of a skin that reads 0 without contact."""
     sweeps = easy(pieces=2)
     rest = np.zeros((len(sweeps), 2, *sweeps.format.shape))
-    return fit.fit(replace(sweeps, unloaded=rest), 1, FitRecipe(steps=40), architecture=ARCHITECTURES["20k"])
+    return fit.fit(
+        replace(sweeps, unloaded=rest), 1, FitRecipe(steps=40), architecture=ARCHITECTURES["20k"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +77,8 @@ def shapes(model: onnx.ModelProto) -> list[list[int]]:
     """Every inferred shape of the graph."""
     graph = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
     return [
-        [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*graph.input, *graph.value_info, *graph.output)
+        [d.dim_value for d in v.type.tensor_type.shape.dim]
+        for v in (*graph.input, *graph.value_info, *graph.output)
     ]
 
 
@@ -85,7 +89,8 @@ def negated(fitted: Fit) -> Fit:
 
 @pytest.mark.parametrize("dtype", graph_builder.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
-    """For each type of raw counts: PyTorch's logits, fixed shapes, the sensor's own counts as input."""
+    """For each type of raw counts: PyTorch's logits, fixed shapes, the sensor's own counts as
+    input."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = Compact(form, 3, 0.1, norm=False).eval()
@@ -101,7 +106,8 @@ def test_the_float_graph_is_the_network(dtype: str):
 
 
 def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: Path):
-    """Weights of seven bits, one scale a channel; every convolution between quantizers; 1 x K out, and where it lies."""
+    """Weights of seven bits, one scale a channel; every convolution between quantizers; 1 x K out,
+    and where it lies."""
     model = onnx.load(packed / bundle.MODEL)
     maker = {name: n for n in model.graph.node for name in n.output}
     values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
@@ -113,11 +119,16 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
         assert weight.dtype == np.int8
         assert 60 <= np.abs(weight.astype(int)).max() <= 64
         assert scale.shape == (len(weight),)
-        assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == ["QuantizeLinear"]
+        assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == [
+            "QuantizeLinear"
+        ]
     run = session(model.SerializeToString())
-    assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [("sweep", [1, 64, 2, 2], "tensor(uint8)")]
+    assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [
+        ("sweep", [1, 64, 2, 2], "tensor(uint8)")
+    ]
     assert [(o.name, o.shape, o.type) for o in run.get_outputs()] == [
-        (name, [1, size], "tensor(float)") for name, size in (("logits", 3), ("embedding", 2 + fitted.bands))
+        (name, [1, size], "tensor(float)")
+        for name, size in (("logits", 3), ("embedding", 2 + fitted.bands))
     ]
 
 
@@ -130,16 +141,17 @@ def test_quantizing_leaves_its_model_alone(fitted: Fit):
 
 
 def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
-    """Golden sweeps of two materials, figures of what was held out, thresholds from training, all files small."""
+    """Golden sweeps of two materials, figures of what was held out, thresholds from training, all
+    files small."""
     it = box(packed)
     assert it.self_test() < 1e-6
     manifest = it.bundle.manifest
     assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
     held = manifest.figures["held-out recording"]
     assert held["n"] == len(fitted.held)
-    assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held["n"] == pytest.approx(
-        1, abs=1e-4
-    )
+    assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held[
+        "n"
+    ] == pytest.approx(1, abs=1e-4)
     assert held["refused"] == 0
     assert manifest.figures["held-out recording, network alone"]["accuracy"] >= held["accuracy"]
     assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
@@ -159,8 +171,8 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 
 
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
-    """With the distance of the taxels the bundle says where the contact was, and how moved sweeps are judged; without it the
-    box could not tell, and the file has no arrays for it."""
+    """With the distance of the taxels the bundle says where the contact was, and how moved sweeps
+    are judged; without it the box could not tell, and the file has no arrays for it."""
     quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
     assert placed.manifest.place
@@ -173,11 +185,13 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
 
 
 def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
-    """Held-out sweeps with other labels than they have: heads fitted to them would name these, heads of the others do not."""
+    """Held-out sweeps with other labels than they have: heads fitted to them would name these,
+    heads of the others do not."""
     wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
     spoilt = replace(fitted, held=wrong)
     honest, misled = (
-        pack.held_out_figures(calibrate(one).held, one, "x")["x, network alone"]["accuracy"] for one in (fitted, spoilt)
+        pack.held_out_figures(calibrate(one).held, one, "x")["x, network alone"]["accuracy"]
+        for one in (fitted, spoilt)
     )
     assert honest > 0.9
     assert misled < 0.1
@@ -192,7 +206,8 @@ def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: 
 
 
 def test_scores_are_fused_by_recording(packed: Path):
-    """Each window gets the label of its recording's product, also where the last one differs; -1 what the box refuses."""
+    """Each window gets the label of its recording's product, also where the last one differs; -1
+    what the box refuses."""
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
@@ -206,18 +221,28 @@ def test_scores_are_fused_by_recording(packed: Path):
 
 
 def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
-    """int8 with its refitted head disagrees with a spoilt float head: the bundle holds the float form, and says why."""
+    """int8 with its refitted head disagrees with a spoilt float head: the bundle holds the float
+    form, and says why."""
     made = quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
     why = made.made["float_because"]
-    assert re.match(r"int8 loses \d+\.\d\d points on held-out sweeps, by float's own .*limit 0\.5", why)
-    assert "QuantizeLinear" not in {n.op_type for n in onnx.load(tmp_path / "bundle" / bundle.MODEL).graph.node}
-    assert "float_because" not in quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "").made
+    assert re.match(
+        r"int8 loses \d+\.\d\d points on held-out sweeps, by float's own .*limit 0\.5", why
+    )
+    assert "QuantizeLinear" not in {
+        n.op_type for n in onnx.load(tmp_path / "bundle" / bundle.MODEL).graph.node
+    }
+    assert (
+        "float_because"
+        not in quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "").made
+    )
 
 
 def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
     """A difference of nan is beyond every limit."""
     with pytest.raises(ExportRefused, match="differs from pytorch by nan in a logit"):
-        quantized_bundle.export(replace(fitted, weights=without_numbers(fitted)), tmp_path / "bundle", "easy", "1", "")
+        quantized_bundle.export(
+            replace(fitted, weights=without_numbers(fitted)), tmp_path / "bundle", "easy", "1", ""
+        )
 
 
 def without_numbers(fitted: Fit) -> dict[str, np.ndarray]:
@@ -234,32 +259,41 @@ def judged(fitted: Fit) -> None:
 def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
     """A fit whose stages reach so far in int8, its head refitted."""
     other = replace(fitted, ranges=replace(fitted.ranges, responses=tuple(responses)))
-    seen, unseen = (graph_builder.run(other.trunk(), s.samples) for s in (fitted.train, fitted.held))
+    seen, unseen = (
+        graph_builder.run(other.trunk(), s.samples) for s in (fitted.train, fitted.held)
+    )
     weight, bias = closed_form_head(seen, fitted.train.labels, unseen, fitted.held.labels)
     return replace(other, weights=fitted.weights | {"int8.weight": weight, "int8.bias": bias})
 
 
 def test_a_range_for_one_outlier_is_refused(tight: Fit):
-    """Ranges from smallest to largest value, with one sweep a thousandfold among them: nothing is left for all others."""
+    """Ranges from smallest to largest value, with one sweep a thousandfold among them: nothing is
+    left for all others."""
     wild = tight.train.samples[:1].astype(np.float32)
     wild = wild.mean(axis=1, keepdims=True) + 1000 * (wild - wild.mean(axis=1, keepdims=True))
     network = tight.network()
     with torch.no_grad():
         responses = network.responses(network.prepare(torch.from_numpy(wild)))
-    with pytest.raises(ExportRefused, match=r"int8 .*\(limit .*suffers most \(-?\d+ dB, 0\.0% beyond.*record more"):
+    with pytest.raises(
+        ExportRefused, match=r"int8 .*\(limit .*suffers most \(-?\d+ dB, 0\.0% beyond.*record more"
+    ):
         judged(ranged(tight, [float(x.max()) for x in responses]))
     judged(ranged(tight, tight.ranges.responses))
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """The first stage reaches a twentieth of what it should: no head can compensate; the share that is cut off is reported."""
+    """The first stage reaches a twentieth of what it should: no head can compensate; the share that
+    is cut off is reported."""
     first, *others = tight.ranges.responses
-    with pytest.raises(ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"):
+    with pytest.raises(
+        ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"
+    ):
         judged(ranged(tight, (0.05 * first, *others)))
 
 
 def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
-    """The float head on features of an int8 trunk that saturates: only a head of its own copes with them."""
+    """The float head on features of an int8 trunk that saturates: only a head of its own copes with
+    them."""
     *before, last = tight.ranges.responses
     refitted = ranged(tight, (*before, 0.25 * last))
     judged(refitted)
@@ -269,7 +303,8 @@ def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
 
 
 def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
-    """A Parity of `n` sweeps, of which int8 loses and wins some; all else as good as can be unless it is named."""
+    """A Parity of `n` sweeps, of which int8 loses and wins some; all else as good as can be unless
+    it is named."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
     difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
@@ -287,10 +322,26 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
         ),
         ({"n": 60, "lost": 4}, {"n": 60, "lost": 5}, r"55 of 60 .*, float on 60"),
         ({"n": 300, "lost": 12, "won": 6}, {"n": 300, "lost": 13, "won": 4}, "3.00 points lost"),
-        ({"expected_loss": 0.0049}, {"expected_loss": 0.0051}, r"loses 0\.51 points .* by float's own probabilities"),
-        ({"probability_difference": 0.29}, {"probability_difference": 0.31}, r"by up to 0\.310 \(limit 0\.3\)"),
-        ({"probability_mean": 0.024}, {"probability_mean": 0.026}, r"by 0\.026 on average \(limit 0\.025\)"),
-        ({"agreement": 0.96}, {"agreement": 0.95}, r"agrees with float on 0\.950 of 100 .*\(limit 0\.96\)"),
+        (
+            {"expected_loss": 0.0049},
+            {"expected_loss": 0.0051},
+            r"loses 0\.51 points .* by float's own probabilities",
+        ),
+        (
+            {"probability_difference": 0.29},
+            {"probability_difference": 0.31},
+            r"by up to 0\.310 \(limit 0\.3\)",
+        ),
+        (
+            {"probability_mean": 0.024},
+            {"probability_mean": 0.026},
+            r"by 0\.026 on average \(limit 0\.025\)",
+        ),
+        (
+            {"agreement": 0.96},
+            {"agreement": 0.95},
+            r"agrees with float on 0\.950 of 100 .*\(limit 0\.96\)",
+        ),
         ({"n": 10, "agreement": 0.9}, {"n": 10, "agreement": 0.8}, r"0\.800 of 10"),
         ({}, {"expected_loss": np.nan}, "loses nan points"),
         ({}, {"probability_mean": np.nan}, "by nan on average"),
@@ -301,14 +352,15 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
         quantized_bundle.check(found(**bad))
-    assert str(refused.value).endswith("drop training sweeps that are unlike all others, or record more")
+    assert str(refused.value).endswith(
+        "drop training sweeps that are unlike all others, or record more"
+    )
 
 
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
-    """A full scale that the sweeps pass: they count as saturated, which export reports before a robot meets it."""
-    refused = (
-        r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: \d+ saturated\. .* --full-scale$"
-    )
+    """A full scale that the sweeps pass: they count as saturated, which export reports before a
+    robot meets it."""
+    refused = r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: \d+ saturated\. .* --full-scale$"
     with pytest.raises(ExportRefused, match=refused):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
@@ -340,13 +392,16 @@ def test_a_material_never_recognised_is_refused(fitted: Fit):
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
-    """A refused export leaves the old bundle; a good one takes its place, stray files gone; other folders are safe."""
+    """A refused export leaves the old bundle; a good one takes its place, stray files gone; other
+    folders are safe."""
     target = tmp_path / "bundle"
     quantized_bundle.export(fitted, target, "old", "1", "")
     (target / "stray").write_text("left over")
     before = (target / bundle.MANIFEST).read_bytes()
     with pytest.raises(ExportRefused):
-        quantized_bundle.export(replace(fitted, weights=without_numbers(fitted)), target, "new", "2", "")
+        quantized_bundle.export(
+            replace(fitted, weights=without_numbers(fitted)), target, "new", "2", ""
+        )
     assert (target / bundle.MANIFEST).read_bytes() == before
     quantized_bundle.export(fitted, target, "new", "2", "")
     assert bundle.load(target).manifest.name == "new"
@@ -368,14 +423,18 @@ def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
 
 def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
     """The manifest's own check speaks before anything is written."""
-    named = replace(fitted, **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")})
+    named = replace(
+        fitted,
+        **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")},
+    )
     with pytest.raises(BundleError, match="label 'a,b' cannot be sent"):
         quantized_bundle.export(named, tmp_path / "bundle", "easy", "1", "")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_default_bundle_is_what_the_box_needs():
-    """The skin's format and tubes, at most 128 KB, golden sweeps as exported, placements that it never saw."""
+    """The skin's format and tubes, at most 128 KB, golden sweeps as exported, placements that it
+    never saw."""
     it = box(bundle.DEFAULT)
     assert it.self_test() <= bundle.GOLDEN_TOLERANCE
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
@@ -387,8 +446,8 @@ def test_the_default_bundle_is_what_the_box_needs():
 
 @pytest.mark.filterwarnings("error")
 def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give six logits. No library
-    speaks while they are made, of a bias that stays in float, say."""
+    """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give
+    six logits. No library speaks while they are made, of a bias that stays in float, say."""
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
     assert main(["references", "--out", str(tmp_path / "new")]) == 0
@@ -396,17 +455,30 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
     sizes = {}
     for path in (tmp_path / "new").iterdir():
         run = session(path.read_bytes())
-        assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [("sweep", [1, 1500, 4, 4], "tensor(uint8)")]
-        assert np.isfinite(run.run(["logits"], {"sweep": np.full((1, 1500, 4, 4), 7, np.uint8)})[0]).all()
+        assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [
+            ("sweep", [1, 1500, 4, 4], "tensor(uint8)")
+        ]
+        assert np.isfinite(
+            run.run(["logits"], {"sweep": np.full((1, 1500, 4, 4), 7, np.uint8)})[0]
+        ).all()
         sizes[path.name] = path.stat().st_size
-    kinds = {path.name: {n.op_type for n in onnx.load(path).graph.node} for path in (tmp_path / "new").iterdir()}
-    assert ["QuantizeLinear" in kinds[name] for name in ("fp32.onnx", "paper_int8.onnx")] == [False, True]
+    kinds = {
+        path.name: {n.op_type for n in onnx.load(path).graph.node}
+        for path in (tmp_path / "new").iterdir()
+    }
+    assert ["QuantizeLinear" in kinds[name] for name in ("fp32.onnx", "paper_int8.onnx")] == [
+        False,
+        True,
+    ]
     assert cost.macs(onnx.load(tmp_path / "new" / "fp32.onnx")) > 4e6
     assert 15_891_910 < sizes["paper_int8.onnx"] < 1.01 * 15_891_910
 
 
-def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """One line a figure, then the size, at the end the command that scores it; a fit that is none has a FormatError's exit code."""
+def test_the_command_exports_what_fit_wrote(
+    fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """One line a figure, then the size, at the end the command that scores it; a fit that is none
+    has a FormatError's exit code."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
@@ -420,20 +492,24 @@ def test_the_command_exports_what_fit_wrote(fitted: Fit, tmp_path: Path, capsys:
         "a page about it, with what breaks it",
     ]
     assert lines[-2].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
-    assert lines[-1].endswith(f": palpate-train report {tmp_path / 'bundle'} --set SET --out report.html")
+    assert lines[-1].endswith(
+        f": palpate-train report {tmp_path / 'bundle'} --set SET --out report.html"
+    )
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
     assert "golden.npz: not a fit" in capsys.readouterr().err
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
-    """Nothing in it is int8: both forms are the same, the box's labels are its network's, no tensor is reported; what another
-    head says is told here as well."""
+    """Nothing in it is int8: both forms are the same, the box's labels are its network's, no tensor
+    is reported; what another head says is told here as well."""
     made = fit.fit(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
-    assert "QuantizeLinear" not in {n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node}
+    assert "QuantizeLinear" not in {
+        n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node
+    }
     with torch.no_grad():
         logits = made.network()(torch.from_numpy(made.held.samples.astype(np.float32))).numpy()
     assert [it.logits(x).argmax() for x in made.held.samples] == logits.argmax(1).tolist()
@@ -448,36 +524,88 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
 
 
 def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch):
-    """An int8 method's figures come into its content; beyond a limit it is refused; one without float form passes."""
+    """An int8 method's figures come into its content; beyond a limit it is refused; one without
+    float form passes."""
     (method,) = methods.find(["compact-1k"], methods.Effort(0.02))
     train, held, by = hold_out(easy(), 1)
     model = method.train(train, train.samples, 1)
-    content, reference = pack.Content(model.graph(), "raw", train, held, by, {}), model.forms["float"].graph()
-    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(content.held_out)
+    content, reference = (
+        pack.Content(model.graph(), "raw", train, held, by, {}),
+        model.forms["float"].graph(),
+    )
+    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(
+        content.held_out
+    )
     assert quantized_bundle.checked(content, None) is content
     monkeypatch.setattr(quantized_bundle, "MOST_MEAN_DIFFERENCE", 0.0)
     with pytest.raises(ExportRefused, match=r"on average \(limit 0.0\)"):
         quantized_bundle.checked(content, reference)
 
 
-@pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps")
+@pytest.mark.skipif(
+    "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
+)
 def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) by the same commands; unseen sweeps over the USB wire into
-    sentences, materials in turn, so that nearly each is another object: as many right as the classifier by itself has."""
+    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) by the same commands; unseen sweeps over
+    the USB wire into sentences, materials in turn, so that nearly each is another object: as many
+    right as the classifier by itself has."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
-    args = ["--set", str(path), "--only", "direction=0", "--only", "force<=180", "--seed", "1", "--steps", "300"]
-    args += ["--split", "recording:0.7", "--rest", str(tmp_path / "rest.npz"), "--out", str(tmp_path / "fit.npz")]
+    args = [
+        "--set",
+        str(path),
+        "--only",
+        "direction=0",
+        "--only",
+        "force<=180",
+        "--seed",
+        "1",
+        "--steps",
+        "300",
+    ]
+    args += [
+        "--split",
+        "recording:0.7",
+        "--rest",
+        str(tmp_path / "rest.npz"),
+        "--out",
+        str(tmp_path / "fit.npz"),
+    ]
     assert main(["fit", *args]) == 0
     assert (
-        main(["export", str(tmp_path / "fit.npz"), "--out", str(tmp_path / "b"), "--name", "f", "--version", "1"]) == 0
+        main(
+            [
+                "export",
+                str(tmp_path / "fit.npz"),
+                "--out",
+                str(tmp_path / "b"),
+                "--name",
+                "f",
+                "--version",
+                "1",
+            ]
+        )
+        == 0
     )
     it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))
-    assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == ("int16", 16, 128)
+    assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == (
+        "int16",
+        16,
+        128,
+    )
     logits = np.stack([it.logits(counts) for counts in rest.samples])
     result = pack.figures(it, rest, "unseen", logits)
     assert result["unseen"]["accuracy"] > 0.9
-    assert result["unseen, by recording"]["accuracy"] > 0.9  # 70 of 74 with the default network of decision 0005
-    sentences = ["demo", "--sim", f"replay:{tmp_path / 'rest.npz'}", "--virtual", "--sweeps", str(len(rest))]
+    assert (
+        result["unseen, by recording"]["accuracy"] > 0.9
+    )  # 70 of 74 with the default network of decision 0005
+    sentences = [
+        "demo",
+        "--sim",
+        f"replay:{tmp_path / 'rest.npz'}",
+        "--virtual",
+        "--sweeps",
+        str(len(rest)),
+    ]
     assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
     out = capsys.readouterr().out
     right, total = (int(n) for n in re.search(r"all sweeps +(\d+) / (\d+)", out).groups())
@@ -488,14 +616,20 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
-    """Materials that differ in nothing but their offset: distinguished by a head that sees means, hidden from one that does not."""
+    """Materials that differ in nothing but their offset: distinguished by a head that sees means,
+    hidden from one that does not."""
     whole = easy(seed=3)
     rng = np.random.default_rng(4)
     labels = rng.permutation(whole.labels)
-    level = whole.samples.mean(axis=1, keepdims=True) - np.array([60, 100, 140])[labels][:, None, None, None]
+    level = (
+        whole.samples.mean(axis=1, keepdims=True)
+        - np.array([60, 100, 140])[labels][:, None, None, None]
+    )
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        made = fit.fit(offset, 1, FitRecipe(steps=20, keep_means=keep), architecture=ARCHITECTURES["20k"])
+        made = fit.fit(
+            offset, 1, FitRecipe(steps=20, keep_means=keep), architecture=ARCHITECTURES["20k"]
+        )
         manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
         assert not keep

@@ -1,4 +1,5 @@
-"""A skin that reads thousands without contact, from its recording to the box: what nothing touches is `no-contact`."""
+"""A skin that reads thousands without contact, from its recording to the box: what nothing touches
+is `no-contact`."""
 
 from __future__ import annotations
 
@@ -28,9 +29,11 @@ PLACES = skin.placements("T-REAL", 3)[:4]
 EACH = 3
 
 
-def act(material: str, place: skin.Placement | None, rng: np.random.Generator, more: int = 0) -> rig.Act:
-    """A sweep of three seconds between half seconds without contact; without a place nothing is touched. more: counts that
-    the skin reads above its usual rest."""
+def act(
+    material: str, place: skin.Placement | None, rng: np.random.Generator, more: int = 0
+) -> rig.Act:
+    """A sweep of three seconds between half seconds without contact; without a place nothing is
+    touched. more: counts that the skin reads above its usual rest."""
     off = SEEN.idle(50, rng, skin.WORLD)
     on = SEEN.idle(320, rng, skin.WORLD)
     if place:
@@ -38,11 +41,15 @@ def act(material: str, place: skin.Placement | None, rng: np.random.Generator, m
     return rig.Act(np.concatenate([off, on, off]) + np.uint16(more), 60, 360, material)
 
 
-def answered(rigged: Callable[..., Rigged], acts: Sequence[rig.Act], **how: object) -> list[Verdict]:
+def answered(
+    rigged: Callable[..., Rigged], acts: Sequence[rig.Act], **how: object
+) -> list[Verdict]:
     """The answers of a box whose robot plays these acts."""
     simulated = devices.build(FORM, acts, rig.VirtualClock(), "sim")
     if folder := how.pop("folder", None):
-        session = RecordingSession(folder, FORM, how.pop("labels"), simulated.clock, lambda line: None)
+        session = RecordingSession(
+            folder, FORM, how.pop("labels"), simulated.clock, lambda line: None
+        )
         how = {"observers": [session], "commands": session.commands}
     box = rigged(simulated, **how)
     return box.until(lambda: simulated.finished(box.box.answered), limit_s=300)
@@ -66,15 +73,21 @@ def exported(source: Path, out: Path) -> bundle.Bundle:
     """The bundle of a set, by command."""
     fit = str(out.with_suffix(".npz"))
     assert main(["fit", "--set", str(source), "--seed", "1", "--steps", "0", "--out", fit]) == 0
-    assert main(["export", fit, "--out", str(out), "--name", "x", "--version", "1", "--pitch-mm", "4"]) == 0
+    assert (
+        main(["export", fit, "--out", str(out), "--name", "x", "--version", "1", "--pitch-mm", "4"])
+        == 0
+    )
     return bundle.load(out)
 
 
 @pytest.mark.slow
-def test_the_whole_way(rigged: Callable[..., Rigged], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """record, fit, export, box: an untouched window is `no-contact`, a touched one has its label and is in place. A skin
-    that rests elsewhere today is so after TARE. Without what the recordings know of the unloaded skin, export says that
-    `no-contact` cannot be told, and the box never does."""
+def test_the_whole_way(
+    rigged: Callable[..., Rigged], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """record, fit, export, box: an untouched window is `no-contact`, a touched one has its label
+    and is in place. A skin that rests elsewhere today is so after TARE. Without what the recordings
+    know of the unloaded skin, export says that `no-contact` cannot be told, and the box never
+    does."""
     model = exported(folder, tmp_path / "known")
     assert "no-contact cannot be told" not in capsys.readouterr().out
     m = model.manifest
@@ -90,7 +103,9 @@ def test_the_whole_way(rigged: Callable[..., Rigged], folder: Path, tmp_path: Pa
     assert sum(not v.moved for v in verdicts[1:]) >= 3
 
     more = 4000
-    simulated = devices.build(FORM, [act("", None, rng, more), act("", None, rng, more)], rig.VirtualClock(), "sim")
+    simulated = devices.build(
+        FORM, [act("", None, rng, more), act("", None, rng, more)], rig.VirtualClock(), "sim"
+    )
     box = rigged(simulated, model=model)
     (before,) = box.until(lambda: box.box.answered == 1)
     assert before.status is not Status.NO_CONTACT
@@ -102,27 +117,48 @@ def test_the_whole_way(rigged: Callable[..., Rigged], folder: Path, tmp_path: Pa
         path.write_text(json.dumps(json.loads(path.read_text()) | {"unloaded": None}))
     capsys.readouterr()
     model = exported(folder, tmp_path / "unknown")
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("no-contact cannot be told: ")]
-    assert "what the unloaded skin gives is not known; record with palpate record, and send TARE" in line
-    assert (model.manifest.thresholds.contact, model.manifest.place, model.manifest.unloaded) == (None, None, ())
+    (line,) = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("no-contact cannot be told: ")
+    ]
+    assert (
+        "what the unloaded skin gives is not known; record with palpate record, and send TARE"
+        in line
+    )
+    assert (model.manifest.thresholds.contact, model.manifest.place, model.manifest.unloaded) == (
+        None,
+        None,
+        (),
+    )
     (verdict,) = answered(rigged, [act("", None, rng)], model=model)
     assert verdict.status is not Status.NO_CONTACT
 
 
 def known(drift: float = 0.0, load: float = 1000.0) -> Dataset:
-    """Eight sweeps [50, 2, 2] whose strongest taxel reads `load` above the unloaded skin, which rises by `drift` from each
-    to the next."""
+    """Eight sweeps [50, 2, 2] whose strongest taxel reads `load` above the unloaded skin, which
+    rises by `drift` from each to the next."""
     rng, n = np.random.default_rng(7), 8
     rest = REST + drift * np.arange(n).reshape(-1, 1, 1, 1)
     samples = rest + rng.normal(0, 3, (n, 50, 2, 2))
     samples[:, :, 0, 0] += load
-    unloaded = np.concatenate([np.broadcast_to(rest, (n, 1, 2, 2)), np.full((n, 1, 2, 2), 3.0)], axis=1)
-    return Dataset(np.rint(samples).astype(np.uint16), np.arange(n) % 2, ("a", "b"), 50.0, {}, "known", unloaded)
+    unloaded = np.concatenate(
+        [np.broadcast_to(rest, (n, 1, 2, 2)), np.full((n, 1, 2, 2), 3.0)], axis=1
+    )
+    return Dataset(
+        np.rint(samples).astype(np.uint16),
+        np.arange(n) % 2,
+        ("a", "b"),
+        50.0,
+        {},
+        "known",
+        unloaded,
+    )
 
 
 def test_a_load_is_above_the_unloaded_skin():
-    """A tenth of the weakest contact; at least what the unloaded skin differs by, between recordings and by its noise.
-    Sweeps of which it is not known do not count."""
+    """A tenth of the weakest contact; at least what the unloaded skin differs by, between
+    recordings and by its noise. Sweeps of which it is not known do not count."""
     found = contact_limit.find(known())
     assert found.contact == pytest.approx(100, abs=1)
     assert found.tare.tolist() == np.full((2, 2), REST).tolist()
@@ -134,20 +170,24 @@ def test_a_load_is_above_the_unloaded_skin():
     assert contact_limit.find(some).contact == pytest.approx(100, abs=1)
 
 
-@pytest.mark.parametrize("how", [{"load": 12.0}, {"drift": 400.0}, {"load": -1000.0}], ids=["weak", "drift", "falling"])
+@pytest.mark.parametrize(
+    "how", [{"load": 12.0}, {"drift": 400.0}, {"load": -1000.0}], ids=["weak", "drift", "falling"]
+)
 def test_what_does_not_separate_is_said(how: dict[str, float]):
-    """Contacts as weak as noise, a rest that moves by more than a contact, counts that fall: no threshold, and why."""
+    """Contacts as weak as noise, a rest that moves by more than a contact, counts that fall: no
+    threshold, and why."""
     found = contact_limit.find(known(**how))
     assert found.contact is None
     assert not found.tare.any()
     assert re.fullmatch(
-        r"the weakest sweep reads -?[\d.]+ counts above .* differs by up to [\d.]+; send TARE .*", found.why
+        r"the weakest sweep reads -?[\d.]+ counts above .* differs by up to [\d.]+; send TARE .*",
+        found.why,
     )
 
 
 def test_a_baseline_of_which_nothing_is_known_is_said():
-    """Where counts can be loads they are taken for them, as ever; where no taxel is ever near 0 nothing is guessed. One
-    taxel alone has none to compare it with."""
+    """Where counts can be loads they are taken for them, as ever; where no taxel is ever near 0
+    nothing is guessed. One taxel alone has none to compare it with."""
     high = replace(known(), unloaded=None)
     found = contact_limit.find(high)
     assert found.contact is None

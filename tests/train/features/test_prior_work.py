@@ -1,4 +1,5 @@
-"""The features of related work against scipy and formulas written out, and exploration until the posterior is sure."""
+"""The features of related work against scipy and formulas written out, and exploration until the
+posterior is sure."""
 
 from __future__ import annotations
 
@@ -25,12 +26,17 @@ RATE = 750.0
 def noise(frames: int = 300, rows: int = 2, cols: int = 3) -> np.ndarray:
     """Taxels that share a part of their noise, float32, another mean on each."""
     rng = np.random.default_rng(4)
-    x = rng.normal(0, 5, (frames, rows, cols)) + rng.normal(0, 4, (frames, 1, 1)) + rng.uniform(20, 90, (rows, cols))
+    x = (
+        rng.normal(0, 5, (frames, rows, cols))
+        + rng.normal(0, 4, (frames, 1, 1))
+        + rng.uniform(20, 90, (rows, cols))
+    )
     return x.astype(np.float32)
 
 
 def test_static_features_are_what_they_say():
-    """Two frames of 1x2 taxels by hand: means, deviations, the pressure's four numbers, centre and contact area."""
+    """Two frames of 1x2 taxels by hand: means, deviations, the pressure's four numbers, centre and
+    contact area."""
     x = np.array([[[10, 0]], [[30, 2]]], np.uint8)
     centre = (-0.5 * 20 + 0.5 * 1) / 21
     want = [20, 1, 10, 1, 10.5, 5.5, 5, 16, 0, centre, 0.5]
@@ -45,23 +51,29 @@ def test_static_features_do_not_know_time():
 
 
 def test_a_spectrogram_is_its_formula():
-    """One part written out: Hann, Fourier sum without DC, mean over a band's six bins, taxels by eq. 4, logarithm."""
+    """One part written out: Hann, Fourier sum without DC, mean over a band's six bins, taxels by
+    eq. 4, logarithm."""
     x = noise(1500)
     part = x.reshape(1500, -1).T.astype(float)[:, 300:600]
     n = np.arange(300)
     shaped = (part - part.mean(1, keepdims=True)) * np.sin(np.pi * (n + 0.5) / 300) ** 2
-    bins = np.array([np.abs(shaped @ np.exp(-2j * np.pi * q * n / 300)) ** 2 / 300 for q in range(1, 151)])
+    bins = np.array(
+        [np.abs(shaped @ np.exp(-2j * np.pi * q * n / 300)) ** 2 / 300 for q in range(1, 151)]
+    )
     want = np.log(bins.reshape(25, 6, 6).mean(axis=1) @ features.taxel_weights(x))
     np.testing.assert_allclose(spectrogram(x, RATE).reshape(5, 25)[1], want)
 
 
 def test_load_and_place_are_those_of_the_normal_axis():
-    """However large the shear is; it only adds its own means and deviations, and power by its taxel's load."""
+    """However large the shear is; it only adds its own means and deviations, and power by its
+    taxel's load."""
     x = noise()
     shear = np.random.default_rng(8).normal(-300, 9, (*x.shape, 2)).astype(np.float32)
     three = np.concatenate([shear, x[..., None]], axis=-1)
     np.testing.assert_allclose(static(three, RATE)[-7:], static(x, RATE)[-7:])
-    np.testing.assert_allclose(static(three, RATE)[:36].reshape(2, 6, 3)[..., 2], static(x, RATE)[:12].reshape(2, 6))
+    np.testing.assert_allclose(
+        static(three, RATE)[:36].reshape(2, 6, 3)[..., 2], static(x, RATE)[:12].reshape(2, 6)
+    )
     same = np.stack([x, x, x], axis=-1)
     np.testing.assert_allclose(spectrogram(same, RATE), spectrogram(x, RATE))
     np.testing.assert_allclose(correlation(same, RATE)[:3], correlation(x, RATE)[:3])
@@ -69,7 +81,8 @@ def test_load_and_place_are_those_of_the_normal_axis():
 
 @pytest.mark.parametrize(("frames", "band"), [(1500, 7), (128, 3), (100, 20)])
 def test_a_tone_lands_in_its_part_and_band(frames: int, band: int):
-    """A burst in the fourth fifth of the sweep is the maximum there, also where zeros must be appended."""
+    """A burst in the fourth fifth of the sweep is the maximum there, also where zeros must be
+    appended."""
     t = np.arange(frames)
     at = t * 5 // frames == 3
     tone = 100 + 50 * at * np.sin(2 * np.pi * (band + 0.5) / 50 * t)
@@ -83,12 +96,15 @@ def test_hjorth_parameters_of_a_sine():
     """Activity log(A^2 / 2), mobility 2 pi f, complexity 1."""
     t = np.arange(1500) / RATE
     x = (100 + 20 * np.sin(2 * np.pi * 12 * t)).reshape(-1, 1, 1).astype(np.float32)
-    np.testing.assert_allclose(correlation(x, RATE)[:3], [math.log(200), 2 * math.pi * 12, 1], rtol=2e-3)
+    np.testing.assert_allclose(
+        correlation(x, RATE)[:3], [math.log(200), 2 * math.pi * 12, 1], rtol=2e-3
+    )
 
 
 @pytest.mark.parametrize("frames", [300, 4])
 def test_correlations_are_those_of_scipy(frames: int):
-    """Mean and spread of Pearson's and Spearman's r over all pairs, with ties, for more frames than taxels and fewer."""
+    """Mean and spread of Pearson's and Spearman's r over all pairs, with ties, for more frames than
+    taxels and fewer."""
     x = np.round(noise(frames)).astype(np.uint8)
     flat = x.reshape(frames, -1).T.astype(float)
     want = []
@@ -97,15 +113,20 @@ def test_correlations_are_those_of_scipy(frames: int):
         want += [np.mean(each), np.std(each)]
     got = correlation(x, RATE)
     np.testing.assert_allclose(got[3:7], want, atol=1e-9)
-    np.testing.assert_allclose(got[7:], [math.log(np.linalg.norm(np.cov(flat, ddof=0))), flat.mean()])
+    np.testing.assert_allclose(
+        got[7:], [math.log(np.linalg.norm(np.cov(flat, ddof=0))), flat.mean()]
+    )
 
 
 def test_a_still_taxel_takes_no_part_in_correlations():
-    """A dead taxel leaves the four numbers as they are, however large its digit; a single one that moves has none."""
+    """A dead taxel leaves the four numbers as they are, however large its digit; a single one that
+    moves has none."""
     x = noise()
     for level in (0, 3.3e30):
         dead = np.concatenate([x, np.full((len(x), 2, 1), level, np.float32)], axis=2)
-        np.testing.assert_allclose(correlation(dead, RATE)[3:7], correlation(x, RATE)[3:7], atol=1e-12)
+        np.testing.assert_allclose(
+            correlation(dead, RATE)[3:7], correlation(x, RATE)[3:7], atol=1e-12
+        )
     assert correlation(x[:, :1, :1], RATE)[3:7].tolist() == [0, 0, 0, 0]
 
 
@@ -121,7 +142,8 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
 
 
 def test_a_mean_that_rounding_left_is_none():
-    """Float32 counts whose means were removed: equal weights, and no feature shows what rounding left."""
+    """Float32 counts whose means were removed: equal weights, and no feature shows what rounding
+    left."""
     x = noise()
     centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
     assert centred.mean(axis=0, dtype=np.float64).any()
@@ -158,21 +180,34 @@ def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, k
     ("kind", "shape", "rate_hz", "message"),
     [
         ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is no sweep"),
-        ("spectrogram", (19, 2, 2), RATE, "19 frames are too few for a spectrogram; use at least 20"),
+        (
+            "spectrogram",
+            (19, 2, 2),
+            RATE,
+            "19 frames are too few for a spectrogram; use at least 20",
+        ),
         ("correlation", (2, 2, 2), RATE, "2 frames are too few .* use at least 3"),
         ("correlation", (20, 2, 2), 0.0, "rate of 0.0 Hz"),
     ],
 )
-def test_what_cannot_be_computed_is_named(kind: str, shape: tuple[int, ...], rate_hz: float, message: str):
+def test_what_cannot_be_computed_is_named(
+    kind: str, shape: tuple[int, ...], rate_hz: float, message: str
+):
     """Each refusal is a FormatError with the value that was wrong."""
     with pytest.raises(FormatError, match=message):
         kinds.compute(kind, np.ones(shape, np.uint8), rate_hz)
 
 
 def test_exploring_stops_when_the_posterior_is_sure():
-    """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them for .99."""
+    """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them
+    for .99."""
     log_p = np.log(np.array([[0.6, 0.4]] * 3))
-    assert [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)] == [(0, 1), (0, 2), (0, 3), (0, 3)]
+    assert [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)] == [
+        (0, 1),
+        (0, 2),
+        (0, 3),
+        (0, 3),
+    ]
 
 
 def test_later_sweeps_correct_the_first():
@@ -184,7 +219,10 @@ def test_later_sweeps_correct_the_first():
 
 @pytest.mark.parametrize(
     ("log_p", "sure", "hint"),
-    [(np.zeros((0, 3)), 0.9, "at least one of each"), (np.zeros((2, 3)), 1.5, "1.5 cannot be reached")],
+    [
+        (np.zeros((0, 3)), 0.9, "at least one of each"),
+        (np.zeros((2, 3)), 1.5, "1.5 cannot be reached"),
+    ],
 )
 def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):
     """No sweep, and a certainty that is no probability."""

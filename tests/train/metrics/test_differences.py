@@ -10,15 +10,19 @@ from train.metrics import differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():
-    """The first example of his table II: 56 of 70 less 48 of 80 is .2, by method 10 from .0524 to .3339."""
+    """The first example of his table II: 56 of 70 less 48 of 80 is .2, by method 10 from .0524 to
+    .3339."""
     one, other = ((right / n, *wilson(right, n)) for right, n in ((56, 70), (48, 80)))
     assert differences.difference(one, other) == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
 
 
 def test_the_interval_of_a_difference_holds_what_it_says():
-    """Of two shares drawn 2,000 times, the true difference lies in it at least 93 % of the time, and not always."""
+    """Of two shares drawn 2,000 times, the true difference lies in it at least 93 % of the time,
+    and not always."""
     rng, inside = np.random.default_rng(0), []
-    for one, other in zip(rng.binomial(80, 0.9, 2000) / 80, rng.binomial(80, 0.7, 2000) / 80, strict=True):
+    for one, other in zip(
+        rng.binomial(80, 0.9, 2000) / 80, rng.binomial(80, 0.7, 2000) / 80, strict=True
+    ):
         estimates = [(float(share), *wilson(80 * share, 80)) for share in (one, other)]
         _, low, high = differences.difference(*estimates)
         inside.append(low <= 0.2 <= high)
@@ -26,7 +30,8 @@ def test_the_interval_of_a_difference_holds_what_it_says():
 
 
 def test_groups_of_a_mean_err_independently():
-    """Four equal intervals: alone half as wide, as one group as wide as each; the ends keep their sides."""
+    """Four equal intervals: alone half as wide, as one group as wide as each; the ends keep their
+    sides."""
     one = (0.8, 0.7, 0.84)
     alone = differences.mean({str(i): [one] for i in range(4)})
     together = differences.mean({"a": [one] * 4})

@@ -1,4 +1,5 @@
-"""MultiRocket-Hydra and QUANT: aeon's answers, small windows, what is left as it was, what cannot be trained."""
+"""MultiRocket-Hydra and QUANT: aeon's answers, small windows, what is left as it was, what cannot
+be trained."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def hard(n: int = 12) -> Dataset:
 @pytest.mark.parametrize("materials", [3, 2])
 @names
 def test_the_labels_are_aeons(name: str, materials: int):
-    """As its classifier gives them with default settings and this seed, also for sweeps that are hard to separate."""
+    """As its classifier gives them with default settings and this seed, also for sweeps that are
+    hard to separate."""
     rockets = pytest.importorskip("aeon.classification.convolution_based")
     from aeon.classification.interval_based import QUANTClassifier
 
@@ -58,17 +60,22 @@ def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
     """float32 sweeps of any window from ten frames on: finite, one by one as all at once."""
     pytest.importorskip("aeon")
     rng, labels = np.random.default_rng(0), np.arange(12) % 3
-    samples = (rng.standard_normal((12, frames, taxels, 1)) * (1 + labels[:, None, None, None])).astype(np.float32)
+    samples = (
+        rng.standard_normal((12, frames, taxels, 1)) * (1 + labels[:, None, None, None])
+    ).astype(np.float32)
     model = train(name, Dataset(samples, labels, ("a", "b", "c"), 100.0))
     logits = model.logits(samples)
     assert np.isfinite(logits).all()
-    np.testing.assert_allclose(np.concatenate([model.logits(x[None]) for x in samples]), logits, atol=1e-2)
+    np.testing.assert_allclose(
+        np.concatenate([model.logits(x[None]) for x in samples]), logits, atol=1e-2
+    )
 
 
 @pytest.mark.slow
 @names
 def test_silence_and_single_sweeps_are_no_trouble(name: str):
-    """A training set without any signal, a taxel without one, one sweep of each material: logits are finite."""
+    """A training set without any signal, a taxel without one, one sweep of each material: logits
+    are finite."""
     pytest.importorskip("aeon")
     sweeps = easy(4)
     silent = replace(sweeps, samples=np.full_like(sweeps.samples, 7))
@@ -80,7 +87,8 @@ def test_silence_and_single_sweeps_are_no_trouble(name: str):
 @pytest.mark.slow
 @names
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
-    """The same logits for the same seed, others for another; numpy's and PyTorch's streams go on."""
+    """The same logits for the same seed, others for another; numpy's and PyTorch's streams go
+    on."""
     pytest.importorskip("aeon")
     sweeps, other = hard(20).split("recording", 0.3, 0)
     np.random.seed(4)
@@ -109,13 +117,17 @@ def test_what_cannot_be_trained_is_named(name: str, monkeypatch: pytest.MonkeyPa
     """Too short a window, one material, no aeon; a graph is refused."""
     sweeps = easy(4)
     short = replace(sweeps, samples=sweeps.samples[:, :9])
-    with pytest.raises(FormatError, match=f"a window of 9 frames is too short for {name}; record at least 10"):
+    with pytest.raises(
+        FormatError, match=f"a window of 9 frames is too short for {name}; record at least 10"
+    ):
         train(name, short)
     with pytest.raises(FormatError, match="only one class, 'high'"):
         train(name, sweeps.take(sweeps.labels == 2))
     for module in ("convolution_based", "interval_based"):
         monkeypatch.setitem(sys.modules, f"aeon.classification.{module}", None)
-    with pytest.raises(FormatError, match=r"needs aeon .*pip install 'palpate-train\[minirocket\]'"):
+    with pytest.raises(
+        FormatError, match=r"needs aeon .*pip install 'palpate-train\[minirocket\]'"
+    ):
         train(name, sweeps)
     with pytest.raises(FormatError, match=f"{name} runs in aeon alone and has no graph"):
         aeon_peers.AeonModel(name, np.zeros_like, np.arange(3), 3).graph()

@@ -1,4 +1,5 @@
-"""Every method on a skin with three axes: it trains, and its graph takes [1, T, R, C, A] and gives what the desktop gives."""
+"""Every method on a skin with three axes: it trains, and its graph takes [1, T, R, C, A] and gives
+what the desktop gives."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ def sweeps() -> Dataset:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", methods.every())
 def test_a_method_takes_three_axes(name: str, sweeps: Dataset):
-    """Logits are finite; the graph, where there is one, has them, too; other shear gives other logits."""
+    """Logits are finite; the graph, where there is one, has them, too; other shear gives other
+    logits."""
     (method,) = methods.find([name], BRIEF)
     if method.extra:
         pytest.importorskip("aeon", reason="aeon comes with palpate-train[minirocket]")
@@ -33,9 +35,14 @@ def test_a_method_takes_three_axes(name: str, sweeps: Dataset):
     assert logits.shape == (4, 6)
     assert np.isfinite(logits).all()
     if not method.library:
-        np.testing.assert_allclose(graph_builder.run(model.graph(), given[:4]), logits, atol=2e-3, rtol=1e-3)
+        np.testing.assert_allclose(
+            graph_builder.run(model.graph(), given[:4]), logits, atol=2e-3, rtol=1e-3
+        )
     if method.input == "raw" and not method.library:
-        (shape,) = {tuple(d.dim_value for d in i.type.tensor_type.shape.dim) for i in model.graph().graph.input}
+        (shape,) = {
+            tuple(d.dim_value for d in i.type.tensor_type.shape.dim)
+            for i in model.graph().graph.input
+        }
         assert shape == (1, 360, 2, 2, 3)
         other = given[:4].copy()
         other[..., 0] = np.roll(other[..., 0] * 3, 1, axis=0)

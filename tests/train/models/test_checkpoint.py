@@ -26,8 +26,11 @@ class Interrupted(Exception):
     """Stands for a loss of power."""
 
 
-def fit(recipe: TrainingRecipe, path: Path | None, stop_after: int = 99) -> tuple[dict[str, torch.Tensor], list]:
-    """The trained weights and the cost of each step. stop_after: the step after which it is interrupted."""
+def fit(
+    recipe: TrainingRecipe, path: Path | None, stop_after: int = 99
+) -> tuple[dict[str, torch.Tensor], list]:
+    """The trained weights and the cost of each step. stop_after: the step after which it is
+    interrupted."""
 
     def log(line: str) -> None:
         if line.startswith(f"step {stop_after}/"):
@@ -40,7 +43,9 @@ def fit(recipe: TrainingRecipe, path: Path | None, stop_after: int = 99) -> tupl
     return net.state_dict(), cost
 
 
-def check_same(one: tuple[dict[str, torch.Tensor], list], other: tuple[dict[str, torch.Tensor], list]) -> None:
+def check_same(
+    one: tuple[dict[str, torch.Tensor], list], other: tuple[dict[str, torch.Tensor], list]
+) -> None:
     """Bit for bit."""
     assert one[1] == other[1]
     assert all(torch.equal(a, b) for a, b in zip(one[0].values(), other[0].values(), strict=True))
@@ -50,7 +55,8 @@ def check_same(one: tuple[dict[str, torch.Tensor], list], other: tuple[dict[str,
 def test_an_interrupted_training_gives_the_same_bits(
     recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Interrupted twice; dropout, noise, gains, batch norms, the rate and the moving average go on where they were."""
+    """Interrupted twice; dropout, noise, gains, batch norms, the rate and the moving average go on
+    where they were."""
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     path = tmp_path / "deeper" / "half.pt"
     for stop in (3, 7):
@@ -96,7 +102,9 @@ def test_it_is_written_from_time_to_time(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_an_interrupted_fold_of_the_paper_s_cnn_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupted_fold_of_the_paper_s_cnn_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Its file lies beside the folds, and is removed when the fold is kept."""
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     plan = Plan(("paper-cnn",), ("split:session=0->1",), effort=Effort(paper_steps=4))

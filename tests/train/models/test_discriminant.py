@@ -1,4 +1,5 @@
-"""The discriminant: against scikit-learn's covariance, with more features than sweeps and with fewer, and too few sweeps."""
+"""The discriminant: against scikit-learn's covariance, with more features than sweeps and with
+fewer, and too few sweeps."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from train.models import discriminant
 
 
 def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Correlated features [n, size] of materials whose means differ, and labels, of which each occurs."""
+    """Correlated features [n, size] of materials whose means differ, and labels, of which each
+    occurs."""
     rng = np.random.default_rng(n + size)
     labels = rng.permutation(np.arange(n) % classes)
     x = (
@@ -36,7 +38,9 @@ def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
     away = ((x[:, None] - means) @ np.linalg.inv(covariance) * (x[:, None] - means)).sum(axis=2)
     differences = logits - logits.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(
-        differences, -(away - away.mean(axis=1, keepdims=True)) / 2, atol=1e-2 * np.abs(differences).max()
+        differences,
+        -(away - away.mean(axis=1, keepdims=True)) / 2,
+        atol=1e-2 * np.abs(differences).max(),
     )
 
 
@@ -71,6 +75,7 @@ def test_features_without_any_scatter_are_compared_by_their_means():
 def test_one_sweep_of_each_material_is_too_few():
     """The message counts them."""
     with pytest.raises(
-        FormatError, match="3 sweeps of as many materials are too few for a linear discriminant; record more"
+        FormatError,
+        match="3 sweeps of as many materials are too few for a linear discriminant; record more",
     ):
         discriminant.fit(np.eye(3), np.arange(3), 3)

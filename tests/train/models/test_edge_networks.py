@@ -1,4 +1,5 @@
-"""DS-CNN and the recipe of the edge tools: their layers, their features against the definition, the int8 form."""
+"""DS-CNN and the recipe of the edge tools: their layers, their features against the definition, the
+int8 form."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from train.onnx_tools.quantize import quantize
 
 
 @pytest.mark.parametrize(
-    ("window", "stride", "kernel"), [(1500, 30, 60), (128, 2, 10), (80, 1, 10), (24, 1, 10), (7, 1, 7)]
+    ("window", "stride", "kernel"),
+    [(1500, 30, 60), (128, 2, 10), (80, 1, 10), (24, 1, 10), (7, 1, 7)],
 )
 def test_the_first_convolution_leaves_about_fifty_steps(window: int, stride: int, kernel: int):
     """Ten frames, or two strides of a long window; a window shorter than that is one step."""
@@ -26,7 +28,8 @@ def test_the_first_convolution_leaves_about_fifty_steps(window: int, stride: int
 
 
 def test_its_weights_and_work_are_those_of_depthwise_separable_layers():
-    """Four blocks of 64 kernels of nine frames and 64 x 64 products, each with a bias after the norms are folded in."""
+    """Four blocks of 64 kernels of nine frames and 64 x 64 products, each with a bias after the
+    norms are folded in."""
     form = SweepFormat(2, 2, 100.0, 128, "int16")
     graph = ds_cnn.DepthwiseSeparable(form, 3, 1.0).eval().graph()
     first, block, head, steps = 64 * 4 * 10 + 64, 64 * (9 + 1) + 64 * 65, 3 * 65, 60
@@ -45,22 +48,28 @@ def test_ds_cnn_has_an_int8_form():
     int8 = model.forms["int8"]
     assert cost.precision(int8.graph()) == "int8"
     assert len(int8.graph().SerializeToString()) < 0.6 * len(model.graph().SerializeToString())
-    np.testing.assert_allclose(softmax(int8.logits(s.samples)), softmax(model.logits(s.samples)), atol=0.25)
+    np.testing.assert_allclose(
+        softmax(int8.logits(s.samples)), softmax(model.logits(s.samples)), atol=0.25
+    )
 
 
 @pytest.mark.parametrize("classes", [3, 26])
 def test_the_box_reads_its_int8_form(classes: int):
-    """A head of more than a kilobyte was once marked as lying in a file of its own, which the box refuses."""
+    """A head of more than a kilobyte was once marked as lying in a file of its own, which the box
+    refuses."""
     form = SweepFormat(2, 2, 100.0, 128, "int16")
     sweeps = np.random.default_rng(1).integers(-99, 99, (8, 128, 2, 2), np.int16)
     network = ds_cnn.build(form, classes, sweeps).eval()
     model = quantize(network.graph(), sweeps, ds_cnn.INT8_NODES)
     assert reader.read(model.SerializeToString()).graph is not None
-    np.testing.assert_allclose(graph_builder.run(model, sweeps), graph_builder.run(network.graph(), sweeps), atol=0.1)
+    np.testing.assert_allclose(
+        graph_builder.run(model, sweeps), graph_builder.run(network.graph(), sweeps), atol=0.1
+    )
 
 
 @pytest.mark.parametrize(
-    ("window", "length"), [(1500, 256), (600, 256), (427, 128), (128, 64), (80, 64), (24, 64), (1, 64)]
+    ("window", "length"),
+    [(1500, 256), (600, 256), (427, 128), (128, 64), (80, 64), (24, 64), (1, 64)],
 )
 def test_the_transform_is_as_long_as_the_window_allows(window: int, length: int):
     """A power of two within half the window, from 64 to 256."""
@@ -69,7 +78,8 @@ def test_the_transform_is_as_long_as_the_window_allows(window: int, length: int)
 
 @pytest.mark.parametrize("window", [1500, 128, 80, 24])
 def test_the_features_are_the_definition(window: int):
-    """numpy's FFT of half-overlapping Hann frames, zeros behind a short window; moments of each taxel."""
+    """numpy's FFT of half-overlapping Hann frames, zeros behind a short window; moments of each
+    taxel."""
     rng = np.random.default_rng(2)
     x = rng.standard_normal((3, window)) * [[0.1], [1], [5]]
     x -= x.mean(1, keepdims=True)
@@ -79,7 +89,9 @@ def test_the_features_are_the_definition(window: int):
     padded = np.pad(x, ((0, 0), (0, max(length - window, 0))))
     hann = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
     starts = range(0, padded.shape[1] - length + 1, length // 2)
-    power = np.mean([np.abs(np.fft.rfft(padded[:, s : s + length] * hann)) ** 2 for s in starts], axis=0)[:, 1:]
+    power = np.mean(
+        [np.abs(np.fft.rfft(padded[:, s : s + length] * hann)) ** 2 for s in starts], axis=0
+    )[:, 1:]
     variance = (x**2).mean(1) + edge_spectral.FLOOR
     moments = [np.sqrt(variance), (x**3).mean(1) / variance**1.5, (x**4).mean(1) / variance**2 - 3]
     want = np.concatenate([*moments, np.log(power / (hann**2).sum() + edge_spectral.FLOOR).ravel()])
@@ -87,7 +99,8 @@ def test_the_features_are_the_definition(window: int):
 
 
 def test_features_are_standardised_on_the_training_sweeps():
-    """Mean 0 and deviation 1 over what `build` was given; a feature that is constant there stays finite."""
+    """Mean 0 and deviation 1 over what `build` was given; a feature that is constant there stays
+    finite."""
     s = easy(10)
     net = edge_spectral.build(s.format, 3, s.samples)
     with torch.no_grad():

@@ -1,4 +1,5 @@
-"""Neural methods: the paper's CNN as printed, graphs that give what PyTorch gives, small trainings with calibrated results."""
+"""Neural methods: the paper's CNN as printed, graphs that give what PyTorch gives, small trainings
+with calibrated results."""
 
 from __future__ import annotations
 
@@ -25,7 +26,15 @@ from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.onnx_tools import graph_builder
 
-NETS = ("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent", "ds-cnn", "lite", "edge-spectral")
+NETS = (
+    "paper-cnn",
+    "paper-cnn-centred",
+    "tactnet2",
+    "recurrent",
+    "ds-cnn",
+    "lite",
+    "edge-spectral",
+)
 NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
 """Two to eight iterations: enough for what is not about accuracy."""
@@ -36,12 +45,21 @@ def method(name: str, effort: Effort = BRIEF) -> Method:
     return methods.find([name], effort)[0]
 
 
-def made(shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0) -> Dataset:
+def made(
+    shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0
+) -> Dataset:
     """Sweeps [N, T, R, C] of noise, the class in its strength; two sweeps to a recording."""
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
-    return Dataset(samples.astype(dtype), labels, names, rate_hz, {"recording": np.arange(shape[0]) // 2}, "made")
+    return Dataset(
+        samples.astype(dtype),
+        labels,
+        names,
+        rate_hz,
+        {"recording": np.arange(shape[0]) // 2},
+        "made",
+    )
 
 
 def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> training.NetworkModel:
@@ -59,7 +77,8 @@ def check_agrees(model: training.NetworkModel, samples: np.ndarray) -> None:
 
 
 def test_the_paper_s_cnn_is_the_paper_s():
-    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and what it becomes in PyTorch.
+    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and what it becomes in
+    PyTorch.
 
     TactNet-II has about the 1.84 M that are known of it.
     """
@@ -75,10 +94,14 @@ def test_the_paper_s_cnn_is_the_paper_s():
     assert sum(p.numel() for p in other.parameters()) == pytest.approx(1.84e6, rel=0.01)
 
 
-@pytest.mark.parametrize(("window", "steps"), [(1500, (150, 15)), (128, (13, 2)), (101, (11, 2)), (5, (1, 1))])
+@pytest.mark.parametrize(
+    ("window", "steps"), [(1500, (150, 15)), (128, (13, 2)), (101, (11, 2)), (5, (1, 1))]
+)
 def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
     """Zero padding handles over-flow: what is left at the end makes one step more, and is seen."""
-    net = paper_cnn.ImageNetwork(SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER)
+    net = paper_cnn.ImageNetwork(
+        SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER
+    )
     assert net.dense.in_features == 64 * steps[1]
     counts = torch.rand(1, window, 1, 1)
     with torch.no_grad():
@@ -89,8 +112,12 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
 
 @pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
-    """Against PyTorch's Adam, step by step: batches in sequence from a shuffled set, shuffled again after each round."""
-    s, r = made((6, 12, 2, 1), "float32", 2), replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0)
+    """Against PyTorch's Adam, step by step: batches in sequence from a shuffled set, shuffled again
+    after each round."""
+    s, r = (
+        made((6, 12, 2, 1), "float32", 2),
+        replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0),
+    )
     with torch.random.fork_rng():
         torch.manual_seed(3)
         mine = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, replace(paper_cnn.PAPER, dense=8))
@@ -112,9 +139,12 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
 
 
 def test_adversarial_training_sees_the_worse_sweep():
-    """The gradient is that of the sweep and of the one moved against it by the fast gradient sign, together."""
+    """The gradient is that of the sweep and of the one moved against it by the fast gradient sign,
+    together."""
     s = made((6, 20, 2, 2), "float32", 2)
-    net = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8))
+    net = paper_cnn.ImageNetwork(
+        s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8)
+    )
     x, labels = net.prepare(torch.from_numpy(s.samples)), torch.from_numpy(s.labels)
     still = x.clone().requires_grad_()
     cost = nn.functional.cross_entropy(net.training_logits(still), labels)
@@ -186,7 +216,8 @@ def test_what_is_easy_is_learnt(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_again_for_the_same_seed(name: str):
-    """Bit for bit, whatever the state outside, which stays as it was; another seed gives another network."""
+    """Bit for bit, whatever the state outside, which stays as it was; another seed gives another
+    network."""
     s = easy(8)
     first = train(name, s).logits(s.samples)
     torch.manual_seed(99)
@@ -213,7 +244,8 @@ def test_a_material_that_never_came_is_never_given(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_small_sets_are_trained_whole(name: str):
-    """Two recordings of one sweep each cannot be parted; one position alone does not forbid parting by recording."""
+    """Two recordings of one sweep each cannot be parted; one position alone does not forbid parting
+    by recording."""
     tiny = easy(2)
     check_agrees(train(name, tiny), tiny.samples)
     one = easy(6)
@@ -225,9 +257,12 @@ def test_small_sets_are_trained_whole(name: str):
 
 @pytest.mark.slow
 def test_one_sweep_of_each_is_too_little_for_a_discriminant():
-    """Refused with a message of ours; augmented copies, or heads trained by gradient, work with what there is."""
+    """Refused with a message of ours; augmented copies, or heads trained by gradient, work with
+    what there is."""
     one, labels = np.eye(3), np.arange(3)
-    with pytest.raises(FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"):
+    with pytest.raises(
+        FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"
+    ):
         closed_form_head(one, labels, one, labels)
     for name in ("compact", "recurrent"):
         check_agrees(train(name, easy(1)), easy(1).samples)
@@ -235,7 +270,8 @@ def test_one_sweep_of_each_is_too_little_for_a_discriminant():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_silence_is_no_trouble(name: str):
-    """A training set without any signal, and constant sweeps afterwards: logits are finite, and equal for all."""
+    """A training set without any signal, and constant sweeps afterwards: logits are finite, and
+    equal for all."""
     s = easy(6)
     dumb = replace(s, samples=np.full_like(s.samples, 7))
     model = train(name, dumb)
@@ -247,7 +283,8 @@ def test_silence_is_no_trouble(name: str):
 
 @pytest.mark.slow
 def test_probabilities_come_from_what_was_held_out():
-    """Labels drawn by lot: a network that learns its training sweeps by heart is made unsure by those it never saw."""
+    """Labels drawn by lot: a network that learns its training sweeps by heart is made unsure by
+    those it never saw."""
     s = easy(40)
     lot = replace(s, labels=np.random.default_rng(1).permutation(s.labels))
     model = train("tactnet2", lot, Effort(share=0.5))
@@ -257,7 +294,8 @@ def test_probabilities_come_from_what_was_held_out():
 
 @pytest.mark.slow
 def test_compact_is_what_palpate_train_fits():
-    """The same network and int8 head as `fit` gives, float logits moved; on a grid and along a line."""
+    """The same network and int8 head as `fit` gives, float logits moved; on a grid and along a
+    line."""
     s = easy(12)
     line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
     for given in (s, line):
@@ -266,7 +304,9 @@ def test_compact_is_what_palpate_train_fits():
             want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
         have = model.forms["float"].logits(given.samples)
         np.testing.assert_allclose(have, want - want.mean(1, keepdims=True), rtol=1e-4, atol=1e-3)
-        int8 = graph_builder.run(graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples)
+        int8 = graph_builder.run(
+            graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples
+        )
         np.testing.assert_allclose(model.logits(given.samples), int8, atol=1e-3)
 
 
@@ -282,7 +322,8 @@ def test_a_window_too_short_is_named():
 
 @pytest.mark.slow
 def test_bfloat16_is_used_where_it_is_asked_for_and_there():
-    """It is reported, its answers stay float32 and close, and its absence on a processor is reported too."""
+    """It is reported, its answers stay float32 and close, and its absence on a processor is
+    reported too."""
     s = easy(8)
     exact = train("paper-cnn", s, Effort(paper_steps=4))
     rough = train("paper-cnn", s, Effort(paper_steps=4, bfloat16=True))
@@ -296,7 +337,13 @@ def test_bfloat16_is_used_where_it_is_asked_for_and_there():
 
 def test_effort_is_kept():
     """Names, iterations and logs follow the effort; methods can be sent to another process."""
-    networks = (*paper_cnn.METHODS, *recurrent.METHODS, *ds_cnn.METHODS, *lite.METHODS, *edge_spectral.METHODS)
+    networks = (
+        *paper_cnn.METHODS,
+        *recurrent.METHODS,
+        *ds_cnn.METHODS,
+        *lite.METHODS,
+        *edge_spectral.METHODS,
+    )
     assert tuple(m.name for m in networks) == NETS
     assert all(m.input == "raw" and "\n" not in m.about for m in networks)
     if not torch.cuda.is_available():
@@ -314,7 +361,8 @@ def test_effort_is_kept():
 
 @pytest.mark.parametrize("name", ["paper-cnn", "paper-cnn-centred"])
 def test_the_paper_s_cnn_has_an_int8_form(name: str):
-    """A quarter of the size, the same labels but for what quantization costs; centred, an offset changes nothing."""
+    """A quarter of the size, the same labels but for what quantization costs; centred, an offset
+    changes nothing."""
     s = easy(8)
     model = train(name, s)
     int8 = model.forms["int8"]
@@ -327,7 +375,8 @@ def test_the_paper_s_cnn_has_an_int8_form(name: str):
 
 
 def test_forms_are_kept_and_counted(tmp_path: Path):
-    """Logits of the other precision come back from the file as they were, and evaluate reports them beside the others."""
+    """Logits of the other precision come back from the file as they were, and evaluate reports them
+    beside the others."""
     s = easy(12)
     order = np.arange(len(s))
     made_ = fold.run(fold.FoldTask("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
@@ -336,6 +385,10 @@ def test_forms_are_kept_and_counted(tmp_path: Path):
     assert set(again.forms) == {"int8"}
     np.testing.assert_array_equal(again.forms["int8"], made_.forms["int8"])
     figures = evaluate.Result("paper-cnn", "random:2", False, 1, s, [again]).json()["forms"]["int8"]
-    assert figures["window"]["right"] == int((made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum())
-    assert figures["agreement"] == np.mean(made_.forms["int8"].argmax(1) == made_.logits.argmax(1)).round(4)
+    assert figures["window"]["right"] == int(
+        (made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum()
+    )
+    assert figures["agreement"] == np.mean(
+        made_.forms["int8"].argmax(1) == made_.logits.argmax(1)
+    ).round(4)
     assert 0 < figures["probability_difference"] < 0.2

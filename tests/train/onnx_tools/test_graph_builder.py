@@ -24,7 +24,9 @@ def made(output: str, by: float) -> onnx.ModelProto:
     x = g("ReduceSum", x, axis, keepdims=1)
     sums = g("Reshape", g("ReduceSum", x, same, keepdims=1), g.constant([1, 4], "int64"))
     g.nodes.append(onnx.helper.make_node("TopK", [sums, g.constant([2], "int64")], ["most", "who"]))
-    return g.model(FORM, g("Mul", g("Mul", "most", g.constant(by)), g.constant(3.0), output=output), 2)
+    return g.model(
+        FORM, g("Mul", g("Mul", "most", g.constant(by)), g.constant(3.0), output=output), 2
+    )
 
 
 def drawn() -> np.ndarray:
@@ -33,11 +35,21 @@ def drawn() -> np.ndarray:
 
 
 def test_what_both_compute_is_there_once():
-    """Six nodes are shared; the two that differ get names of their own, and so does the constant that differs."""
+    """Six nodes are shared; the two that differ get names of their own, and so does the constant
+    that differs."""
     both = joined(made("a", 0.5), made("b", 0.25))
     assert [node.name for node in both.graph.node] == [
-        "reshape0", "cast1", "reducesum2", "reducesum3", "reshape4", "", "mul6", "a", "mul6.b", "b",
-    ]  # fmt: skip
+        "reshape0",
+        "cast1",
+        "reducesum2",
+        "reducesum3",
+        "reshape4",
+        "",
+        "mul6",
+        "a",
+        "mul6.b",
+        "b",
+    ]
     assert [node.output[:] for node in both.graph.node][5] == ["most", "who"]
     assert len(both.graph.initializer) == len(made("a", 0.5).graph.initializer) + 1
     assert [output.name for output in both.graph.output] == ["a", "b"]
@@ -62,7 +74,9 @@ def test_constants_are_told_apart_by_type_and_shape():
         g = GraphBuilder()
         x = g("Cast", g("Reshape", "sweep", g.constant([80], "int64")), to=1)
         ones = g("Cast", g.constant(np.zeros(shape), dtype), to=1)
-        return g.model(FORM, g("Reshape", g("Add", x, ones), g.constant([1, 80], "int64"), output=output), 80)
+        return g.model(
+            FORM, g("Reshape", g("Add", x, ones), g.constant([1, 80], "int64"), output=output), 80
+        )
 
     both = joined(shaped("a", [80], "uint8"), shaped("b", [1, 80], "uint8"))
     assert len(both.graph.initializer) == 4
@@ -70,7 +84,8 @@ def test_constants_are_told_apart_by_type_and_shape():
 
 
 def test_a_slim_model_gives_the_same_bits_in_fewer_bytes():
-    """Equal constants once, short names, those of inputs, outputs and of what multiplies as they were."""
+    """Equal constants once, short names, those of inputs, outputs and of what multiplies as they
+    were."""
     g = GraphBuilder()
     x = g("Cast", g("Reshape", "sweep", g.constant([1, 20, 4], "int64")), to=1)
     y = g("MatMul", x, g.constant(np.arange(12).reshape(4, 3)))

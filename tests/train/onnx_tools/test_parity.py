@@ -1,4 +1,5 @@
-"""Float against int8: what is lost, with its interval, the range of each tensor, and what saturates."""
+"""Float against int8: what is lost, with its interval, the range of each tensor, and what
+saturates."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def measured(fitted: Fit) -> parity.Parity:
 
 def activations(found: parity.Parity) -> list[Layer]:
     """Its rounded tensors behind convolutions, in order."""
-    return [layer for layer in found.layers if layer.kind == "activations" and layer.against == "float"]
+    return [
+        layer for layer in found.layers if layer.kind == "activations" and layer.against == "float"
+    ]
 
 
 def booleans(n: int, wrong: list[int]) -> np.ndarray:
@@ -49,9 +52,15 @@ def booleans(n: int, wrong: list[int]) -> np.ndarray:
 
 
 def test_what_is_lost_is_counted_in_pairs():
-    """Three sweeps lost, one won, by hand with Agresti's and Min's halves; no loss of a hundred is not certainly none."""
+    """Three sweeps lost, one won, by hand with Agresti's and Min's halves; no loss of a hundred is
+    not certainly none."""
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
-    assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (50, 49, 47, pytest.approx(0.04))
+    assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (
+        50,
+        49,
+        47,
+        pytest.approx(0.04),
+    )
     middle = (3.5 - 1.5) / 52
     reach = 1.96 * np.sqrt((5 / 52 - middle**2) / 52)
     assert (lost.low, lost.high) == (pytest.approx(middle - reach), pytest.approx(middle + reach))
@@ -61,7 +70,8 @@ def test_what_is_lost_is_counted_in_pairs():
 
 
 def test_the_interval_holds_what_it_promises():
-    """Of 400 draws of 80 sweeps, of which int8 loses 4 % and wins 2 %, at least 93 % of the intervals hold the truth."""
+    """Of 400 draws of 80 sweeps, of which int8 loses 4 % and wins 2 %, at least 93 % of the
+    intervals hold the truth."""
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(400):
@@ -74,14 +84,17 @@ def test_the_interval_holds_what_it_promises():
 def test_sweeps_that_fail_together_count_together():
     """All losses in one of five recordings: less sure than if they lay anywhere."""
     wrong = booleans(50, list(range(5)))
-    alone, together = (parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10))
+    alone, together = (
+        parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10)
+    )
     assert together.low <= alone.low
     assert together.high > alone.high
     assert parity.loss(np.ones(50, bool), wrong, np.arange(50) // 10) == together
 
 
 def test_differences_by_hand():
-    """The common part of logits does not count; the largest and the mean difference of a probability are of sweeps."""
+    """The common part of logits does not count; the largest and the mean difference of a
+    probability are of sweeps."""
     want = np.float32([[1, 0], [0, 0.1]])
     have = np.float32([[6, 5], [0.3, 0]])
     apart = parity.compare(want, have)
@@ -89,11 +102,15 @@ def test_differences_by_hand():
     assert apart.agreement == 0.5
     assert apart.probability_difference == pytest.approx(moved, abs=1e-6)
     assert apart.probability_mean == pytest.approx(moved / 2, abs=1e-6)
-    assert (apart.logit_difference, apart.logit_mean) == (pytest.approx(0.2, abs=1e-6), pytest.approx(0.1, abs=1e-6))
+    assert (apart.logit_difference, apart.logit_mean) == (
+        pytest.approx(0.2, abs=1e-6),
+        pytest.approx(0.1, abs=1e-6),
+    )
 
 
 def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
-    """Percentiles and the share beyond reach of each stage, against its responses in PyTorch; weights of seven bits."""
+    """Percentiles and the share beyond reach of each stage, against its responses in PyTorch;
+    weights of seven bits."""
     found = measured(fitted)
     model = fitted.network()
     with torch.no_grad():
@@ -102,7 +119,9 @@ def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
     stages = activations(found)
     assert len(stages) == len(responses)
     for layer, x in zip(stages, responses, strict=True):
-        np.testing.assert_allclose(layer.percentiles, np.percentile(x, parity.PERCENTILES), atol=1e-4)
+        np.testing.assert_allclose(
+            layer.percentiles, np.percentile(x, parity.PERCENTILES), atol=1e-4
+        )
         assert layer.low == 0
         assert layer.high == pytest.approx(255 * layer.step)
         assert layer.saturated == pytest.approx(np.mean(x > layer.high + layer.step / 2), abs=2e-4)
@@ -113,7 +132,8 @@ def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
 
 
 def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
-    """A stage whose range is a fifth: its values are cut off, its signal drowns; those before are as they were."""
+    """A stage whose range is a fifth: its values are cut off, its signal drowns; those before are
+    as they were."""
     *before, last = fitted.ranges.responses
     broken = replace(fitted, ranges=replace(fitted.ranges, responses=(*before, last / 5)))
     whole, cut = (activations(measured(one)) for one in (fitted, broken))
@@ -123,7 +143,8 @@ def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
 
 
 def test_a_tap_that_was_moved_is_found(fitted: Fit):
-    """Taps that sum to zero, then one integer more: an offset can move the first convolution by it."""
+    """Taps that sum to zero, then one integer more: an offset can move the first convolution by
+    it."""
     _, int8 = quantized_bundle.graphs(fitted)
     conv = next(n for n in int8.graph.node if n.op_type == "Conv")
     maker = next(n for n in int8.graph.node if conv.input[1] in n.output)
@@ -151,7 +172,11 @@ def test_a_bundle_is_compared_without_float(fitted: Fit):
     """Each tensor against itself, before it is rounded; a graph without int8 is named."""
     reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
-    assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (None, None, {"itself"})
+    assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (
+        None,
+        None,
+        {"itself"},
+    )
     assert len(found.layers) >= len(fitted.architecture.channels)
     assert "holds no float form" in parity.table(found)
     with pytest.raises(FormatError, match="no int8 tensors"):
@@ -169,5 +194,7 @@ def test_the_command_reports_fits_and_bundles(fitted: Fit, tmp_path: Path):
     assert figures["set"] == "close"
     assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
     assert "holds no float form" in quantized_bundle.compared(tmp_path / "bundle", fitted.held)
-    with pytest.raises(FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"):
+    with pytest.raises(
+        FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"
+    ):
         quantized_bundle.compared(tmp_path / "fit.npz", easy(dtype="int16"))

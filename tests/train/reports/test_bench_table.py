@@ -1,4 +1,5 @@
-"""The one table of the box's figures, which README and manual show: they name none of its figures elsewhere."""
+"""The one table of the box's figures, which README and manual show: they name none of its figures
+elsewhere."""
 
 from __future__ import annotations
 
@@ -42,11 +43,13 @@ def running_text(path: Path) -> str:
 
 
 def named(text: str, figures: dict[str, Any]) -> list[str]:
-    """The figures of the bench that a text names: by what they measure, and by their values as the table prints
-    them."""
+    """The figures of the bench that a text names: by what they measure, and by their values as the
+    table prints them."""
     found = [match[0] for pattern in MEASURED.values() for match in re.finditer(pattern, text)]
     values = set(re.findall(r"[\d.]+ (?:ms|MiB|kB|s)\b|\d+\.\d %", bench_table.table(figures)))
-    shown = {value for value in values if len(re.sub(r"\D", "", value)) > 2}  # of 1.0 ms there may be others
+    shown = {
+        value for value in values if len(re.sub(r"\D", "", value)) > 2
+    }  # of 1.0 ms there may be others
     return found + [value for value in shown if re.search(rf"(?<![\d.]){re.escape(value)}", text)]
 
 
@@ -86,16 +89,21 @@ def test_figures_of_an_older_bundle_say_so_first(figures: dict[str, Any]):
     assert bench_table.table(figures).startswith("Measured by `make bench` with the simulated skin")
     figures["bundle"] = "0badbead"
     first, _, rest = bench_table.table(figures).partition("\n\n")
-    assert first == f"**Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now.**"
+    assert (
+        first
+        == f"**Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now.**"
+    )
     assert rest.startswith("Measured by")
 
 
 def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
-    """In percent and with units; the accuracy says that it is simulated, of how many sweeps, and its interval."""
+    """In percent and with units; the accuracy says that it is simulated, of how many sweeps, and
+    its interval."""
     text = bench_table.table(figures)
     right, n = figures["accuracy"]["right"], figures["accuracy"]["total"]
     assert re.search(
-        rf"simulated.*n = {n}, with 95 % interval.*\| {right} of {n}: \d+\.\d % \[\d+\.\d, \d+\.\d\] \|", text
+        rf"simulated.*n = {n}, with 95 % interval.*\| {right} of {n}: \d+\.\d % \[\d+\.\d, \d+\.\d\] \|",
+        text,
     )
     for words, value in (
         ("last frame", r"median [\d.]+ ms, 99 % within [\d.]+ ms \(n = 60\)"),
@@ -115,5 +123,7 @@ def test_memory_without_the_simulated_board_has_its_row(figures: dict[str, Any])
     """Behind the memory with it, in figures of a bench that has measured it."""
     figures["rss_mb"] |= {"after_1000": 56.64, "without_board": 56.21}
     rows = bench_table.table(figures).splitlines()
-    (at,) = (i for i, row in enumerate(rows) if row.startswith("| resident memory after 1,000 sweeps"))
+    (at,) = (
+        i for i, row in enumerate(rows) if row.startswith("| resident memory after 1,000 sweeps")
+    )
     assert rows[at + 1] == "| of it without the simulated readout board | 56.2 MiB |"

@@ -35,19 +35,27 @@ def sweeps() -> Dataset:
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
     """Of the packaged bundle."""
-    return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {"command": "palpate-train report"}
+    return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {
+        "command": "palpate-train report"
+    }
 
 
 def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
-    """Materials add up to what the box's classifier answers, and precision counts the sweeps of others."""
+    """Materials add up to what the box's classifier answers, and precision counts the sweeps of
+    others."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     assert figures["named_rightly"]["right"] == found.right.sum()
     assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
-    assert round(sum(row["recall"][0] * row["sweeps"] for row in figures["materials"])) == found.right.sum()
+    assert (
+        round(sum(row["recall"][0] * row["sweeps"] for row in figures["materials"]))
+        == found.right.sum()
+    )
     assert figures["calibration"]["n"] == found.statuses["ok"] + found.statuses["unsure"]
 
 
-def test_a_material_that_others_are_taken_for_loses_precision(figures: dict, sweeps: Dataset, default_bundle: Bundle):
+def test_a_material_that_others_are_taken_for_loses_precision(
+    figures: dict, sweeps: Dataset, default_bundle: Bundle
+):
     """Three sweeps of wood as metal, one refused: each stands where it belongs."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     answered = {
@@ -56,30 +64,44 @@ def test_a_material_that_others_are_taken_for_loses_precision(figures: dict, swe
     }
     mixed = replace(found, answered=answered, foreign={"felt": Counter({"metal": 6})})
     wood, metal = (bundle_experiment.material(name, mixed) for name in ("wood", "metal"))
-    assert [wood[k] for k in ("sweeps", "unsure", "unknown", "refused", "taken_for")] == [12, 1, 1, 2, ["metal", 3]]
+    assert [wood[k] for k in ("sweeps", "unsure", "unknown", "refused", "taken_for")] == [
+        12,
+        1,
+        1,
+        2,
+        ["metal", 3],
+    ]
     assert wood["recall"][0] == 5 / 12
     assert wood["precision"][0] == 1
     assert metal["precision"][0] == 9 / 18
     assert (
-        bundle_experiment.material("metal", replace(mixed, answered={"metal": Counter({"(gap)": 2})}, foreign={}))[
-            "precision"
-        ]
+        bundle_experiment.material(
+            "metal", replace(mixed, answered={"metal": Counter({"(gap)": 2})}, foreign={})
+        )["precision"]
         == []
     )
 
 
 def test_what_breaks_it_first_stands_on_top(figures: dict):
-    """The share of its range at which five points are lost rises; clean sweeps are the first of each."""
+    """The share of its range at which five points are lost rises; clean sweeps are the first of
+    each."""
     rows = figures["corruptions"]
-    reach = [np.inf if row["falls"] is None else row["falls"] / row["severities"][-1] for row in rows]
+    reach = [
+        np.inf if row["falls"] is None else row["falls"] / row["severities"][-1] for row in rows
+    ]
     assert reach == sorted(reach)
     assert len({row["right"][0] for row in rows}) == 1
-    assert all(r + w <= row["total"] for row in rows for r, w in zip(row["right"], row["wrong"], strict=True))
+    assert all(
+        r + w <= row["total"]
+        for row in rows
+        for r, w in zip(row["right"], row["wrong"], strict=True)
+    )
     assert {"noise", "dead", "lost", "hum"} <= {row["name"] for row in rows}
 
 
 def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
-    """Headline, a row for each material and corruption; whole tags, no raw braces, nothing from elsewhere."""
+    """Headline, a row for each material and corruption; whole tags, no raw braces, nothing from
+    elsewhere."""
     reader = PageReader(bundle_report.page(figures, sweeps))
     assert (reader.open, reader.wrong) == ([], [])
     assert all(link.startswith(("#", "data:")) for link in reader.links)
@@ -95,9 +117,11 @@ def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
 def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
     """The foreign one has its table; with more than twelve labels the matrix is left out."""
     many = figures | {
-        "labels": [f"m{i}" for i in range(13)], "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
-        "set": "mine.npz", "recordings": {"right": 3, "total": 4},
-    }  # fmt: skip
+        "labels": [f"m{i}" for i in range(13)],
+        "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
+        "set": "mine.npz",
+        "recordings": {"right": 3, "total": 4},
+    }
     plain = PageReader(bundle_report.page(many, sweeps)).text
     assert "felt 8 7 1" in plain
     assert "materials by the labels that they get" not in plain
@@ -114,27 +138,43 @@ def test_windows_too_short_for_a_spectrogram_say_so(figures: dict, sweeps: Datas
 
 
 def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
-    """Right, wrong and not named add up to all sweeps; the worst material, the first thing to break it, errors, cost."""
+    """Right, wrong and not named add up to all sweeps; the worst material, the first thing to break
+    it, errors, cost."""
     named = figures["named"]
     assert named["right"] + named["wrong"] + named["not_named"] == named["n"] == len(sweeps)
     missed = figures | {
         "named": {"n": 20, "right": 15, "wrong": 3, "not_named": 2, "unknown": [0.1, 0.0, 0.3]},
-        "materials": [row | {"recall": [0.25, 0.1, 0.5] if row["name"] == "wood" else [1.0, 0.9, 1.0]} for row in figures["materials"]],
+        "materials": [
+            row | {"recall": [0.25, 0.1, 0.5] if row["name"] == "wood" else [1.0, 0.9, 1.0]}
+            for row in figures["materials"]
+        ],
         "foreign_named": [0.75, 0.5, 0.9],
-    }  # fmt: skip
+    }
     text = PageReader(bundle_report.page(missed, sweeps)).text
-    for line in ("named rightly 75.0 %, 15 of 20", "named wrongly 15.0 %, 3 of 20", "refused) 10.0 %, 2 of 20",
-                 "least often: wood 25.0 % [10.0, 50.0]", "yet it names them 75.0 % [50.0, 90.0]",
-                 "Of the sweeps of its own materials it calls 10.0 % [0.0, 30.0] unknown"):  # fmt: skip
+    for line in (
+        "named rightly 75.0 %, 15 of 20",
+        "named wrongly 15.0 %, 3 of 20",
+        "refused) 10.0 %, 2 of 20",
+        "least often: wood 25.0 % [10.0, 50.0]",
+        "yet it names them 75.0 % [50.0, 90.0]",
+        "Of the sweeps of its own materials it calls 10.0 % [0.0, 30.0] unknown",
+    ):
         assert line in text, line
 
 
-def test_what_the_bundle_calls_a_foreign_material_is_counted(sweeps: Dataset, default_bundle: Bundle):
-    """Six sweeps of felt, four of which get a label: two thirds; wrong and silent answers to its own are told apart."""
+def test_what_the_bundle_calls_a_foreign_material_is_counted(
+    sweeps: Dataset, default_bundle: Bundle
+):
+    """Six sweeps of felt, four of which get a label: two thirds; wrong and silent answers to its
+    own are told apart."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     answered = {"wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 2})}
-    mixed = replace(found, answered=answered, right=np.arange(11) < 5,
-                    foreign={"felt": Counter({"metal": 3, "wood": 1, "(unknown)": 2})})  # fmt: skip
+    mixed = replace(
+        found,
+        answered=answered,
+        right=np.arange(11) < 5,
+        foreign={"felt": Counter({"metal": 3, "wood": 1, "(unknown)": 2})},
+    )
     assert bundle_experiment.foreign_named(mixed)[0] == pytest.approx(4 / 6)
     assert bundle_experiment.foreign_named(found) == []
     named = bundle_experiment.named(sweeps.take(np.arange(11)), mixed)
@@ -158,7 +198,10 @@ def test_the_command_writes_page_and_figures(
     named = ["report", str(bundle.DEFAULT), "--set", "sim:T-REAL:1021:1", "--only", "position<=2"]
     assert main([*named, "--out", "/proc/none/report.html"]) != 0
     assert "cannot be written" in capsys.readouterr().err
-    assert main([*named, "--out", str(tmp_path / "report.html"), "--json", str(tmp_path / "f.json")]) == 0
+    assert (
+        main([*named, "--out", str(tmp_path / "report.html"), "--json", str(tmp_path / "f.json")])
+        == 0
+    )
     text = (tmp_path / "report.html").read_text()
     assert "<h2>What it will be bad at</h2>" in text
     assert "name the sweeps that it was fitted to with <code>--train</code>" in text

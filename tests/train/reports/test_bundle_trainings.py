@@ -1,4 +1,5 @@
-"""What a report needs trainings for: the points of the learning curve, materials left out, and how sets are brought together."""
+"""What a report needs trainings for: the points of the learning curve, materials left out, and how
+sets are brought together."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def where(folder: Path) -> Where:
 
 @pytest.mark.slow
 def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
-    """Points at 5 and 10 of each material, the last of all 16; each tests all sweeps; more training is no worse here."""
+    """Points at 5 and 10 of each material, the last of all 16; each tests all sweeps; more training
+    is no worse here."""
     made = {"method": "static-svm"}
     test = easy(30, seed=5)
     found = bundle_trainings.run(made, easy(16), test, where(tmp_path), NOTHING)
@@ -44,7 +46,8 @@ def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
 
 @pytest.mark.slow
 def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
-    """The default recipe: a share that gets a known name, a share of known ones kept, for each material."""
+    """The default recipe: a share that gets a known name, a share of known ones kept, for each
+    material."""
     train, test = tones(10), tones(4, noise=1.5)
     found = bundle_trainings.run({"chosen": "filters"}, train, test, where(tmp_path), NOTHING)
     assert set(found["left_out"]["materials"]) == {"a", "b", "c"}
@@ -57,17 +60,22 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
 def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
     """A fit of a size of its own: the reason stands in place of the figures."""
     found = bundle_trainings.run({}, easy(4), easy(4), where(tmp_path), NOTHING)
-    assert found == {"why_not": "the bundle was fitted with settings of its own, which no method has"}
+    assert found == {
+        "why_not": "the bundle was fitted with settings of its own, which no method has"
+    }
 
 
 def test_materials_are_matched_by_name():
-    """Another order of materials, one more, one less: labels mean the same, what is foreign is left out; formats must fit."""
+    """Another order of materials, one more, one less: labels mean the same, what is foreign is left
+    out; formats must fit."""
     train, other = easy(4), easy(6)
     mixed = replace(other, materials=("high", "felt", "low"))
     found = bundle_trainings.aligned(mixed, train)
     assert found.materials == train.materials
     assert len(found) == 12
-    assert [train.materials[k] for k in found.labels] == [mixed.materials[k] for k in mixed.labels if k != 1]
+    assert [train.materials[k] for k in found.labels] == [
+        mixed.materials[k] for k in mixed.labels if k != 1
+    ]
     with pytest.raises(FormatError, match="name sets of one form"):
         bundle_trainings.aligned(tones(), train)
 
@@ -78,30 +86,74 @@ def test_a_fit_gives_back_all_its_sweeps():
     made = recipe.fit(whole, 1, recipe.Settings(0), NOTHING)
     again = bundle_trainings.whole(made)
     assert len(again) == len(whole)
-    np.testing.assert_array_equal(np.sort(again.group("recording")), np.sort(whole.group("recording")))
+    np.testing.assert_array_equal(
+        np.sort(again.group("recording")), np.sort(whole.group("recording"))
+    )
     assert again.materials == whole.materials
 
 
 def figures(curve: list[dict]) -> dict:
     """What a page needs, of no sweep at all, with this curve."""
     return {
-        "bundle": {"name": "b", "version": "1", "id": "0"}, "set": "s.npz", "digest": "d", "sweeps": 6, "labels": ["low", "middle"],
-        "named_rightly": {"right": 5, "total": 6, "interval": [0.4, 1.0]}, "interval_by": "", "statuses": {"ok": 6},
-        "unsure_right": 0, "answers": {}, "not_in_the_bundle": {}, "format": "f", "made": {"set": "t.npz", "seed": 1, "commit": "c"},
-        "figures": {}, "fitted_to_this": False, "tells_unknown": True, "groups": {"position": 2}, "foreign_named": [],
+        "bundle": {"name": "b", "version": "1", "id": "0"},
+        "set": "s.npz",
+        "digest": "d",
+        "sweeps": 6,
+        "labels": ["low", "middle"],
+        "named_rightly": {"right": 5, "total": 6, "interval": [0.4, 1.0]},
+        "interval_by": "",
+        "statuses": {"ok": 6},
+        "unsure_right": 0,
+        "answers": {},
+        "not_in_the_bundle": {},
+        "format": "f",
+        "made": {"set": "t.npz", "seed": 1, "commit": "c"},
+        "figures": {},
+        "fitted_to_this": False,
+        "tells_unknown": True,
+        "groups": {"position": 2},
+        "foreign_named": [],
         "named": {"n": 6, "right": 5, "wrong": 1, "not_named": 0, "unknown": [0.0, 0.0, 0.4]},
-        "materials": [{"name": "low", "sweeps": 6, "recall": [5 / 6, 0.4, 1.0], "precision": [], "unsure": 0, "unknown": 0,
-                       "refused": 0, "taken_for": []}],
-        "calibration": {"n": 6, "error": 0.1, "bins": [{"said": 0.9, "right": 0.8, "n": 6}]}, "corruptions": [],
-        "cost": {"ms": 1.0, "ms_p99": 2.0, "kb": 3.0, "mib": 4.0}, "commit": "c", "machine": "m", "command": "palpate-train report",
-        "curve": curve, "trained": {"method": "default", "set": "t.npz", "sweeps": 60, "effort": 1.0},
-        "left_out": {"materials": {"low": {"auroc": 0.9, "low": 0.8, "high": 1.0, "kept": 0.95, "false_known": 0.25, "known": 9, "unknown": 4}},
-                     "mean": {"auroc": 0.9, "kept": 0.95, "false_known": 0.25}},
-    }  # fmt: skip
+        "materials": [
+            {
+                "name": "low",
+                "sweeps": 6,
+                "recall": [5 / 6, 0.4, 1.0],
+                "precision": [],
+                "unsure": 0,
+                "unknown": 0,
+                "refused": 0,
+                "taken_for": [],
+            }
+        ],
+        "calibration": {"n": 6, "error": 0.1, "bins": [{"said": 0.9, "right": 0.8, "n": 6}]},
+        "corruptions": [],
+        "cost": {"ms": 1.0, "ms_p99": 2.0, "kb": 3.0, "mib": 4.0},
+        "commit": "c",
+        "machine": "m",
+        "command": "palpate-train report",
+        "curve": curve,
+        "trained": {"method": "default", "set": "t.npz", "sweeps": 60, "effort": 1.0},
+        "left_out": {
+            "materials": {
+                "low": {
+                    "auroc": 0.9,
+                    "low": 0.8,
+                    "high": 1.0,
+                    "kept": 0.95,
+                    "false_known": 0.25,
+                    "known": 9,
+                    "unknown": 4,
+                }
+            },
+            "mean": {"auroc": 0.9, "kept": 0.95, "false_known": 0.25},
+        },
+    }
 
 
 def test_the_page_shows_the_curve_and_materials_left_out():
-    """Each point in words, the picture with a name for each axis, the material in its table and in the headline."""
+    """Each point in words, the picture with a name for each axis, the material in its table and in
+    the headline."""
     points = [
         {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
         {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
@@ -129,14 +181,44 @@ def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: in
 
 
 @pytest.mark.slow
-def test_the_report_of_a_fit_is_that_of_its_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """From fit to page in two commands, the second named by the first; with a curve, since a fit holds its sweeps."""
+def test_the_report_of_a_fit_is_that_of_its_bundle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """From fit to page in two commands, the second named by the first; with a curve, since a fit
+    holds its sweeps."""
     tones(12).save(tmp_path / "t.npz")
     fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
-    assert main(["fit", "--set", str(tmp_path / "t.npz"), "--seed", "1", "--steps", "0", "--out", str(fit)]) == 0
-    assert f"palpate-train report {fit} --set SET --out report.html" in capsys.readouterr().out.splitlines()[-1]
+    assert (
+        main(
+            [
+                "fit",
+                "--set",
+                str(tmp_path / "t.npz"),
+                "--seed",
+                "1",
+                "--steps",
+                "0",
+                "--out",
+                str(fit),
+            ]
+        )
+        == 0
+    )
+    assert (
+        f"palpate-train report {fit} --set SET --out report.html"
+        in capsys.readouterr().out.splitlines()[-1]
+    )
     tones(4, noise=1.5).save(tmp_path / "test.npz")
-    named = ["report", str(fit), "--set", str(tmp_path / "test.npz"), "--out", str(page), "--jobs", "1"]
+    named = [
+        "report",
+        str(fit),
+        "--set",
+        str(tmp_path / "test.npz"),
+        "--out",
+        str(page),
+        "--jobs",
+        "1",
+    ]
     assert main([*named, "--cache", str(tmp_path / "cache")]) == 0
     text = PageReader(page.read_text()).text
     assert "mine 1: what it answers" in text
@@ -151,4 +233,6 @@ def test_sets_for_training_must_have_the_form_of_the_bundle():
     """A set of another skin is refused before anything is trained."""
     other: Dataset = tones()
     with pytest.raises(FormatError, match=r"easy is of .*, tones of .*; name sets of one form"):
-        bundle_trainings.run({"method": "static-svm"}, easy(4), other, Where(jobs=1, cache=None), NOTHING)
+        bundle_trainings.run(
+            {"method": "static-svm"}, easy(4), other, Where(jobs=1, cache=None), NOTHING
+        )

@@ -1,4 +1,5 @@
-"""The interactive chart in a headless browser: every control works, and no request leaves the page."""
+"""The interactive chart in a headless browser: every control works, and no request leaves the
+page."""
 
 from __future__ import annotations
 
@@ -42,14 +43,19 @@ class BrowsedChart:
 
     def places(self) -> dict[int, tuple[float, float]]:
         """Where each dot that is shown stands, by its number."""
-        return {int(i): (x, y) for i, x, y in self.page.evaluate("""() => [...document.querySelectorAll('.dot')]
+        return {
+            int(i): (x, y)
+            for i, x, y in self.page.evaluate("""() => [...document.querySelectorAll('.dot')]
             .filter((d) => d.style.display !== 'none').map((d) => {
-                const m = new DOMMatrix(d.style.transform); return [d.dataset.i, m.e, m.f]; })""")}  # fmt: skip
+                const m = new DOMMatrix(d.style.transform); return [d.dataset.i, m.e, m.f]; })""")
+        }
 
     def best(self) -> list[int]:
         """Numbers of the dots on the front, from the left."""
         there = self.places()
-        marked = self.page.eval_on_selector_all(".dot.best", "all => all.map((d) => Number(d.dataset.i))")
+        marked = self.page.eval_on_selector_all(
+            ".dot.best", "all => all.map((d) => Number(d.dataset.i))"
+        )
         return sorted((i for i in marked if i in there), key=lambda i: there[i])
 
     def stairs(self) -> str:
@@ -67,7 +73,8 @@ class BrowsedChart:
 
 @pytest.fixture
 def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
-    """The page on a desktop; nothing may appear on the console, and nothing but the file may be requested."""
+    """The page on a desktop; nothing may appear on the console, and nothing but the file may be
+    requested."""
     context = browser.new_context(viewport={"width": 1000, "height": 800}, reduced_motion="reduce")
     one = BrowsedChart(context.new_page(), file)
     yield one.open()
@@ -77,7 +84,8 @@ def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
 
 
 def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
-    """Each network once, as Python found it: further right is dearer, further up more accurate; the still picture gives way."""
+    """Each network once, as Python found it: further right is dearer, further up more accurate; the
+    still picture gives way."""
     there = seen.places()
     assert sorted(there, key=lambda i: there[i]) == SHOWN
     assert seen.best() == FRONT["speed"]
@@ -102,11 +110,20 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, 
 
 
 def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
-    """Near a dot its name is shown, with its interval and what beats it; away from all dots nothing is."""
+    """Near a dot its name is shown, with its interval and what beats it; away from all dots nothing
+    is."""
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
     seen.page.mouse.move(frame["x"] + x + 6, frame["y"] + y + 6)
-    for text in ("H, SVM", "H-svm float", "L and H", "93.0 %", "91.0 – 95.0 %", "0.5 ms", "behind Palpate, as shipped"):
+    for text in (
+        "H, SVM",
+        "H-svm float",
+        "L and H",
+        "93.0 %",
+        "91.0 – 95.0 %",
+        "0.5 ms",
+        "behind Palpate, as shipped",
+    ):
         assert text in seen.tip()
     seen.page.mouse.move(frame["x"] + 60, frame["y"] + 20)
     assert seen.tip() == ""
@@ -114,7 +131,9 @@ def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
 
 def test_a_tap_names_a_dot_on_a_phone(browser: Any, file: str):
     """The tip is there after a tap and inside the picture."""
-    context = browser.new_context(viewport={"width": 360, "height": 700}, has_touch=True, reduced_motion="reduce")
+    context = browser.new_context(
+        viewport={"width": 360, "height": 700}, has_touch=True, reduced_motion="reduce"
+    )
     seen = BrowsedChart(context.new_page(), file).open()
     seen.page.evaluate("document.getElementById('plot').scrollIntoView()")
     for i, (x, y) in seen.places().items():
@@ -147,9 +166,12 @@ def test_nothing_left_is_no_trouble(seen: BrowsedChart):
 
 
 def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
-    """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one; errors by their root, or not."""
+    """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one;
+    errors by their root, or not."""
     ratio = lambda there: (there[3][0] - there[2][0]) / (there[6][0] - there[3][0])  # noqa: E731
-    assert ratio(seen.places()) == pytest.approx(np.log(12.5) / np.log(18), rel=0.01)  # .04 to .5 to 9 ms
+    assert ratio(seen.places()) == pytest.approx(
+        np.log(12.5) / np.log(18), rel=0.01
+    )  # .04 to .5 to 9 ms
     seen.page.uncheck("#xlog")
     assert ratio(seen.places()) == pytest.approx(0.46 / 8.5, rel=0.01)
     rise = lambda there: (there[4][1] - there[0][1]) / (there[0][1] - there[2][1])  # noqa: E731
@@ -160,7 +182,8 @@ def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
 
 
 def test_the_choice_is_in_the_address(seen: BrowsedChart):
-    """A choice is in the address, and opening that address restores it; values that do not exist are ignored."""
+    """A choice is in the address, and opening that address restores it; values that do not exist
+    are ignored."""
     seen.page.select_option("#x", "macs")
     seen.page.select_option("#y", "lopo")
     seen.page.uncheck("#xlog")
@@ -234,7 +257,8 @@ def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
 @pytest.mark.parametrize("width", [360, 800])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: str):
-    """No sideways scrolling, by day and by night; the plot is as wide as the page; names stay inside it."""
+    """No sideways scrolling, by day and by night; the plot is as wide as the page; names stay
+    inside it."""
     context = browser.new_context(
         viewport={"width": width, "height": 700}, color_scheme=scheme, reduced_motion="reduce"
     )
@@ -246,7 +270,9 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
         box = name.bounding_box()
         assert box["x"] >= frame["x"]
         assert box["x"] + box["width"] <= frame["x"] + frame["width"] + 1
-    light = page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")
+    light = page.evaluate(
+        "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)"
+    )
     assert (sum(light) > 600) == (scheme == "light")
     page.set_viewport_size({"width": 500, "height": 700})
     page.wait_for_function("document.querySelector('#plot svg').viewBox.baseVal.width < 500")
@@ -254,7 +280,8 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
 
 
 def test_what_the_box_ships_stands_out(seen: BrowsedChart):
-    """It alone has a ring; its whole name stands at it, the others of ours have theirs without saying that they are ours."""
+    """It alone has a ring; its whole name stands at it, the others of ours have theirs without
+    saying that they are ours."""
     ringed = seen.page.eval_on_selector_all(
         ".dot",
         "all => all.filter((d) => getComputedStyle(d.querySelector('.ship')).stroke !== 'none').map((d) => Number(d.dataset.i))",
@@ -278,11 +305,17 @@ def test_a_network_in_both_precisions_has_an_arrow(seen: BrowsedChart):
 
 
 def test_the_axis_goes_to_all_and_shows_where_guessing_is(seen: BrowsedChart):
-    """100 % is its last tick, the line of chance stands at 1/7, and the most accurate have ticks around them."""
-    ticks = [text.removesuffix(" %") for text in seen.page.locator("#grid text[text-anchor=end]").all_text_contents()]
+    """100 % is its last tick, the line of chance stands at 1/7, and the most accurate have ticks
+    around them."""
+    ticks = [
+        text.removesuffix(" %")
+        for text in seen.page.locator("#grid text[text-anchor=end]").all_text_contents()
+    ]
     assert {"90", "95", "99", "100"} < set(ticks)
     assert "guessing: 14.3" in " ".join(ticks)
-    line, last = (seen.page.locator(f"#grid {which}").last for which in (".chance", "line:not(.chance)"))
+    line, last = (
+        seen.page.locator(f"#grid {which}").last for which in (".chance", "line:not(.chance)")
+    )
     assert float(line.get_attribute("y1")) > max(y for _, y in seen.places().values())
     assert float(last.get_attribute("y1")) < min(y for _, y in seen.places().values())
 
@@ -290,7 +323,9 @@ def test_the_axis_goes_to_all_and_shows_where_guessing_is(seen: BrowsedChart):
 def test_large_files_are_told_in_megabytes(seen: BrowsedChart):
     """50,000 KB are 50 MB, on the axis and in the table; nothing is "k KB"."""
     seen.page.select_option("#x", "file_kb")
-    texts = " ".join([*seen.page.locator("#grid text").all_text_contents(), seen.page.inner_text("#table")])
+    texts = " ".join(
+        [*seen.page.locator("#grid text").all_text_contents(), seen.page.inner_text("#table")]
+    )
     assert "50 MB" in texts
     assert "10 MB" in texts
     assert "k KB" not in texts
@@ -304,7 +339,8 @@ def test_what_was_not_measured_so_stands_last(seen: BrowsedChart):
 
 
 def test_all_figures_can_be_had(seen: BrowsedChart):
-    """As the file beside the page, and as a sheet that the page holds itself: a line for each form, shares from 0 to 1."""
+    """As the file beside the page, and as a sheet that the page holds itself: a line for each form,
+    shares from 0 to 1."""
     assert seen.page.get_attribute("a[download]:not([href^=data])", "href") == "chart.json"
     assert (Path(urlparse(seen.address).path).parent / "chart.json").exists()
     with seen.page.expect_download() as sheet:

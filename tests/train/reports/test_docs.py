@@ -1,4 +1,5 @@
-"""The pages under docs/ as their readers have them: each is in the list of `reports`, has its header, and can be read."""
+"""The pages under docs/ as their readers have them: each is in the list of `reports`, has its
+header, and can be read."""
 
 from __future__ import annotations
 
@@ -32,15 +33,24 @@ def name(path: Path) -> str:
 def tells_of_a_default(figures: Any) -> bool:
     """Whether figures are of methods or of a bundle, wherever they say so."""
     if isinstance(figures, dict):
-        return bool(METHODS & figures.keys()) or "bundle" in figures or any(map(tells_of_a_default, figures.values()))
+        return (
+            bool(METHODS & figures.keys())
+            or "bundle" in figures
+            or any(map(tells_of_a_default, figures.values()))
+        )
     return isinstance(figures, list) and any(map(tells_of_a_default, figures))
 
 
 def test_every_page_and_every_result_that_tells_of_a_default_is_listed():
-    """What lies under docs/ is found, not listed: a page that `reports` does not know would grow stale unseen."""
-    folders = {(DOCS / page.file).parent for page in docs_pages.PAGES if page.file.endswith(".html")}
+    """What lies under docs/ is found, not listed: a page that `reports` does not know would grow
+    stale unseen."""
+    folders = {
+        (DOCS / page.file).parent for page in docs_pages.PAGES if page.file.endswith(".html")
+    }
     assert [name(path) for path in HTML if path.parent not in folders] == []
-    results = [path for path in DOCS.rglob("*.json") if tells_of_a_default(json.loads(path.read_bytes()))]
+    results = [
+        path for path in DOCS.rglob("*.json") if tells_of_a_default(json.loads(path.read_bytes()))
+    ]
     assert len(results) >= 5
     listed = {CURVE, *(DOCS / page.results for page in docs_pages.PAGES)}
     assert [name(path) for path in results if path not in listed] == []
@@ -48,21 +58,28 @@ def test_every_page_and_every_result_that_tells_of_a_default_is_listed():
 
 @pytest.mark.parametrize("page", docs_pages.PAGES, ids=lambda page: page.name)
 def test_a_page_shows_its_results_and_says_first_if_they_are_older(page: DocsPage):
-    """Its header is that of the file beside it: commit, sets, seeds; where the default was another one, the first line
-    behind the title says so."""
+    """Its header is that of the file beside it: commit, sets, seeds; where the default was another
+    one, the first line behind the title says so."""
     shown = provenance.read(DOCS / page.results)
     assert shown.commit
     beside = HTML if page.file.endswith(".html") else []
-    for path in {DOCS / page.file, *(other for other in beside if other.parent == (DOCS / page.file).parent)}:
+    for path in {
+        DOCS / page.file,
+        *(other for other in beside if other.parent == (DOCS / page.file).parent),
+    }:
         assert provenance.read(path) == shown, path
         if path.suffix == ".html":
             first = re.search(r"</h1>\s*(?:<p[^>]*>(.*?)</p>)?", path.read_text(), re.DOTALL)
-            assert shown.older in (first[1] or ""), f"{path}: palpate-train reports, or reports --draw"
+            assert shown.older in (first[1] or ""), (
+                f"{path}: palpate-train reports, or reports --draw"
+            )
         elif path.suffix == ".md":
             assert f" -->\n> **{shown.older}**\n" in path.read_text() or not shown.older
 
 
-@pytest.mark.parametrize("page", [page for page in docs_pages.PAGES if "/" in page.file], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in docs_pages.PAGES if "/" in page.file], ids=lambda page: page.name
+)
 def test_a_page_and_its_pictures_are_of_the_same_run(page: DocsPage):
     """Every picture in its folder has the header of its results."""
     pictures = [path for path in SVG if path.parent == (DOCS / page.file).parent]
@@ -71,7 +88,8 @@ def test_a_page_and_its_pictures_are_of_the_same_run(page: DocsPage):
 
 @pytest.mark.parametrize("path", HTML, ids=name)
 def test_a_page_leads_home_and_has_its_pictures_beside_it(path: Path):
-    """To README, which is there; for those who see no HTML a README.md in its folder shows a picture and names the page."""
+    """To README, which is there; for those who see no HTML a README.md in its folder shows a
+    picture and names the page."""
     assert f'<nav><a href="{html.HOME}">' in path.read_text()
     assert (path.parent / html.HOME).resolve() == ROOT / "README.md"
     beside = (path.parent / "README.md").read_text()
@@ -84,8 +102,9 @@ def test_a_page_leads_home_and_has_its_pictures_beside_it(path: Path):
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 @pytest.mark.parametrize("path", HTML, ids=name)
 def test_a_page_can_be_read(browser: Any, path: Path, width: int, scheme: str):
-    """On a phone, a tablet and a desk, by day and by night: no column or text is cut off, every axis has a title, contrast
-    is 4.5 at least, tables have heads and take the focus where they scroll, and no brace was left."""
+    """On a phone, a tablet and a desk, by day and by night: no column or text is cut off, every
+    axis has a title, contrast is 4.5 at least, tables have heads and take the focus where they
+    scroll, and no brace was left."""
     assert rendered.faults(browser, rendered.address(path), width, scheme) == {}
 
 
@@ -115,5 +134,10 @@ def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, path: P
 @pytest.mark.parametrize("path", MARKDOWN, ids=name)
 def test_no_brace_was_left_in_a_text(path: Path):
     """Outside of code no {name} stands where a value belongs."""
-    text = re.sub(r"^```.*?^```|^ {4}.*?$|`[^`]*`|<!--.*?-->", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(
+        r"^```.*?^```|^ {4}.*?$|`[^`]*`|<!--.*?-->",
+        "",
+        path.read_text(),
+        flags=re.DOTALL | re.MULTILINE,
+    )
     assert re.findall(r"\{[a-z_]*\}", text) == []

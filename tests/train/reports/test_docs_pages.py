@@ -1,4 +1,5 @@
-"""`palpate-train reports`: which pages are stale and why, what is run for them, and what happens where one fails."""
+"""`palpate-train reports`: which pages are stale and why, what is run for them, and what happens
+where one fails."""
 
 from __future__ import annotations
 
@@ -15,7 +16,13 @@ from train.metrics import score
 from train.reports import docs_pages, html, provenance
 from train.reports.docs_pages import DocsPage
 
-TODAY: dict[str, Any] = {"method": "default", "seed": 1, "set": "sim:T-REAL:1", "commit": "abc", "date": "2026-11-22"}
+TODAY: dict[str, Any] = {
+    "method": "default",
+    "seed": 1,
+    "set": "sim:T-REAL:1",
+    "commit": "abc",
+    "date": "2026-11-22",
+}
 NEED = "a thing that is not here"
 
 
@@ -26,15 +33,30 @@ def today() -> dict[str, Any]:
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project with four pages: of today, older, never made, and one that needs what is not here."""
+    """A project with four pages: of today, older, never made, and one that needs what is not
+    here."""
     (tmp_path / "README.md").write_text("# Project\n")
     for name, results in (("current", today()), ("older", TODAY | {"shipped": "0badbead"})):
         lay(tmp_path / "docs" / name, results, results)
     monkeypatch.setitem(docs_pages.NEEDS, NEED, lambda: False)
     pages = [
-        DocsPage("older", "older/index.html", "older/results.json", ("train", "older"), folds=True, drawn=True),
-        DocsPage("current", "current/index.html", "current/results.json", ("train", "current", "--out", "x")),
-        DocsPage("lacking", "lacking/index.html", "lacking/results.json", ("tests.lacking",), (NEED,)),
+        DocsPage(
+            "older",
+            "older/index.html",
+            "older/results.json",
+            ("train", "older"),
+            folds=True,
+            drawn=True,
+        ),
+        DocsPage(
+            "current",
+            "current/index.html",
+            "current/results.json",
+            ("train", "current", "--out", "x"),
+        ),
+        DocsPage(
+            "lacking", "lacking/index.html", "lacking/results.json", ("tests.lacking",), (NEED,)
+        ),
         DocsPage("new", "new/index.html", "new/results.json", ("appliance", "new")),
     ]
     monkeypatch.setattr(docs_pages, "PAGES", tuple(pages))
@@ -50,7 +72,8 @@ def lay(folder: Path, results: dict[str, Any], shown: dict[str, Any]) -> None:
 
 
 class RunCommands:
-    """Takes down which commands are run, and makes no page; `codes` are their exit codes, 0 where none is given."""
+    """Takes down which commands are run, and makes no page; `codes` are their exit codes, 0 where
+    none is given."""
 
     def __init__(self, **codes: int) -> None:
         self.words: list[list[str]] = []
@@ -63,7 +86,8 @@ class RunCommands:
 
 
 def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.CaptureFixture[str]):
-    """Each page with its command as a person types it; what is of today, what is older, what is missing and what it needs."""
+    """Each page with its command as a person types it; what is of today, what is older, what is
+    missing and what it needs."""
     assert main(["reports", "--list"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"older    stale: Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now",
@@ -74,13 +98,14 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
         "         python -m tests.lacking",
         "new      stale: docs/new/index.html: No such file or directory",
         "         palpate new",
-    ]  # fmt: skip
+    ]
     assert main(["reports", "--list", "current"]) == 0
     assert "older" not in capsys.readouterr().out
 
 
 def test_stale_pages_are_made_in_order(project: Path):
-    """The first tells most; what is of today is not made; only commands of folds get the options of where they run."""
+    """The first tells most; what is of today is not made; only commands of folds get the options of
+    where they run."""
     run, lines = RunCommands(), []
     docs_pages.make((), ("--scheduler", "tcp://here"), lines.append, run)
     assert run.words == [["train", "older", "--scheduler", "tcp://here"], ["appliance", "new"]]
@@ -104,9 +129,12 @@ def test_a_named_page_is_made_again_whatever_it_is(project: Path):
 
 
 def test_a_failure_is_named_and_the_others_are_made(project: Path):
-    """All that did not come stands in the error: what failed, and what was named but lacks something."""
+    """All that did not come stands in the error: what failed, and what was named but lacks
+    something."""
     run = RunCommands(older=3)
-    with pytest.raises(FormatError, match="older ended with exit code 3; see above, and run the command again"):
+    with pytest.raises(
+        FormatError, match="older ended with exit code 3; see above, and run the command again"
+    ):
         docs_pages.make((), (), lambda line: None, run)
     assert len(run.words) == 2
     with pytest.raises(FormatError, match="lacking is left out"):
@@ -114,11 +142,14 @@ def test_a_failure_is_named_and_the_others_are_made(project: Path):
 
 
 def test_pages_are_drawn_again_without_measuring(project: Path):
-    """Those that are stale and whose command can do that; the others are named, and so is what fails."""
+    """Those that are stale and whose command can do that; the others are named, and so is what
+    fails."""
     run, lines = RunCommands(), []
     docs_pages.draw((), lines.append, run)
     assert run.words == [["train", "older", "--draw"]]
-    assert lines == [f"{name} is left out: its command has no --draw" for name in ("lacking", "new")]
+    assert lines == [
+        f"{name} is left out: its command has no --draw" for name in ("lacking", "new")
+    ]
     with pytest.raises(FormatError, match="older could not be drawn"):
         docs_pages.draw(("older",), lines.append, RunCommands(older=1))
 
@@ -145,7 +176,9 @@ def test_a_page_that_shows_other_results_is_stale(project: Path):
 
 def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPatch):
     """`python -m` and the words, in the project's folder; its exit code comes back."""
-    (project / "made.py").write_text("import pathlib, sys; pathlib.Path('said').write_text(sys.argv[1]); sys.exit(7)")
+    (project / "made.py").write_text(
+        "import pathlib, sys; pathlib.Path('said').write_text(sys.argv[1]); sys.exit(7)"
+    )
     page = DocsPage("made", "made/index.html", "made/results.json", ("made", "word"))
     monkeypatch.setattr(docs_pages, "PAGES", (page,))
     with pytest.raises(FormatError, match="made ended with exit code 7"):

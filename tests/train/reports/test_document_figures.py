@@ -1,4 +1,5 @@
-"""What README, manual and pages say in figures: it is what the files of results hold, and what is older says so."""
+"""What README, manual and pages say in figures: it is what the files of results hold, and what is
+older says so."""
 
 from __future__ import annotations
 
@@ -46,8 +47,11 @@ def test_all_markers_of_a_document_are_written(name: str):
     assert set(MARKED.findall((ROOT / name).read_text(encoding="utf-8"))) == known
 
 
-def test_the_command_writes_what_has_changed_and_nothing_else(project: Path, capsys: pytest.CaptureFixture[str]):
-    """A changed figure changes its documents, and text beside the markers stays; a second run changes nothing."""
+def test_the_command_writes_what_has_changed_and_nothing_else(
+    project: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A changed figure changes its documents, and text beside the markers stays; a second run
+    changes nothing."""
     results, before = project / document_figures.BENCH, (project / "README.md").read_text()
     figures = json.loads(results.read_bytes())
     figures["rss_mb"]["after_1000"] = 1234.5
@@ -55,7 +59,11 @@ def test_the_command_writes_what_has_changed_and_nothing_else(project: Path, cap
     assert main(["figures"]) == 0
     assert capsys.readouterr().out.split() == ["README.md", "docs/manual.md"]
     after = (project / "README.md").read_text()
-    changed = [pair for pair in zip(before.split("\n"), after.split("\n"), strict=True) if pair[0] != pair[1]]
+    changed = [
+        pair
+        for pair in zip(before.split("\n"), after.split("\n"), strict=True)
+        if pair[0] != pair[1]
+    ]
     assert ["1234.5 MiB" in line for _, line in changed] == [True]
     assert main(["figures"]) == 0
     assert capsys.readouterr().out == ""
@@ -64,15 +72,35 @@ def test_the_command_writes_what_has_changed_and_nothing_else(project: Path, cap
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda root: (root / document_figures.BENCH).unlink(), "docs/bench.json does not hold the figures of 'bench': .*make bench"),
-        (lambda root: (root / document_figures.BENCH).write_text("{"), "docs/bench.json .* run `make bench`"),
-        (lambda root: (root / document_figures.ALIGNMENT).write_text('{"moved": {"rows": []}}'), "place.json .* run `palpate-train alignment"),
-        (lambda root: (root / "README.md").write_text("# no markers"), "README.md has not one pair of markers"),
-        (lambda root: (root / "README.md").write_text("<!-- /bench --><!-- bench --><!-- front --><!-- /front -->"), "one pair"),
-        (lambda root: (root / "README.md").unlink(), "no docs/ and README.md; run this in the project's folder"),
+        (
+            lambda root: (root / document_figures.BENCH).unlink(),
+            "docs/bench.json does not hold the figures of 'bench': .*make bench",
+        ),
+        (
+            lambda root: (root / document_figures.BENCH).write_text("{"),
+            "docs/bench.json .* run `make bench`",
+        ),
+        (
+            lambda root: (root / document_figures.ALIGNMENT).write_text('{"moved": {"rows": []}}'),
+            "place.json .* run `palpate-train alignment",
+        ),
+        (
+            lambda root: (root / "README.md").write_text("# no markers"),
+            "README.md has not one pair of markers",
+        ),
+        (
+            lambda root: (root / "README.md").write_text(
+                "<!-- /bench --><!-- bench --><!-- front --><!-- /front -->"
+            ),
+            "one pair",
+        ),
+        (
+            lambda root: (root / "README.md").unlink(),
+            "no docs/ and README.md; run this in the project's folder",
+        ),
     ],
     ids=["no file", "no JSON", "other JSON", "no markers", "wrong order", "elsewhere"],
-)  # fmt: skip
+)
 def test_what_is_missing_is_named_and_nothing_is_written(
     project: Path, capsys: pytest.CaptureFixture[str], damage: Break, said: str
 ):
@@ -85,7 +113,8 @@ def test_what_is_missing_is_named_and_nothing_is_written(
 
 
 def test_a_picture_of_an_older_default_is_called_so():
-    """Every document that shows one holds its sentence; a picture without a header tells of no default."""
+    """Every document that shows one holds its sentence; a picture without a header tells of no
+    default."""
     for document in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         text = document.read_text(encoding="utf-8")
         for name in PICTURE.findall(text):

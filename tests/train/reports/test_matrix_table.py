@@ -1,4 +1,5 @@
-"""The table of methods beside ours: tests in order, the best of the others, the difference, a verdict; where it goes."""
+"""The table of methods beside ours: tests in order, the best of the others, the difference, a
+verdict; where it goes."""
 
 from __future__ import annotations
 
@@ -12,35 +13,80 @@ from train.cli.main import main
 from train.reports import matrix_table
 
 
-def result(method: str, protocol: str, right: int, means_removed: bool = True, seed: int = 1, classes: int = 2) -> dict:
+def result(
+    method: str,
+    protocol: str,
+    right: int,
+    means_removed: bool = True,
+    seed: int = 1,
+    classes: int = 2,
+) -> dict:
     """One of the list that evaluate writes, of a hundred windows."""
     return {
-        "method": method, "protocol": protocol, "means_removed": means_removed, "seed": seed, "materials": ["a"] * classes,
-        "window": {"right": right, "total": 100}, "interval": [right / 100 - 0.02, right / 100 + 0.02],
-        "recording": {"right": 4, "total": 10}, "recording_interval": [0.31, 0.52],
-    }  # fmt: skip
+        "method": method,
+        "protocol": protocol,
+        "means_removed": means_removed,
+        "seed": seed,
+        "materials": ["a"] * classes,
+        "window": {"right": right, "total": 100},
+        "interval": [right / 100 - 0.02, right / 100 + 0.02],
+        "recording": {"right": 4, "total": 10},
+        "recording_interval": [0.31, 0.52],
+    }
 
 
 def test_each_test_says_whether_ours_is_ahead():
-    """Without means first, more classes first; the best other by name, the difference with an interval, a verdict in words."""
+    """Without means first, more classes first; the best other by name, the difference with an
+    interval, a verdict in words."""
     results = [
-        result("default", "leave:force", 95, means_removed=False), result("static-svm", "leave:force", 98, means_removed=False),
-        result("default", "leave:force", 90), result("minirocket", "leave:force", 80), result("H-svm", "leave:force", 60),
-        result("default", "leave:rep", 70, classes=7), result("default", "leave:rep", 72, seed=2, classes=7),
-        result("minirocket", "leave:rep", 78, classes=7), result("H-svm", "leave:speed", 50),
-    ]  # fmt: skip
-    head, _, *rows = [
-        [cell.strip() for cell in line.strip("|").split("|")] for line in matrix_table.headline(results).splitlines()
+        result("default", "leave:force", 95, means_removed=False),
+        result("static-svm", "leave:force", 98, means_removed=False),
+        result("default", "leave:force", 90),
+        result("minirocket", "leave:force", 80),
+        result("H-svm", "leave:force", 60),
+        result("default", "leave:rep", 70, classes=7),
+        result("default", "leave:rep", 72, seed=2, classes=7),
+        result("minirocket", "leave:rep", 78, classes=7),
+        result("H-svm", "leave:speed", 50),
     ]
-    assert head == ["test", "means", "Palpate, as shipped", "best of the others", "difference, points", "verdict"]
+    head, _, *rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in matrix_table.headline(results).splitlines()
+    ]
+    assert head == [
+        "test",
+        "means",
+        "Palpate, as shipped",
+        "best of the others",
+        "difference, points",
+        "verdict",
+    ]
     assert rows == [
-        ["7 classes: a repetition it never felt", "removed", "71.0 % [69.0, 73.0]", "MiniRocket: 78.0 % [76.0, 80.0]",
-         "−7.0 [−9.8, −4.2]", "falls short"],
-        ["2 classes: a force it never felt", "removed", "90.0 % [88.0, 92.0]", "MiniRocket: 80.0 % [78.0, 82.0]",
-         "+10.0 [+7.2, +12.8]", "ahead"],
-        ["2 classes: a force it never felt", "kept", "95.0 % [93.0, 97.0]", "static-svm: 98.0 % [96.0, 100.0]",
-         "−3.0 [−5.8, −0.2]", "falls short"],
-    ]  # fmt: skip
+        [
+            "7 classes: a repetition it never felt",
+            "removed",
+            "71.0 % [69.0, 73.0]",
+            "MiniRocket: 78.0 % [76.0, 80.0]",
+            "−7.0 [−9.8, −4.2]",
+            "falls short",
+        ],
+        [
+            "2 classes: a force it never felt",
+            "removed",
+            "90.0 % [88.0, 92.0]",
+            "MiniRocket: 80.0 % [78.0, 82.0]",
+            "+10.0 [+7.2, +12.8]",
+            "ahead",
+        ],
+        [
+            "2 classes: a force it never felt",
+            "kept",
+            "95.0 % [93.0, 97.0]",
+            "static-svm: 98.0 % [96.0, 100.0]",
+            "−3.0 [−5.8, −0.2]",
+            "falls short",
+        ],
+    ]
 
 
 def test_ours_alone_has_no_verdict():
@@ -52,7 +98,9 @@ def test_ours_alone_has_no_verdict():
     )
 
 
-def test_the_command_writes_the_table_between_its_markers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_writes_the_table_between_its_markers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """Picture and table; a page without markers is named, and stays as it is."""
     (tmp_path / "r.json").write_text(
         json.dumps([result("default", "leave:force", 90), result("H-svm", "leave:force", 60)])
@@ -71,5 +119,8 @@ def test_the_command_writes_the_table_between_its_markers(tmp_path: Path, capsys
     page.write_text("# Fabrics\n")
     capsys.readouterr()
     assert main([*command, str(page)]) == FormatError.exit_code
-    assert "has not one pair of markers <!-- matrix --> and <!-- /matrix -->" in capsys.readouterr().err
+    assert (
+        "has not one pair of markers <!-- matrix --> and <!-- /matrix -->"
+        in capsys.readouterr().err
+    )
     assert page.read_text() == "# Fabrics\n"

@@ -14,7 +14,8 @@ from train.reports import overview_plot
 
 @pytest.mark.slow
 def test_it_shows_the_verdict_and_every_label():
-    """Each label once with its probability, the winner in the title too; it says that the sweep is simulated."""
+    """Each label once with its probability, the winner in the title too; it says that the sweep is
+    simulated."""
     svg = overview_plot.draw("paper")
     assert "the box answers paper (simulated)" in svg
     shares = [float(share) for share in re.findall(r">([0-9.]+) %<", svg)]

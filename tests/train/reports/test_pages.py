@@ -1,4 +1,5 @@
-"""Pages from templates: each shows every figure of its committed results, escapes what it is given, and needs nothing else."""
+"""Pages from templates: each shows every figure of its committed results, escapes what it is given,
+and needs nothing else."""
 
 from __future__ import annotations
 
@@ -55,7 +56,9 @@ def paper_facts(summary: Any) -> Facts:
     for row in summary["table"]:
         mean, low, high = row["share"]
         yield f"{number(mean)} % {number(low)} – {number(high)} %"
-        ms = "–" if row["ms_p50"] is None else f"{row['ms_p50']:.2f}"  # of a CNN that was followed, not evaluated
+        ms = (
+            "–" if row["ms_p50"] is None else f"{row['ms_p50']:.2f}"
+        )  # of a CNN that was followed, not evaluated
         yield f"{row['right']} / {row['total']} {len(row['worlds'])} {ms}"
     yield from (f"Commit {commit}" for commit in {one["commit"] for one in summary["results"]})
     yield f"On {summary['results'][0]['machine']}"
@@ -75,7 +78,9 @@ def certainty_facts(figures: Any) -> Facts:
     let_through = figures["unknown"]["mean"]["false_known"]
     if let_through > 0.1:
         yield f"Missed: sweeps of unknown materials that get a known name, {number(let_through)} % (wanted ≤ 10 %)"
-    worst, its = max(figures["unknown"]["materials"].items(), key=lambda item: item[1]["false_known"])
+    worst, its = max(
+        figures["unknown"]["materials"].items(), key=lambda item: item[1]["false_known"]
+    )
     yield f"the one most often taken for a known one: {worst}, {number(its['false_known'])} %."
     for p in (p for held in figures["sequence"].values() for p in held["points"] if p["wanted"]):
         yield f"{p['sweeps']:.2f} {three(p['accuracy'], p['low'], p['high'])} {number(p['decided'])} %"
@@ -91,7 +96,9 @@ def certainty_facts(figures: Any) -> Facts:
     before = figures["calibration"]["before"]
     yield f"{three(before['error'], before['low'], before['high'])} as the classifier gives them"
     yield f"{number(figures['early']['share'])} % of the window"
-    yield from (str(figures[name]) for name in ("set", "test", "digest", "commit", "machine", "format"))
+    yield from (
+        str(figures[name]) for name in ("set", "test", "digest", "commit", "machine", "format")
+    )
 
 
 def chart_facts(dots: Any) -> Facts:
@@ -105,9 +112,13 @@ def chart_facts(dots: Any) -> Facts:
 
 
 def stress_facts(result: Any) -> Facts:
-    """Each method, its accuracy at every severity that has a limit, what the box answers there; origin."""
+    """Each method, its accuracy at every severity that has a limit, what the box answers there;
+    origin."""
     curves = {plain_name(name): entry["curves"] for name, entry in result["methods"].items()}
-    curves |= {f"box {answer}": result["box"]["curves"][answer] for answer in ("rightly", "wrongly", "network")}
+    curves |= {
+        f"box {answer}": result["box"]["curves"][answer]
+        for answer in ("rightly", "wrongly", "network")
+    }
     for name, those in curves.items():
         yield name.removeprefix("box ")
         for mean, low, high in at_targets(those).values():
@@ -123,7 +134,8 @@ def soak_facts(records: Any) -> Facts:
         yield name
         yield f"{sums['received']:,}"
         yield from (
-            f"{sums[kind]['n']:,}: {number(sums[kind]['n'] / sums[kind]['of'])} %" for kind in ("right", "wrong")
+            f"{sums[kind]['n']:,}: {number(sums[kind]['n'] / sums[kind]['of'])} %"
+            for kind in ("right", "wrong")
         )
         yield from (what for run in box["runs"] for _, what in run["faults"])
         yield f"{number(sums['cpu'])} %"
@@ -169,16 +181,25 @@ PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
     ),
     "choice": (
         lambda: selection_report.page(choice_data.choice()),
-        lambda: iter([*choice_facts(choice_data.choice()), f"If {SMALL}", "12 % of metal are called plastic <smooth>.",
-                      "480 sweeps of sim:T-REAL:1 (7f7b49c7)", "place 0 1 2 3 4 5 6 7 …; day 1 2.", "noise 0.3 92.7 %,"]),
+        lambda: iter(
+            [
+                *choice_facts(choice_data.choice()),
+                f"If {SMALL}",
+                "12 % of metal are called plastic <smooth>.",
+                "480 sweeps of sim:T-REAL:1 (7f7b49c7)",
+                "place 0 1 2 3 4 5 6 7 …; day 1 2.",
+                "noise 0.3 92.7 %,",
+            ]
+        ),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_shows_every_figure_of_its_results(name: str):
-    """All facts stand in its visible text; no brace, None or nan is left in it; its tags close and no address is in it."""
+    """All facts stand in its visible text; no brace, None or nan is left in it; its tags close and
+    no address is in it."""
     render, facts = PAGES[name]
     page = render()
     read = PageReader(page)
@@ -196,7 +217,8 @@ def test_a_page_shows_every_figure_of_its_results(name: str):
 
 @pytest.mark.slow
 def test_terminal_and_page_say_the_same_of_a_choice():
-    """Every sentence stands in one line of the terminal, with nothing escaped; the table has a line for each model."""
+    """Every sentence stands in one line of the terminal, with nothing escaped; the table has a line
+    for each model."""
     text = selection_report.text(choice_data.choice())
     lines = text.split("\n")
     for fact in choice_facts(choice_data.choice()):
@@ -213,10 +235,18 @@ def test_terminal_and_page_say_the_same_of_a_choice():
 
 def test_a_choice_that_is_not_good_enough_says_so_first():
     """Not reached stands out on the page; nothing smaller or larger, no curves, no budget."""
-    text, page = selection_report.text(choice_data.missed()), selection_report.page(choice_data.missed())
-    for fact in ("compact-1k is the best model here but not good enough", "Not reached: 99 % is wanted, 51.0 % is to be expected",
-                 "Not smaller: nothing cheaper could be tried.", "Not larger: there is no larger model.", "No budget was given.",
-                 "nothing varies in this scene"):  # fmt: skip
+    text, page = (
+        selection_report.text(choice_data.missed()),
+        selection_report.page(choice_data.missed()),
+    )
+    for fact in (
+        "compact-1k is the best model here but not good enough",
+        "Not reached: 99 % is wanted, 51.0 % is to be expected",
+        "Not smaller: nothing cheaper could be tried.",
+        "Not larger: there is no larger model.",
+        "No budget was given.",
+        "nothing varies in this scene",
+    ):
         assert fact in text
         assert fact in PageReader(page).text
     assert '<p class="stop">Not reached' in page
@@ -225,9 +255,12 @@ def test_a_choice_that_is_not_good_enough_says_so_first():
 
 @pytest.mark.slow
 def test_what_a_template_prints_is_escaped(tmp_path: Path):
-    """Names of others cannot become tags; a picture stays what it is; data that is missing is an error."""
+    """Names of others cannot become tags; a picture stays what it is; data that is missing is an
+    error."""
     (tmp_path / "a.html.j2").write_text("<p>{{ name }} {{ picture }} {{ share | percent }}</p>")
-    page = html.render("a.html.j2", tmp_path, name="<b> & c", picture=html.picture("<svg/>"), share=0.5)
+    page = html.render(
+        "a.html.j2", tmp_path, name="<b> & c", picture=html.picture("<svg/>"), share=0.5
+    )
     assert page == "<p>&lt;b&gt; &amp; c <svg/> 50.0\N{NO-BREAK SPACE}%</p>"
     with pytest.raises(jinja2.UndefinedError, match="name"):
         html.render("a.html.j2", tmp_path)
@@ -239,22 +272,42 @@ def test_what_a_template_prints_is_escaped(tmp_path: Path):
 def test_numbers_are_written_for_people():
     """Per cent with a sign, differences in points, durations in the unit that suits them."""
     assert (formatting.percent(0.973), formatting.percent(1, 0)) == ("97.3 %", "100 %")
-    assert [formatting.exact_percent(v) for v in (0.86, 0.923, 0.999, 1)] == ["86 %", "92.3 %", "99.9 %", "100 %"]
+    assert [formatting.exact_percent(v) for v in (0.86, 0.923, 0.999, 1)] == [
+        "86 %",
+        "92.3 %",
+        "99.9 %",
+        "100 %",
+    ]
     assert formatting.estimate([0.864, 0.81, 0.9031]) == "86.4 % [81.0, 90.3]"
     assert formatting.interval((0.81, 0.903), 0) == "81 – 90 %"
     assert [formatting.points(v) for v in (0.023, -0.0041)] == ["2.3", "−0.4"]
     assert [formatting.points(v, sign=True) for v in (0.023, -0.0041)] == ["+2.3", "−0.4"]
     assert formatting.points(-0.0001) == "0.0"
-    assert [formatting.amount(*v) for v in ((0.4009, "ms"), (104.17, "ms"), (950.0, "KB"), (15918.3, "KB"), (1234567.0,))] == [
-        "0.401 ms", "104 ms", "950 KB", "15.9 MB", "1,230,000"]  # fmt: skip
+    assert [
+        formatting.amount(*v)
+        for v in ((0.4009, "ms"), (104.17, "ms"), (950.0, "KB"), (15918.3, "KB"), (1234567.0,))
+    ] == ["0.401 ms", "104 ms", "950 KB", "15.9 MB", "1,230,000"]
     assert [formatting.seconds(v) for v in (0.2468, 31.4, 720)] == ["0.25 s", "31 s", "12 min"]
 
 
 @pytest.mark.slow
 def test_an_installed_wheel_has_the_templates(tmp_path: Path):
     """Every template and script of reports is in the wheel of the desktop."""
-    source = shutil.copytree(ROOT / "train", tmp_path / "train", ignore=shutil.ignore_patterns("build", "*.egg-info"))
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", tmp_path, source]
+    source = shutil.copytree(
+        ROOT / "train", tmp_path / "train", ignore=shutil.ignore_patterns("build", "*.egg-info")
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        tmp_path,
+        source,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")

@@ -1,4 +1,5 @@
-"""The paper's page: which sweeps are fused, how results are counted, what the page shows, and that it needs nothing else."""
+"""The paper's page: which sweeps are fused, how results are counted, what the page shows, and that
+it needs nothing else."""
 
 from __future__ import annotations
 
@@ -23,17 +24,32 @@ FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
 
 
 def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: int = 3) -> Outcome:
-    """Made up: 4 sweeps of each material at each place, `right` of them named right, all others taken for the next."""
+    """Made up: 4 sweeps of each material at each place, `right` of them named right, all others
+    taken for the next."""
     labels = np.tile(np.repeat(np.arange(6), 4), places)
     place = np.repeat(np.arange(places), 24) + 10_000 * world
-    given = np.where(np.random.default_rng(world).random(len(labels)) < right, labels, (labels + 1) % 6)
+    given = np.where(
+        np.random.default_rng(world).random(len(labels)) < right, labels, (labels + 1) % 6
+    )
     confusion = np.zeros((6, 6), int)
     np.add.at(confusion, (labels, given), 1)
-    about = {"part": part, "method": method, "world": world, "materials": list(MATERIALS), "machine": "abacus, 2 cores",
-            "confusion": confusion.tolist(), "fit_s": 1.5, "ms_p50": 0.25, "ran": "7 beads" if "cnn" in method else "",
-            "commit": "c0ffee<", "means_removed": False}  # fmt: skip
+    about = {
+        "part": part,
+        "method": method,
+        "world": world,
+        "materials": list(MATERIALS),
+        "machine": "abacus, 2 cores",
+        "confusion": confusion.tolist(),
+        "fit_s": 1.5,
+        "ms_p50": 0.25,
+        "ran": "7 beads" if "cnn" in method else "",
+        "commit": "c0ffee<",
+        "means_removed": False,
+    }
     costs = [np.array([[1, 1.7], [7, 0.5]])] * 2 if "cnn" in method else []
-    return Outcome(part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, about)
+    return Outcome(
+        part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, about
+    )
 
 
 def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
@@ -46,7 +62,9 @@ def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
     ]
     outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
     more = {"quick": quick}
-    return json.loads(paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | more))
+    return json.loads(
+        paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | more)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +80,19 @@ def made(results: dict[str, Any]) -> tuple[str, dict[str, str]]:
 
 
 def test_printed_numbers_are_the_papers():
-    """One of each figure by hand; rows of the confusion matrix sum to one, rounded; .917 is 55 of 60."""
-    assert [paper_values.ACCURACY[p][m] for p, m in (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"),
-                                                ("hard", "L-knn"))] == [0.96, 0.75, 0.83, 0.58]  # fmt: skip
+    """One of each figure by hand; rows of the confusion matrix sum to one, rounded; .917 is 55 of
+    60."""
+    assert [
+        paper_values.ACCURACY[p][m]
+        for p, m in (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"), ("hard", "L-knn"))
+    ] == [0.96, 0.75, 0.83, 0.58]
     assert round(55 / 60, 3) == paper_values.ACCURACY["hard"]["paper-cnn"]
     assert np.allclose(paper_values.CONFUSION.sum(1), 1, atol=0.011)
 
 
 def test_objects_begin_with_every_sweep_once_and_mix_nothing():
-    """Numbers in a row differ, are of one material and place, and as many as the smallest such group has."""
+    """Numbers in a row differ, are of one material and place, and as many as the smallest such
+    group has."""
     o = outcome("lopo", "H-svm")
     keep = np.arange(len(o.labels)) != 5
     labels, place = o.labels[keep], o.place[keep]
@@ -85,7 +107,8 @@ def test_objects_begin_with_every_sweep_once_and_mix_nothing():
 
 
 def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
-    """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products go beyond it."""
+    """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products
+    go beyond it."""
     o = outcome("lopo", "H-svm", right=1)
     weak = np.arange(len(o.labels)) % 2 == 0
     o.logits[weak] = np.eye(6)[(o.labels[weak] + 1) % 6]
@@ -97,16 +120,20 @@ def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
 
 
 def test_exploration_stops_when_it_is_sure():
-    """Sure sweeps need one; sweeps that know nothing take all four and are right one time in six."""
+    """Sure sweeps need one; sweeps that know nothing take all four and are right one time in
+    six."""
     sure = outcome("lopo", "H-svm", right=1)
     assert [e["sweeps"] for e in paper_experiment.explored([sure])] == [1, 1, 1]
     assert all(e["share"][0] == 1 for e in paper_experiment.explored([sure]))
     sure.logits[:] = 0
-    assert [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])] == [(4, round(1 / 6, 4))] * 3
+    assert [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])] == [
+        (4, round(1 / 6, 4))
+    ] * 3
 
 
 def test_intervals_are_over_places():
-    """Eight places all right or all wrong are no 192 sweeps: the interval is far wider than of independent ones."""
+    """Eight places all right or all wrong are no 192 sweeps: the interval is far wider than of
+    independent ones."""
     place = np.repeat(np.arange(8), 24)
     _, low, high = paper_experiment.estimate(place % 2 == 0, place)
     assert high - low > 0.5
@@ -124,9 +151,15 @@ def test_a_cost_curve_keeps_its_ends_in_few_points():
 
 
 def test_summary_pools_worlds_and_keeps_each_result(results):
-    """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11 confusion rows of 24."""
+    """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11
+    confusion rows of 24."""
     row = next(r for r in results["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
-    assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (144, [1, 2], 0.86, 6)
+    assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (
+        144,
+        [1, 2],
+        0.86,
+        6,
+    )
     assert row["share"][0] == round(row["right"] / 144, 4)
     assert len(results["results"]) == 4 * 6 * 2 + 2
     assert np.sum(results["confusion"]["H-svm"], 1).tolist() == [24] * 6
@@ -134,7 +167,8 @@ def test_summary_pools_worlds_and_keeps_each_result(results):
 
 
 def test_the_page_is_one_file_that_a_phone_can_read(made):
-    """It parses, is as wide as its reader, follows light and dark, names no address, and its tables scroll."""
+    """It parses, is as wide as its reader, follows light and dark, names no address, and its tables
+    scroll."""
     html, pictures = made
     read = PageReader(html)
     assert (read.wrong, read.open) == ([], [])
@@ -147,7 +181,8 @@ def test_the_page_is_one_file_that_a_phone_can_read(made):
 
 
 def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
-    """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed value and difference."""
+    """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed
+    value and difference."""
     html, pictures = made
     assert sorted(pictures) == sorted(FIGURES)
     text = " ".join(PageReader(html).text.split())
@@ -156,7 +191,9 @@ def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
             difference = f"{100 * (row['share'][0] - row['printed']):+.1f}".replace("-", "−")
             low, high = (f"{100 * v:.1f}" for v in row["share"][1:])
             value = f"{100 * row['printed']:.1f}".removesuffix(".0")
-            assert f"{low} – {high} % {value} % {difference} {row['right']} / {row['total']}" in text
+            assert (
+                f"{low} – {high} % {value} % {difference} {row['right']} / {row['total']}" in text
+            )
     for fact in (
         "simulated sweeps",
         "c0ffee<",
@@ -179,7 +216,11 @@ def test_only_a_quick_run_says_that_it_means_nothing(results, made):
 def test_hard_protocols_come_first(made):
     """In the summary, and in the picture of all methods."""
     html, pictures = made
-    assert html.index("T-REAL, leave one position out") < html.index("tested on T-HARD") < html.index("T-LAB, random")
+    assert (
+        html.index("T-REAL, leave one position out")
+        < html.index("tested on T-HARD")
+        < html.index("T-LAB, random")
+    )
     assert pictures["methods"].index(">leave position<") < pictures["methods"].index(">random<")
 
 
@@ -200,14 +241,31 @@ def test_the_network_without_means_is_called_so():
 
 
 def curve(step: int = 400) -> dict[str, Any]:
-    """What cnn_curve has written after some iterations: nine places, of which the last is always taken for the next."""
-    made = {part: outcome(part, "paper-cnn", right=1.0, places=9) for part in paper_experiment.CURVE_PARTS}
+    """What cnn_curve has written after some iterations: nine places, of which the last is always
+    taken for the next."""
+    made = {
+        part: outcome(part, "paper-cnn", right=1.0, places=9)
+        for part in paper_experiment.CURVE_PARTS
+    }
     for one in made.values():
         one.logits[one.place == 10_008] = np.eye(6)[1]
-    newest = {name: {"labels": made[part].labels.tolist(), "position": made[part].place.tolist(),
-                     "logits": made[part].logits.tolist()} for part, name in paper_experiment.CURVE_PARTS.items()}  # fmt: skip
-    points = [{"step": n, "cost": 1 / n, "new confusion": np.eye(6, dtype=int).tolist(), "hard confusion": [[1] * 6] * 6}
-              for n in (25, 50, step)]  # fmt: skip
+    newest = {
+        name: {
+            "labels": made[part].labels.tolist(),
+            "position": made[part].place.tolist(),
+            "logits": made[part].logits.tolist(),
+        }
+        for part, name in paper_experiment.CURVE_PARTS.items()
+    }
+    points = [
+        {
+            "step": n,
+            "cost": 1 / n,
+            "new confusion": np.eye(6, dtype=int).tolist(),
+            "hard confusion": [[1] * 6] * 6,
+        }
+        for n in (25, 50, step)
+    ]
     return {
         "about": ["whole", 1, False],
         "steps": 4000,
@@ -219,12 +277,18 @@ def curve(step: int = 400) -> dict[str, Any]:
 
 
 def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
-    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training beside results.json is refused."""
+    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training beside
+    results.json is refused."""
     (tmp_path / "results.json").write_text(json.dumps(summary(cnn=paper_values.CNNS[1])))
     (tmp_path / paper_experiment.CURVE).write_text(json.dumps(curve()))
     text = " ".join(PageReader(paper_experiment.draw(tmp_path).read_text()).text.split())
-    for fact in ("the CNN (400 of 4000 iterations of 50)", "at iteration 400 of 4000", "Fig. 11: paper-cnn, position",
-                 "Commit c0de: paper-cnn; Commit c0ffee<: all other methods", "Ours ended at 0.0025"):  # fmt: skip
+    for fact in (
+        "the CNN (400 of 4000 iterations of 50)",
+        "at iteration 400 of 4000",
+        "Fig. 11: paper-cnn, position",
+        "Commit c0de: paper-cnn; Commit c0ffee<: all other methods",
+        "Ours ended at 0.0025",
+    ):
         assert fact in text, fact
     taken = json.loads((tmp_path / "results.json").read_text())
     assert [row["ran"] for row in taken["table"] if row["method"] == "paper-cnn"] == [
@@ -232,10 +296,19 @@ def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
     ] * 2
     found = paper_experiment.as_printed(curve(), paper_experiment.FULL)
     (lopo,) = (row for row in found["table"] if row["part"] == "lopo")
-    assert (lopo["right"], lopo["total"], lopo["attachments"][0], lopo["ms_p50"]) == (196, 216, 9, None)
+    assert (lopo["right"], lopo["total"], lopo["attachments"][0], lopo["ms_p50"]) == (
+        196,
+        216,
+        9,
+        None,
+    )
     assert found["several"]["paper-cnn"]["product"][0][0] == lopo["share"][0]
-    (tmp_path / paper_experiment.CURVE).write_text(json.dumps(curve() | {"about": ["small", 1, False]}))
-    with pytest.raises(FormatError, match="is not the CNN as printed; run palpate-train cnn-curve --size whole"):
+    (tmp_path / paper_experiment.CURVE).write_text(
+        json.dumps(curve() | {"about": ["small", 1, False]})
+    )
+    with pytest.raises(
+        FormatError, match="is not the CNN as printed; run palpate-train cnn-curve --size whole"
+    ):
         paper_experiment.draw(tmp_path)
 
 
@@ -252,7 +325,11 @@ def test_some_methods_are_run_again_and_the_others_stay():
     assert len(both["results"]) == len(earlier["results"])
     assert both["several"].keys() == earlier["several"].keys()
     left = paper_experiment.planned(earlier, [Step(("default", "paper-cnn"), ("lopo",), (1,), 1)])
-    assert {row["method"] for row in left["table"]} == left["confusion"].keys() == {"default", "paper-cnn"}
+    assert (
+        {row["method"] for row in left["table"]}
+        == left["confusion"].keys()
+        == {"default", "paper-cnn"}
+    )
     with pytest.raises(FormatError, match="a quick run and a whole one cannot be joined"):
         paper_experiment.joined(new, earlier | {"quick": True})
 
@@ -261,23 +338,30 @@ def test_only_methods_of_the_plan_are_run():
     """Steps without any of them are left out; an unknown one is named."""
     steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["default", "H-svm"])
     assert [step.methods for step in steps] == [("H-svm",), *[("default",)] * 3]
-    with pytest.raises(FormatError, match="method 'quant' is not in the paper's experiment; use some of L-gauss"):
+    with pytest.raises(
+        FormatError, match="method 'quant' is not in the paper's experiment; use some of L-gauss"
+    ):
         paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["quant"])
 
 
 def test_plans_name_methods_and_parts_that_exist():
-    """Full and quick: every step's methods are known, its parts planned, and both hold every kind of figure.
+    """Full and quick: every step's methods are known, its parts planned, and both hold every kind
+    of figure.
 
-    The paper's experiment leaves out the other sizes of our own network, its CNN in the form that is not printed, and
-    what the pages of development sets and the chart compare instead.
+    The paper's experiment leaves out the other sizes of our own network, its CNN in the form that
+    is not printed, and what the pages of development sets and the chart compare instead.
     """
     known = set(paper_experiment.methods.every())
     for parts, steps in (
         (paper_experiment.FULL, paper_experiment.FULL_STEPS),
         (paper_experiment.QUICK, paper_experiment.QUICK_STEPS),
     ):
-        ran = {(part, m + step.means_removed * paper_values.CENTRED) for step in steps for part in step.parts
-               for m in step.methods}  # fmt: skip
+        ran = {
+            (part, m + step.means_removed * paper_values.CENTRED)
+            for step in steps
+            for part in step.parts
+            for m in step.methods
+        }
         left = known ^ {m.removesuffix(paper_values.CENTRED) for _, m in ran}
         newer = {
             "compact",
@@ -288,10 +372,14 @@ def test_plans_name_methods_and_parts_that_exist():
             "lite",
             "edge-spectral",
         }
-        assert left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"} | newer
+        assert (
+            left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"} | newer
+        )
         assert {part for part, _ in ran} == set(parts) == set(paper_report.TITLES)
         cnn = {(p, m) for p in paper_values.ACCURACY for m in paper_values.CNNS}
-        assert {(p, m) for p in paper_values.ACCURACY for m in paper_values.ACCURACY[p]} - cnn <= ran
+        assert {
+            (p, m) for p in paper_values.ACCURACY for m in paper_values.ACCURACY[p]
+        } - cnn <= ran
         assert {
             ("lopo", paper_values.CNNS[1]),
             ("hard", paper_values.CNNS[0]),
@@ -300,8 +388,11 @@ def test_plans_name_methods_and_parts_that_exist():
 
 
 @pytest.mark.slow
-def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives the same figures."""
+def test_run_writes_everything_and_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives
+    the same figures."""
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
     parts = {
         "lopo": PaperPart((real,), "leave:position", 2, one),
@@ -310,13 +401,17 @@ def test_run_writes_everything_and_goes_on_where_it_was(tmp_path: Path, monkeypa
         "random": PaperPart((real,), "random:2", 2, one),
     }
     monkeypatch.setattr(paper_experiment, "QUICK", parts)
-    monkeypatch.setattr(paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),))
+    monkeypatch.setattr(
+        paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),)
+    )
     where, lines = Where(jobs=1, cache=tmp_path / "cache"), []
     made = paper_experiment.run(tmp_path / "a", True, where, lines.append)
     assert made == tmp_path / "a" / "index.html"
     assert 'class="stop"' in made.read_text()
     results = json.loads((tmp_path / "a" / "results.json").read_text())
-    assert {p.stem for p in made.parent.glob("*.svg")} == {f"figure-{n}" for n in (4, 5, 6, 7, 13)} | {"methods"}
+    assert {p.stem for p in made.parent.glob("*.svg")} == {
+        f"figure-{n}" for n in (4, 5, 6, 7, 13)
+    } | {"methods"}
     assert len(results["results"]) == 8
     assert len(lines) == 14
     assert "4/4 random, world 1" in lines[-1]

@@ -27,7 +27,11 @@ def drawn(draw: Draw, plain: bool = False) -> str:
 
 def titles(svg: str) -> list[str | None]:
     """The titles of the axes with numbers."""
-    return [found for node in ElementTree.fromstring(svg).iter() if (found := node.get("data-axis")) is not None]
+    return [
+        found
+        for node in ElementTree.fromstring(svg).iter()
+        if (found := node.get("data-axis")) is not None
+    ]
 
 
 @pytest.mark.parametrize(
@@ -35,14 +39,29 @@ def titles(svg: str) -> list[str | None]:
     [
         (lambda figure, axes: None, ["", ""]),
         (lambda figure, axes: plot_style.set_titles(axes, x="time, s"), ["time, s", ""]),
-        (lambda figure, axes: plot_style.set_titles(axes, "time, s", "named rightly, %"), ["time, s", "named rightly, %"]),
-        (lambda figure, axes: (figure.supxlabel("time, s"), figure.supylabel("share")), ["time, s", "share"]),
+        (
+            lambda figure, axes: plot_style.set_titles(axes, "time, s", "named rightly, %"),
+            ["time, s", "named rightly, %"],
+        ),
+        (
+            lambda figure, axes: (figure.supxlabel("time, s"), figure.supylabel("share")),
+            ["time, s", "share"],
+        ),
         (lambda figure, axes: plot_style.set_ticks(axes.xaxis, (0, 1), bare=True), [""]),
-        (lambda figure, axes: plot_style.set_categories(axes.yaxis, (0, 1), ("wood", "foam")), [""]),
-        (lambda figure, axes: (plot_style.set_ticks(axes.xaxis, ()), plot_style.set_ticks(axes.yaxis, ())), []),
+        (
+            lambda figure, axes: plot_style.set_categories(axes.yaxis, (0, 1), ("wood", "foam")),
+            [""],
+        ),
+        (
+            lambda figure, axes: (
+                plot_style.set_ticks(axes.xaxis, ()),
+                plot_style.set_ticks(axes.yaxis, ()),
+            ),
+            [],
+        ),
     ],
     ids=["none", "one", "both", "shared", "no numbers", "names", "no ticks"],
-)  # fmt: skip
+)
 def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw, there: list[str]):
     """Its title is an attribute, empty where it is missing; axes without numbers need none."""
     assert titles(drawn(draw)) == there
@@ -51,13 +70,17 @@ def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw,
 def test_titles_stand_by_their_axes():
     """Both are written, the vertical one level."""
     svg = drawn(lambda figure, axes: plot_style.set_titles(axes, "time, s", "share named"))
-    texts = {node.text: node for node in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")}
+    texts = {
+        node.text: node
+        for node in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
+    }
     assert {"time, s", "share named"} <= texts.keys()
     assert "rotate" not in texts["share named"].get("transform", "")
 
 
 def test_a_picture_by_itself_is_light_or_dark():
-    """The roles have values for both; within a page they are the page's; programs without style sheets get colours."""
+    """The roles have values for both; within a page they are the page's; programs without style
+    sheets get colours."""
     svg = drawn(lambda figure, axes: None)
     assert svg.count(plot_style.SCHEMES) == 1
     for roles in (plot_style.ROLES, plot_style.DARK_ROLES):

@@ -1,4 +1,5 @@
-"""The header of pages, pictures and results: made once, found in each kind of file, and what is older says so first."""
+"""The header of pages, pictures and results: made once, found in each kind of file, and what is
+older says so first."""
 
 from __future__ import annotations
 
@@ -15,7 +16,9 @@ from train.metrics import score
 from train.reports import html, provenance
 from train.reports.provenance import Provenance
 
-ABOUT = Provenance(("abc", "def+"), ("12345678",), ("sim:T-REAL:1", "a & b <c>--d.npz"), (1, 2), "2026-11-22")
+ABOUT = Provenance(
+    ("abc", "def+"), ("12345678",), ("sim:T-REAL:1", "a & b <c>--d.npz"), (1, 2), "2026-11-22"
+)
 SVG = '<svg xmlns="http://www.w3.org/2000/svg"><title>a</title></svg>'
 
 
@@ -56,9 +59,14 @@ def test_a_second_header_takes_the_place_of_the_first():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "no header", '<script type="application/json" id="provenance">{"commit": }</script>',
-             '<script type="application/json" id="provenance">{"comit": []}</script>'],
-)  # fmt: skip
+    "text",
+    [
+        "",
+        "no header",
+        '<script type="application/json" id="provenance">{"commit": }</script>',
+        '<script type="application/json" id="provenance">{"comit": []}</script>',
+    ],
+)
 def test_a_file_without_header_is_named(tmp_path: Path, text: str):
     """FormatError with its name and what to do; also where it is not there at all."""
     path = tmp_path / "index.html"
@@ -69,18 +77,40 @@ def test_a_file_without_header_is_named(tmp_path: Path, text: str):
 
 
 def test_the_header_is_collected_wherever_figures_say_it():
-    """Joined runs, results in lists, sets of parts; names of sets that stand for several are left to their results."""
+    """Joined runs, results in lists, sets of parts; names of sets that stand for several are left
+    to their results."""
     figures = {
-        "runs": [{"methods": ["default"], "seeds": [1, 2], "commit": "a", "shipped": "11111111", "date": "2026-01-02"},
-                 {"methods": ["minirocket"], "seeds": [3], "commit": "b", "shipped": "22222222", "date": "2026-01-03"}],
+        "runs": [
+            {
+                "methods": ["default"],
+                "seeds": [1, 2],
+                "commit": "a",
+                "shipped": "11111111",
+                "date": "2026-01-02",
+            },
+            {
+                "methods": ["minirocket"],
+                "seeds": [3],
+                "commit": "b",
+                "shipped": "22222222",
+                "date": "2026-01-03",
+            },
+        ],
         "parts": {"hard": {"sets": ["sim:T-REAL:{w}"]}},
         "results": [{"method": "H-svm", "set": "sim:T-REAL:1", "seed": 4, "right": True}],
         "made": {"commit": "of the bundle", "set": "of the bundle", "seed": 9},
-    }  # fmt: skip
+    }
     about = provenance.of(figures)
-    assert about == Provenance(("a", "b"), ("11111111",), ("sim:T-REAL:1",), (1, 2, 3, 4), "2026-01-03")
-    assert provenance.of([{"commit": "a"}, {"commit": "a", "started": "2026-05-06T07:08"}]).date == "2026-05-06"
-    assert provenance.of({"bundle": {"id": "33333333", "name": "mine"}, "shipped": "11111111"}).bundle == ("33333333",)
+    assert about == Provenance(
+        ("a", "b"), ("11111111",), ("sim:T-REAL:1",), (1, 2, 3, 4), "2026-01-03"
+    )
+    assert (
+        provenance.of([{"commit": "a"}, {"commit": "a", "started": "2026-05-06T07:08"}]).date
+        == "2026-05-06"
+    )
+    assert provenance.of(
+        {"bundle": {"id": "33333333", "name": "mine"}, "shipped": "11111111"}
+    ).bundle == ("33333333",)
 
 
 def test_a_run_records_its_origin():
@@ -94,7 +124,8 @@ def test_a_run_records_its_origin():
 
 
 def test_a_page_of_an_older_default_says_so_in_its_first_line():
-    """Behind the title, before all else, in HTML and in Markdown; a page of today's default, and one for others, does not."""
+    """Behind the title, before all else, in HTML and in Markdown; a page of today's default, and
+    one for others, does not."""
     now, text = (
         score.shipped(),
         f"Made with an older default, bundle 12345678; the box ships bundle {score.shipped()} now.",
@@ -110,7 +141,8 @@ def test_a_page_of_an_older_default_says_so_in_its_first_line():
 
 
 def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
-    """A link with words before the title, the origin at the end; a page for others has no such link."""
+    """A link with words before the title, the origin at the end; a page for others has no such
+    link."""
     page = as_html(ABOUT)
     assert '<nav><a href="../../README.md">← Palpate</a></nav>\n<h1>' in page
     assert "2026-11-22, commit abc, def+, bundle 12345678, seeds 1, 2." in PageReader(page).text
@@ -118,7 +150,8 @@ def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
 
 
 def test_every_table_has_a_frame(tmp_path: Path):
-    """Whatever a template writes: heads have a scope, wide tables take the focus; what a template says itself stays."""
+    """Whatever a template writes: heads have a scope, wide tables take the focus; what a template
+    says itself stays."""
     (tmp_path / "a.html.j2").write_text(
         '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead><tr><th scope="row">b</th></tr></table></div>'
     )
@@ -126,16 +159,23 @@ def test_every_table_has_a_frame(tmp_path: Path):
     assert '<th scope="col" class="text">a</th>' in page
     assert '<th scope="row">b</th>' in page
     assert "<thead>" in page
-    assert page.startswith('<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways">')
+    assert page.startswith(
+        '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways">'
+    )
 
 
 def test_a_page_is_published_with_its_pictures_for_those_who_see_no_html(tmp_path: Path):
-    """All files have the header; README.md shows each picture with its title and is written again, but not one by hand."""
+    """All files have the header; README.md shows each picture with its title and is written again,
+    but not one by hand."""
     readme = tmp_path / "README.md"
-    assert html.publish(tmp_path, {"index": as_html(ABOUT)}, {"one": SVG, "two": SVG}, ABOUT) == tmp_path / "index.html"
-    assert [provenance.read(tmp_path / name) for name in ("index.html", "one.svg", "two.svg", "README.md")] == [
-        ABOUT
-    ] * 4
+    assert (
+        html.publish(tmp_path, {"index": as_html(ABOUT)}, {"one": SVG, "two": SVG}, ABOUT)
+        == tmp_path / "index.html"
+    )
+    assert [
+        provenance.read(tmp_path / name)
+        for name in ("index.html", "one.svg", "two.svg", "README.md")
+    ] == [ABOUT] * 4
     assert "![a](one.svg)\n\n![a](two.svg)\n" in readme.read_text()
     assert "[index.html](index.html). Back to [Palpate](../../README.md)." in readme.read_text()
     html.publish(tmp_path, {"index": as_html(ABOUT)}, {"three": SVG}, ABOUT)

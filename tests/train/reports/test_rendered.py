@@ -1,4 +1,5 @@
-"""The eyes of the tests: each fault of a page is seen by the browser, and a page without one has none."""
+"""The eyes of the tests: each fault of a page is seen by the browser, and a page without one has
+none."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ GOOD = """{% extends "base.html.j2" %}{% import "parts.html.j2" as parts %}{% bl
 
 
 def page(folder: Path, body: str, **figure: str) -> str:
-    """The address of a page with this body, in the frame of all pages. figure: titles of its picture's axes."""
+    """The address of a page with this body, in the frame of all pages. figure: titles of its
+    picture's axes."""
     one, axes = plot_style.single_axes(2.0, 0.1, 0.9, 0.3, 0.5)
     plot_style.set_ticks(axes.xaxis, (0, 0.5, 1), "s")
     plot_style.set_ticks(axes.yaxis, (0, 1), percent=True)
@@ -41,19 +43,35 @@ def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, sche
     ("kind", "body"),
     [
         ("page wider than the window", f"<p style='white-space: nowrap'>{LONG}</p>"),
-        ("verdict out of sight", "<div class='wide' tabindex='0' role='region'><table><tr><td style='padding-left: 30rem'></td>"
-                                 "<td class='verdict'>reached</td></tr></table></div>"),
+        (
+            "verdict out of sight",
+            "<div class='wide' tabindex='0' role='region'><table><tr><td style='padding-left: 30rem'></td>"
+            "<td class='verdict'>reached</td></tr></table></div>",
+        ),
         ("scrolls without keyboard", f"<div style='overflow-x: auto'><pre>{LONG}</pre></div>"),
-        ("text outside its picture", "<svg viewBox='0 0 50 20'><text x='30' y='10'>60 minutes</text></svg>"),
-        ("head without scope", "<script>document.write('<table><tr><th\\x3ea</th></tr></table>')</script>"),
+        (
+            "text outside its picture",
+            "<svg viewBox='0 0 50 20'><text x='30' y='10'>60 minutes</text></svg>",
+        ),
+        (
+            "head without scope",
+            "<script>document.write('<table><tr><th\\x3ea</th></tr></table>')</script>",
+        ),
         ("low contrast", "<p style='color: #999'>pale</p>"),
-        ("low contrast", "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/><text y='14' font-size='9' fill='#111'>dark</text></svg>"),
+        (
+            "low contrast",
+            "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/><text y='14' font-size='9' fill='#111'>dark</text></svg>",
+        ),
         ("raw brace", "<p>sim:T-REAL:{{ '{w}' }}</p>"),
     ],
-)  # fmt: skip
+)
 def test_each_fault_is_seen(browser: Any, tmp_path: Path, kind: str, body: str):
     """And no other is, on a phone by day."""
-    whole = '{% extends "base.html.j2" %}{% block title %}Bad{% endblock %}{% block body %}' + body + "{% endblock %}"
+    whole = (
+        '{% extends "base.html.j2" %}{% block title %}Bad{% endblock %}{% block body %}'
+        + body
+        + "{% endblock %}"
+    )
     assert list(rendered.faults(browser, page(tmp_path, whole), 390, "light")) == [kind]
 
 
@@ -67,14 +85,18 @@ def test_an_axis_without_title_is_seen(browser: Any, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_picture_by_itself_is_dark_by_night(browser: Any, tmp_path: Path):
-    """Its own style sheet gives it the colours of the scheme: nothing is low in contrast, and the background differs."""
+    """Its own style sheet gives it the colours of the scheme: nothing is low in contrast, and the
+    background differs."""
     figure, axes = plot_style.single_axes(1.0, 0.1, 0.9, 0.3, 0.4)
     plot_style.write(axes, 0.5, 0.5, "a text")
     for axis in (axes.xaxis, axes.yaxis):
         plot_style.set_ticks(axis, ())
     (tmp_path / "a.svg").write_text(plot_style.to_svg(figure, "a picture"))
     address = rendered.address(tmp_path / "a.svg")
-    assert [rendered.faults(browser, address, 390, scheme) for scheme in rendered.SCHEMES] == [{}, {}]
+    assert [rendered.faults(browser, address, 390, scheme) for scheme in rendered.SCHEMES] == [
+        {},
+        {},
+    ]
     backgrounds = set()
     for scheme in rendered.SCHEMES:
         context = browser.new_context(color_scheme=scheme)

@@ -1,4 +1,5 @@
-"""The page to leaf through a set: which sweeps it shows, how large it is, and how it is turned in a browser."""
+"""The page to leaf through a set: which sweeps it shows, how large it is, and how it is turned in a
+browser."""
 
 from __future__ import annotations
 
@@ -25,12 +26,15 @@ def source(count: int) -> SweepSource:
 
 
 def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.MonkeyPatch):
-    """First and last among them, in order, none twice; as many as are allowed, and as fit by their size."""
+    """First and last among them, in order, none twice; as many as are allowed, and as fit by their
+    size."""
     assert sweep_pages.chosen(source(7), None) == list(range(7))
     shown = sweep_pages.chosen(source(1000), None)
     assert (len(shown), shown[0], shown[-1]) == (sweep_pages.MOST, 0, 999)
     assert shown == sorted(set(shown))
-    monkeypatch.setattr(sweep_pages, "MOST_BYTES", 3 * len(sweep_plot.draw(source(1).get(0), plain=False)))
+    monkeypatch.setattr(
+        sweep_pages, "MOST_BYTES", 3 * len(sweep_plot.draw(source(1).get(0), plain=False))
+    )
     assert sweep_pages.chosen(source(1000), None) == [0, 500, 999]
 
 
@@ -51,11 +55,16 @@ def test_what_a_page_cannot_show_is_refused(
         sweep_pages.chosen(source(count), numbers)
 
 
-def test_the_command_writes_a_page_of_what_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Sweeps of a set and of a folder; an .svg is of one sweep, and other kinds of file are not written."""
+def test_the_command_writes_a_page_of_what_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Sweeps of a set and of a folder; an .svg is of one sweep, and other kinds of file are not
+    written."""
     easy(4).save(tmp_path / "s.npz")
     out = tmp_path / "v.html"
-    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "10-11", "--out", str(out)]) == 0
+    assert (
+        main(["sets", "view", str(tmp_path / "s.npz"), "--number", "10-11", "--out", str(out)]) == 0
+    )
     reader = PageReader(out.read_text())
     assert "2 of 12 sweeps of " in reader.text
     assert "11: high, recording 11" in reader.text
@@ -66,9 +75,26 @@ def test_the_command_writes_a_page_of_what_is_named(tmp_path: Path, capsys: pyte
     assert main(["sets", "view", str(tmp_path / "box"), "--out", str(out)]) == 0
     assert "2 of 2 sweeps of " in PageReader(out.read_text()).text
     capsys.readouterr()
-    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "0-1", "--out", str(tmp_path / "v.svg")]) != 0
-    assert "--number 0-1: an .svg shows one sweep; name an .html for more" in capsys.readouterr().err
-    assert main(["sets", "view", str(tmp_path / "s.npz"), "--number", "9-1", "--out", str(out)]) != 0
+    assert (
+        main(
+            [
+                "sets",
+                "view",
+                str(tmp_path / "s.npz"),
+                "--number",
+                "0-1",
+                "--out",
+                str(tmp_path / "v.svg"),
+            ]
+        )
+        != 0
+    )
+    assert (
+        "--number 0-1: an .svg shows one sweep; name an .html for more" in capsys.readouterr().err
+    )
+    assert (
+        main(["sets", "view", str(tmp_path / "s.npz"), "--number", "9-1", "--out", str(out)]) != 0
+    )
     assert "--number 9-1 cannot be read; write FIRST-LAST, e.g. 0-49" in capsys.readouterr().err
 
 
@@ -79,7 +105,10 @@ def test_a_page_of_some_sweeps_says_how_many_there_are(
     monkeypatch.setattr(sweep_pages, "MOST", 3)
     easy(4).save(tmp_path / "s.npz")
     assert main(["sets", "view", str(tmp_path / "s.npz"), "--out", str(tmp_path / "v.html")]) == 0
-    assert "3 of 12 sweeps, from all over the set; --number FIRST-LAST shows others" in capsys.readouterr().out
+    assert (
+        "3 of 12 sweeps, from all over the set; --number FIRST-LAST shows others"
+        in capsys.readouterr().out
+    )
     assert "3 of 12 sweeps of " in (tmp_path / "v.html").read_text()
 
 
@@ -92,16 +121,26 @@ def address(tmp_path: Path) -> str:
 
 @pytest.mark.slow
 def test_arrow_keys_turn_the_page(browser: Any, address: str):
-    """One sweep is seen at a time; arrows, Home and End turn, not beyond the ends; the address names the sweep."""
+    """One sweep is seen at a time; arrows, Home and End turn, not beyond the ends; the address
+    names the sweep."""
     seen_page = BrowsedPage(browser.new_context(), address)
     page = seen_page.page
 
     def seen() -> list[str]:
-        return page.eval_on_selector_all("figure", "all => all.filter((f) => f.checkVisibility()).map((f) => f.id)")
+        return page.eval_on_selector_all(
+            "figure", "all => all.filter((f) => f.checkVisibility()).map((f) => f.id)"
+        )
 
     assert seen() == ["sweep-0"]
-    for key, wanted in (("ArrowLeft", 0), ("ArrowRight", 1), ("ArrowRight", 2), ("End", 3), ("ArrowRight", 3),
-                        ("ArrowLeft", 2), ("Home", 0)):  # fmt: skip
+    for key, wanted in (
+        ("ArrowLeft", 0),
+        ("ArrowRight", 1),
+        ("ArrowRight", 2),
+        ("End", 3),
+        ("ArrowRight", 3),
+        ("ArrowLeft", 2),
+        ("Home", 0),
+    ):
         page.keyboard.press(key)
         assert seen() == [f"sweep-{wanted}"]
         assert page.evaluate("location.hash") == f"#sweep-{wanted}"

@@ -1,4 +1,5 @@
-"""The picture of a sweep: what stands in it, for every grid and length; the same everywhere, nothing from outside."""
+"""The picture of a sweep: what stands in it, for every grid and length; the same everywhere,
+nothing from outside."""
 
 from __future__ import annotations
 
@@ -19,20 +20,29 @@ from train.reports import plot_style, sweep_plot
 SVG = "{http://www.w3.org/2000/svg}"
 ABOUT = {
     "tare": [[1.5] * 4] * 4,
-    "verdict": {"status": "unsure", "label": "cork", "probability": 0.98765, "scores": [0.98765, 0.01235]},
+    "verdict": {
+        "status": "unsure",
+        "label": "cork",
+        "probability": 0.98765,
+        "scores": [0.98765, 0.01235],
+    },
     "bundle": "9f3c2a1b",
     "device": {"board": "readout", "serial": "A4", "firmware": [1, 4, 2]},
     "clock": {"jitter_us": 41.23456},
 }
 
 
-def sweep(path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more) -> str:
+def sweep(
+    path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more
+) -> str:
     """A recording of noise, a second after its start edge; its last taxel is silent."""
     seq = np.arange(fmt.window) if seq is None else seq
     taxels = np.random.default_rng(0).integers(0, 99, (len(seq), *fmt.shape)).astype(fmt.numpy_type)
     taxels[:, -1, -1] = 0
     t_ns = (1e9 + seq * fmt.period_ns).astype(np.int64)
-    made = Sweep(7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more)
+    made = Sweep(
+        7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more
+    )
     save(path, made, fmt, about or {})
     return str(path)
 
@@ -55,35 +65,50 @@ def small(tmp_path: Path) -> str:
 
 
 def test_the_picture_says_what_is_known(small: str):
-    """Label, places, file, format, losses, verdict, bundle, device, clock; numbers as they are; units at both fields."""
+    """Label, places, file, format, losses, verdict, bundle, device, clock; numbers as they are;
+    units at both fields."""
     shown = words(small)
     for text in (
-        "cork, position 3, session mon", "sweep-000017.npy, sweep 7: ok", "4x4 uint8 at 750 Hz, window 1500",
-        "2 frames lost, filled in from their neighbours", "verdict: status unsure, label cork, probability 0.9877",
-        "bundle: 9f3c2a1b", "device: board readout, serial A4, firmware 1.4.2", "clock: jitter us 41.23", "grey: the skin at rest",
-        "raw counts over seconds after the start edge", "raw counts per √Hz over Hz", "the noise of rounding to whole counts; without 1 that stand still",
-    ):  # fmt: skip
+        "cork, position 3, session mon",
+        "sweep-000017.npy, sweep 7: ok",
+        "4x4 uint8 at 750 Hz, window 1500",
+        "2 frames lost, filled in from their neighbours",
+        "verdict: status unsure, label cork, probability 0.9877",
+        "bundle: 9f3c2a1b",
+        "device: board readout, serial A4, firmware 1.4.2",
+        "clock: jitter us 41.23",
+        "grey: the skin at rest",
+        "raw counts over seconds after the start edge",
+        "raw counts per √Hz over Hz",
+        "the noise of rounding to whole counts; without 1 that stand still",
+    ):
         assert text in shown, text
-    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(shown.split("\n"))
+    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(
+        shown.split("\n")
+    )
 
 
 def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
     """What the recorder found: the status alone, the trigger, and the unloaded skin."""
     about = {
-        "verdict": {"status": "recorded", "label": "", "probability": 0.0, "detail": ""}, "source": "usb",
+        "verdict": {"status": "recorded", "label": "", "probability": 0.0, "detail": ""},
+        "source": "usb",
         "trigger": {"mode": "key", "times": "arrival of the key"},
         "unloaded": {"level": [[1.5] * 4] * 4, "noise": [[0.5] * 4] * 4},
-    }  # fmt: skip
+    }
     shown = words(drawn(tmp_path / "a.npy", SweepFormat(4, 4, 100.0, 200, "uint8"), about))
     assert "verdict: status recorded · " in shown
     assert "trigger: mode key, times arrival of the key" in shown
     assert "grey: the skin at rest" in shown
-    found = drawn(tmp_path / "b.npy", SweepFormat(4, 4, 100.0, 200, "uint8"), about | {"unloaded": None})
+    found = drawn(
+        tmp_path / "b.npy", SweepFormat(4, 4, 100.0, 200, "uint8"), about | {"unloaded": None}
+    )
     assert "grey" not in words(found)
 
 
 def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
-    """A recording of an older version, with nothing more in its sidecar: nothing of rest, verdict or device is shown."""
+    """A recording of an older version, with nothing more in its sidecar: nothing of rest, verdict
+    or device is shown."""
     record(tmp_path / "1.npy", "a")
     shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
     assert shown.startswith("a\n1.npy, sweep 1: ok")
@@ -93,22 +118,34 @@ def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
-    """Well-formed, titled, drawn twice the same, in plain colours, its pixels in itself, no text beyond its edges."""
+    """Well-formed, titled, drawn twice the same, in plain colours, its pixels in itself, no text
+    beyond its edges."""
     fmt = SweepFormat(12, 12, 50.0, 40, "float32")
     for svg in (small, drawn(tmp_path / "big.npy", fmt)):
         root = ElementTree.fromstring(svg)
         assert root.find(f"{SVG}title").text == "one sweep: cork" + (
             ", position 3, session mon" if svg is small else ""
         )
-        assert all(link.startswith(("#", "data:image/png;base64,")) for link in re.findall(r'href="([^"]*)"', svg))
-        assert svg.count("data:image/png;base64,") == 1  # spectrogram or skin: one image, not a shape for each pixel
+        assert all(
+            link.startswith(("#", "data:image/png;base64,"))
+            for link in re.findall(r'href="([^"]*)"', svg)
+        )
+        assert (
+            svg.count("data:image/png;base64,") == 1
+        )  # spectrogram or skin: one image, not a shape for each pixel
         assert "<style" not in svg
-        fills = {re.search("fill: ([^;]*)", text.get("style"))[1] for text in root.iter(f"{SVG}text")}
+        fills = {
+            re.search("fill: ([^;]*)", text.get("style"))[1] for text in root.iter(f"{SVG}text")
+        }
         assert fills <= set(plot_style.ROLES.values())
         assert "var(" not in svg, "programs other than browsers know no style sheets"
         _, _, width, height = map(float, root.get("viewBox").split())
         for node in root.iter(f"{SVG}text"):
-            long = 0.5 * len(node.text or "") * float(re.search(r"font-size: ([\d.]+)px", node.get("style"))[1])
+            long = (
+                0.5
+                * len(node.text or "")
+                * float(re.search(r"font-size: ([\d.]+)px", node.get("style"))[1])
+            )
             ends = float(node.get("x")) + long * np.array(
                 {"middle": (-0.5, 0.5), "end": (-1, 0)}.get(
                     (re.search(r"text-anchor: (\w+)", node.get("style")) or "  ")[1], (0, 1)
@@ -120,7 +157,8 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
 
 
 def test_every_peak_is_in_the_line():
-    """Thinned to what can be seen: first and last step, the one frame that stands out, the order of time."""
+    """Thinned to what can be seen: first and last step, the one frame that stands out, the order of
+    time."""
     counts = np.zeros(5000)
     counts[[3210, 4321]] = 99, -99
     time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, counts)
@@ -132,7 +170,8 @@ def test_every_peak_is_in_the_line():
 
 
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
-    """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of twice the bin's noise width."""
+    """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of
+    twice the bin's noise width."""
     fmt = SweepFormat(1, 1, 750.0, 1500, "float32")
     tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
     axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
@@ -141,17 +180,29 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     assert hz[0] == 1
     assert hz[-1] == 375
     assert hz[density.argmax()] == 100
-    assert density.max() == pytest.approx(8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01)  # Hann's noise width is 1.5 bins
+    assert density.max() == pytest.approx(
+        8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01
+    )  # Hann's noise width is 1.5 bins
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "cols", "window", "dtype"),
-    [(1, 1, 1, "uint8"), (1, 1, 7, "float32"), (1, 64, 8, "int16"), (9, 1, 9, "uint16"), (8, 8, 30, "uint8"),
-     (5, 13, 3, "int16"), (255, 1, 40, "uint8"), (1, 255, 40, "float32"), (255, 255, 24, "uint8")],
-)  # fmt: skip
+    [
+        (1, 1, 1, "uint8"),
+        (1, 1, 7, "float32"),
+        (1, 64, 8, "int16"),
+        (9, 1, 9, "uint16"),
+        (8, 8, 30, "uint8"),
+        (5, 13, 3, "int16"),
+        (255, 1, 40, "uint8"),
+        (1, 255, 40, "float32"),
+        (255, 255, 24, "uint8"),
+    ],
+)
 def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: int, dtype: str):
-    """From one taxel and one frame to the largest skin there can be, in a file that a browser opens at once."""
+    """From one taxel and one frame to the largest skin there can be, in a file that a browser opens
+    at once."""
     svg = drawn(tmp_path / "a.npy", SweepFormat(rows, cols, 0.5, window, dtype))
     ElementTree.fromstring(svg)
     assert len(svg) < 2_000_000
@@ -161,11 +212,14 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
 
 @pytest.mark.parametrize("grid", [(2, 3), (9, 2)])
 def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int]):
-    """A line for each axis, the normal one dark; a larger skin is an image of all. A tare of another shape is refused."""
+    """A line for each axis, the normal one dark; a larger skin is an image of all. A tare of
+    another shape is refused."""
     fmt = SweepFormat(*grid, 100.0, 100, "int16", 3)
     shown = words(drawn(tmp_path / "a.npy", fmt, {"tare": np.ones(fmt.shape).tolist()}))
     small = max(grid) <= 8
-    wanted = "; 3 axes, the normal one dark" if small else "in each row its 2 taxels, of each its 3 axes"
+    wanted = (
+        "; 3 axes, the normal one dark" if small else "in each row its 2 taxels, of each its 3 axes"
+    )
     assert wanted in shown
     assert f"{grid[0]}x{grid[1]}x3 int16 at 100 Hz, window 100" in shown
     seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt))
@@ -183,7 +237,11 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
     """Nothing moves: no frequency has power, no axis is without length."""
     fmt = SweepFormat(2, 2, 100.0, 300, "uint8")
     still = np.full((300, 2, 2), count, np.uint8)
-    save(tmp_path / "a.npy", Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)), fmt)
+    save(
+        tmp_path / "a.npy",
+        Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)),
+        fmt,
+    )
     shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
     assert "no material" in shown
     assert "no spectrum: less than 8 frames, or nothing moves" in shown
@@ -191,8 +249,11 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("grid", [(2, 2), (9, 9)])
-def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]):
-    """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the longest run without one."""
+def test_missing_frames_are_marked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]
+):
+    """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the
+    longest run without one."""
     fmt = SweepFormat(*grid, 100.0, 400, "uint8")
     whole = drawn(tmp_path / "a.npy", fmt)
     seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt, seq=np.r_[0:300, 350:400]))
@@ -202,7 +263,9 @@ def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (bar,) = axes.patches
     assert (bar.get_x(), bar.get_width()) == (pytest.approx(3.99), pytest.approx(0.51))
     heard = []
-    monkeypatch.setattr(sweep_plot, "_spectrum", lambda axes, taxels, form: heard.append(len(taxels)))
+    monkeypatch.setattr(
+        sweep_plot, "_spectrum", lambda axes, taxels, form: heard.append(len(taxels))
+    )
     assert "grey bars: frames are missing" in words(sweep_plot.draw(seen))
     assert heard == [300]
     assert "no spectrogram" not in words(whole)
@@ -211,7 +274,8 @@ def test_missing_frames_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_texts_are_shown_as_they_are(tmp_path: Path):
-    """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be shown is a �."""
+    """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be
+    shown is a �."""
     fmt = SweepFormat(1, 1, 50.0, 9, "uint8")
     assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", fmt, material="$a_b$ <&>"))
     first = words(drawn(tmp_path / "a.npy", fmt, material="x" * 300)).split("\n")[0]
@@ -219,11 +283,14 @@ def test_texts_are_shown_as_they_are(tmp_path: Path):
     s = easy(2)
     object.__setattr__(s, "materials", ("a\x01b", "c", "d"))
     s.save(tmp_path / "a.npz")
-    assert words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npz"), 0))).startswith("a�b, recording 0")
+    assert words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npz"), 0))).startswith(
+        "a�b, recording 0"
+    )
 
 
 def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
-    """Of a file, a simulated set, a folder: the one that training counts so; its groups are named."""
+    """Of a file, a simulated set, a folder: the one that training counts so; its groups are
+    named."""
     s = easy(4)
     s.save(tmp_path / "s.npz")
     seen = sweep_plot.load(str(tmp_path / "s.npz"), 11)
@@ -257,8 +324,14 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | 
     if "2.npy" in what:
         for name, tare in (("2", [[1, 2]]), ("4", "x"), ("5", [[1, 2, None]] * 2)):
             record(tmp_path / "box" / f"{name}.npy")
-            save(tmp_path / "box" / f"{name}.npy", *load(tmp_path / "box" / f"{name}.npy"), {"tare": tare})
-            with pytest.raises(FormatError, match=f"{name}.npy: the tare in its .json is no 2 x 3 numbers"):
+            save(
+                tmp_path / "box" / f"{name}.npy",
+                *load(tmp_path / "box" / f"{name}.npy"),
+                {"tare": tare},
+            )
+            with pytest.raises(
+                FormatError, match=f"{name}.npy: the tare in its .json is no 2 x 3 numbers"
+            ):
                 sweep_plot.load(str(tmp_path / "box" / f"{name}.npy"))
     with pytest.raises(FormatError, match=message):
         sweep_plot.load(str(tmp_path / what), number)
@@ -266,13 +339,20 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | 
 
 def test_a_picture_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A name that promises another kind of picture is refused, before anything is read."""
-    assert main(["sets", "view", "none.npy", "--out", str(tmp_path / "v.png")]) == FormatError.exit_code
-    assert "v.png: one sweep is an .svg, a page of many an .html; name a file that ends so" in capsys.readouterr().err
+    assert (
+        main(["sets", "view", "none.npy", "--out", str(tmp_path / "v.png")])
+        == FormatError.exit_code
+    )
+    assert (
+        "v.png: one sweep is an .svg, a page of many an .html; name a file that ends so"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow
 def test_the_spectrogram_shows_when_a_tone_sounds(monkeypatch: pytest.MonkeyPatch):
-    """A tone of 25 Hz in the second half alone: its band is weak before and strong after; time lies as in the signals."""
+    """A tone of 25 Hz in the second half alone: its band is weak before and strong after; time lies
+    as in the signals."""
     rate = 100.0
     t = np.arange(400) / rate
     tone = np.where(t >= 2, 40 * np.sin(2 * np.pi * 25 * t), 0)
@@ -281,7 +361,9 @@ def test_the_spectrogram_shows_when_a_tone_sounds(monkeypatch: pytest.MonkeyPatc
     form = SweepFormat(2, 2, rate, 400, "float32")
     shown = sweep_plot.ShownSweep(counts, t, form, "", (), "seconds", None, np.empty(0, int))
     seen = []
-    monkeypatch.setattr(sweep_plot.Axes, "imshow", lambda axes, db, **more: seen.append((db, more["extent"])))
+    monkeypatch.setattr(
+        sweep_plot.Axes, "imshow", lambda axes, db, **more: seen.append((db, more["extent"]))
+    )
     sweep_plot.draw(shown)
     ((db, (start, end, low, high)),) = seen
     band = round((25 - low) / (high - low) * len(db) - 0.5)

@@ -35,7 +35,10 @@ from train.reports import (
     uncertainty_report,
 )
 
-DRAWN_HERE = [*sorted((ROOT / "train" / "reports").glob("*.py")), ROOT / "tests" / "rig" / "soak_page.py"]
+DRAWN_HERE = [
+    *sorted((ROOT / "train" / "reports").glob("*.py")),
+    ROOT / "tests" / "rig" / "soak_page.py",
+]
 
 
 def committed(path: str) -> Any:
@@ -48,20 +51,26 @@ def image() -> str:
     form = SweepFormat(12, 12, 50.0, 40, "float32")
     counts = np.random.default_rng(0).random((40, 12, 12), np.float32)
     return sweep_plot.draw(
-        sweep_plot.ShownSweep(counts, np.arange(40) / 50, form, "", (), "seconds", None, np.empty(0, int))
+        sweep_plot.ShownSweep(
+            counts, np.arange(40) / 50, form, "", (), "seconds", None, np.empty(0, int)
+        )
     )
 
 
 PICTURES: dict[str, Callable[[], Any]] = {
     "paper": lambda: paper_report.render(committed("paper/results.json")),
-    "long training": lambda: plots.curve([np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"),
+    "long training": lambda: plots.curve(
+        [np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"
+    ),
     "certainty": lambda: uncertainty_report.render(committed("certainty/results.json")),
     "chart": lambda: scatter.chart(committed("chart/chart.json")),
     "small chart": lambda: scatter.chart(DOTS, ("speed", "lopo")),
     "stress": lambda: stress_report.render(stress_data.figures()),
     "matrix": lambda: plots.matrix(committed("fabricslide/results.json")),
     "alignment": lambda: contact_plot.draw(committed("alignment/place.json")),
-    "choice": lambda: selection_plots.sizes(choice_data.choice()["rungs"], "compact-4k", 0.9, "sizes"),
+    "choice": lambda: selection_plots.sizes(
+        choice_data.choice()["rungs"], "compact-4k", 0.9, "sizes"
+    ),
     "less": lambda: selection_plots.reductions(choice_data.choice()["less"], "less"),
     "soak": lambda: soak_page.charts(committed("soak/results.json")),
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
@@ -103,7 +112,8 @@ def axes_of(figure: Figure) -> Iterator[Axis]:
 
 
 def wrong_labels(axis: Axis) -> list[tuple[float, str]]:
-    """Ticks (position, label) whose label is another number than their position; a unit follows the last label.
+    """Ticks (position, label) whose label is another number than their position; a unit follows the
+    last label.
 
     A label is right to five significant digits, which is far less than half of its last place.
     """
@@ -111,14 +121,19 @@ def wrong_labels(axis: Axis) -> list[tuple[float, str]]:
     shown = [(at, label) for at, label in ticks if label]
     unit = shown[-1][1].partition(" ")[2] if shown else ""
     factor = 100 if unit.startswith("%") else 1e-3 if unit == "k" else 1
-    return [(at, label) for at, label in shown
-            if float(label.partition(" ")[0].replace("−", "-")) != pytest.approx(factor * at, rel=1e-5, abs=1e-12)]  # fmt: skip
+    return [
+        (at, label)
+        for at, label in shown
+        if float(label.partition(" ")[0].replace("−", "-"))
+        != pytest.approx(factor * at, rel=1e-5, abs=1e-12)
+    ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_labels_are_where_they_say(name: str, drawn: list[tuple[Figure, tuple[str, str]]]):
-    """Where an axis has values its labels are those of its ticks; only names of things may be another text."""
+    """Where an axis has values its labels are those of its ticks; only names of things may be
+    another text."""
     PICTURES[name]()
     assert drawn
     named = 0
@@ -138,21 +153,28 @@ def test_no_picture_is_left_out(drawn: list[tuple[Figure, tuple[str, str]]]):
     """Every function that ends in `to_svg` draws one of the pictures above."""
     calls = {
         (path.name, function.name)
-        for path in DRAWN_HERE for function in ast.walk(ast.parse(path.read_text())) if isinstance(function, ast.FunctionDef)
+        for path in DRAWN_HERE
+        for function in ast.walk(ast.parse(path.read_text()))
+        if isinstance(function, ast.FunctionDef)
         for call in ast.walk(function)
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "to_svg"
-    }  # fmt: skip
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Name)
+        and call.func.id == "to_svg"
+    }
     for draw in PICTURES.values():
         draw()
     assert len(calls) > 10
     assert {function for _, function in drawn} == calls
 
 
-@pytest.mark.parametrize(("ticks", "labels"), [
-    ((0.9, 0.925, 0.95, 0.975, 1.0), ["90", "92.5", "95", "97.5", "100 %"]),
-    ((0.0, 1 / 3, 0.7000000001), ["0", "33.3333", "70 %"]),
-    ((-0.5, 0.987), ["−50", "98.7 %"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("ticks", "labels"),
+    [
+        ((0.9, 0.925, 0.95, 0.975, 1.0), ["90", "92.5", "95", "97.5", "100 %"]),
+        ((0.0, 1 / 3, 0.7000000001), ["0", "33.3333", "70 %"]),
+        ((-0.5, 0.987), ["−50", "98.7 %"]),
+    ],
+)
 def test_ticks_have_as_many_decimals_as_they_need(ticks: tuple[float, ...], labels: list[str]):
     """None is rounded to the places of another."""
     figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)

@@ -1,4 +1,5 @@
-"""Choosing the smallest sufficient model within the budget, its unbiased figure, and reduced sweeps where they suffice."""
+"""Choosing the smallest sufficient model within the budget, its unbiased figure, and reduced sweeps
+where they suffice."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ HERE = Where(jobs=1, cache=None)
 
 @dataclass
 class Powers:
-    """Answers with the material whose log power on each taxel is nearest; taxels from the `first` on are not looked at."""
+    """Answers with the material whose log power on each taxel is nearest; taxels from the `first`
+    on are not looked at."""
 
     means: np.ndarray
     first: int
@@ -43,7 +45,9 @@ class Powers:
         x = g("Cast", "sweep", to=1)
         x = g("Sub", x, g("ReduceMean", x, axes=[1], keepdims=1))
         power = g("ReduceMean", g("Mul", x, x), axes=[1], keepdims=0)
-        seen = g("Log", g("Reshape", g("Add", power, g.constant(0.01)), g.constant([1, -1], "int64")))
+        seen = g(
+            "Log", g("Reshape", g("Add", power, g.constant(0.01)), g.constant([1, -1], "int64"))
+        )
         means = self.means * (np.arange(form.rows * form.cols) < self.first)
         inner = g("MatMul", seen, g.constant(8 * means.T))
         g("Add", inner, g.constant(-4 * (means**2).sum(1)), output="logits")
@@ -59,8 +63,10 @@ def learn(sweeps: Dataset, given: np.ndarray, seed: int, first: int = 99) -> Pow
     if given.shape[1] < 4:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 4")
     seen = np.log(given.astype(float).var(axis=1).reshape(len(given), -1) + 0.01)
-    there = [seen[sweeps.labels == k].mean(0) if (sweeps.labels == k).any() else 0 * seen[0] - 9
-             for k in range(len(sweeps.materials))]  # fmt: skip
+    there = [
+        seen[sweeps.labels == k].mean(0) if (sweeps.labels == k).any() else 0 * seen[0] - 9
+        for k in range(len(sweeps.materials))
+    ]
     return Powers(np.stack(there).astype(np.float32), first, sweeps)
 
 
@@ -70,8 +76,11 @@ def guess(sweeps: Dataset, given: np.ndarray, seed: int, number: int = 0) -> Pow
     return Powers(3 + drawn.astype(np.float32), 99, sweeps)
 
 
-def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15) -> Dataset:
-    """Four materials at several places: each of the named taxels has half of the information, by the strength of what they feel."""
+def skin(
+    places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15
+) -> Dataset:
+    """Four materials at several places: each of the named taxels has half of the information, by
+    the strength of what they feel."""
     labels = np.tile(np.arange(4), places * each)
     rng = np.random.default_rng(3)
     bits = np.stack([labels % 2, labels // 2], axis=1)
@@ -79,11 +88,19 @@ def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise
     for taxel, bit in zip(taxels, bits.T, strict=True):
         strength[:, taxel] *= 1 + 2 * bit
     x = 100 + strength[:, None] * rng.standard_normal((len(labels), 60, 6))
-    groups = {"place": np.repeat(np.arange(places), 4 * each), "day": np.repeat(np.arange(places) % 4, 4 * each)}
-    return Dataset(np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c", "d"), 100.0, groups, "skin")
+    groups = {
+        "place": np.repeat(np.arange(places), 4 * each),
+        "day": np.repeat(np.arange(places) % 4, 4 * each),
+    }
+    return Dataset(
+        np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c", "d"), 100.0, groups, "skin"
+    )
 
 
-FAKES = {f"see-{n}": Method(f"see-{n}", f"{n} taxels", "raw", partial(learn, first=n)) for n in (1, 2, 4, 6)}
+FAKES = {
+    f"see-{n}": Method(f"see-{n}", f"{n} taxels", "raw", partial(learn, first=n))
+    for n in (1, 2, 4, 6)
+}
 COSTS = {name: BundleCost(0.1 * (i + 1), 10.0 * (i + 1), 50.0) for i, name in enumerate(FAKES)}
 
 
@@ -103,7 +120,9 @@ def fakes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def asked(**more) -> scene.Scene:
     """A scene in which the place varies."""
-    return scene.Scene(**{"name": "drawer", "varies": ("place",), "folds": 3, "path": Path("scene.toml"), **more})
+    return scene.Scene(
+        **{"name": "drawer", "varies": ("place",), "folds": 3, "path": Path("scene.toml"), **more}
+    )
 
 
 def chosen(sweeps: Dataset, where: Where = HERE, **more) -> select.Selection:
@@ -113,7 +132,9 @@ def chosen(sweeps: Dataset, where: Where = HERE, **more) -> select.Selection:
 
 def parts_of(sweeps: Dataset, **more) -> nested_cv.Trials:
     """Trials of which none has been run."""
-    return nested_cv.Trials(sweeps, asked(**more), FULL_EFFORT, HERE, Progress(0, lambda line: None))
+    return nested_cv.Trials(
+        sweeps, asked(**more), FULL_EFFORT, HERE, Progress(0, lambda line: None)
+    )
 
 
 @cache
@@ -123,7 +144,8 @@ def two() -> Dataset:
 
 
 def test_the_smallest_that_will_do_is_taken(fakes):
-    """One taxel has half of the information, two have all: two are taken, with reasons both ways; four and six are not tried."""
+    """One taxel has half of the information, two have all: two are taken, with reasons both ways;
+    four and six are not tried."""
     choice = chosen(two())
     result = choice.json(asked())
     assert result["chosen"] == "see-2"
@@ -144,17 +166,24 @@ def test_the_cheapest_is_taken_where_it_suffices(fakes):
 
 
 def test_a_gain_within_the_error_is_no_reason(fakes):
-    """What is right at one place more than the cheaper one is not paid for; what is right a little more everywhere is."""
+    """What is right at one place more than the cheaper one is not paid for; what is right a little
+    more everywhere is."""
     better = np.ones((1, len(two())))
     here, everywhere = better.copy(), better.copy()
     here[0, :3] = 0
     everywhere[0, ::12] = 0
-    assert select.SizeSearch(parts_of(two()), None, {"cheap": here, "dear": better}).chosen == "cheap"
-    assert select.SizeSearch(parts_of(two()), None, {"cheap": everywhere, "dear": better}).chosen == "dear"
+    assert (
+        select.SizeSearch(parts_of(two()), None, {"cheap": here, "dear": better}).chosen == "cheap"
+    )
+    assert (
+        select.SizeSearch(parts_of(two()), None, {"cheap": everywhere, "dear": better}).chosen
+        == "dear"
+    )
 
 
 def test_the_search_in_a_family_ends_where_larger_ones_change_nothing(fakes):
-    """Two larger ones that change nothing end it, unless the second is better than the first; other families go on."""
+    """Two larger ones that change nothing end it, unless the second is better than the first; other
+    families go on."""
     half, more = np.zeros((2, 1, len(two())))
     half[0, ::2], more[0] = 1, 1
     more[0, ::6] = 0
@@ -176,13 +205,15 @@ def test_the_search_in_a_family_ends_where_larger_ones_change_nothing(fakes):
 
 
 def test_the_order_is_that_of_cost(fakes):
-    """The same methods with other costs: the one that is then cheapest is taken, though it looks at more."""
+    """The same methods with other costs: the one that is then cheapest is taken, though it looks at
+    more."""
     fakes(costs={name: replace(COSTS[name], kb=100 - COSTS[name].kb) for name in reversed(FAKES)})
     assert chosen(two()).final.chosen == "see-6"
 
 
 def test_what_is_over_the_budget_is_not_tried(fakes):
-    """Time on the board, size or memory: named with its limit; the best of the others is taken, whether it reaches what is wanted or not."""
+    """Time on the board, size or memory: named with its limit; the best of the others is taken,
+    whether it reaches what is wanted or not."""
     for budget in ({"ms": 0.3, "slower": 2.0}, {"kb": 15}):
         choice = chosen(two(), budget=scene.Budget(**budget))
         assert choice.final.chosen == "see-1"
@@ -192,16 +223,22 @@ def test_what_is_over_the_budget_is_not_tried(fakes):
 
 def test_nothing_fits(fakes):
     """The nearest is named with what it lacks."""
-    with pytest.raises(select.NothingFits, match=r"nearest is see-1, over the budget: 10 kb of 5: raise the budget"):
+    with pytest.raises(
+        select.NothingFits, match=r"nearest is see-1, over the budget: 10 kb of 5: raise the budget"
+    ):
         chosen(two(), budget=scene.Budget(kb=5))
     short = replace(two(), samples=two().samples[:, :3])
-    with pytest.raises(select.NothingFits, match="see-6 cannot be used here: a window of 3 frames is too short"):
+    with pytest.raises(
+        select.NothingFits, match="see-6 cannot be used here: a window of 3 frames is too short"
+    ):
         chosen(short)
 
 
 def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
     """It has no cost, or its training refuses: the reason is reported and the others are tried."""
-    never = Method("see-0", "refuses", "raw", lambda sweeps, given, seed: learn(sweeps, given[:, :1], seed))
+    never = Method(
+        "see-0", "refuses", "raw", lambda sweeps, given, seed: learn(sweeps, given[:, :1], seed)
+    )
     fakes(
         {"see-0": never, **FAKES, "bad": never},
         {"see-0": BundleCost(0.01, 1, 1), **COSTS, "bad": BundleCost(refused="no graph")},
@@ -217,8 +254,11 @@ def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
 
 @pytest.mark.slow
 def test_the_nested_figure_is_not_optimistic(fakes):
-    """Of sixteen that only guess the best one looks good; the choice, judged on what it has not seen, is a guess."""
-    known = {f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)}
+    """Of sixteen that only guess the best one looks good; the choice, judged on what it has not
+    seen, is a guess."""
+    known = {
+        f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)
+    }
     fakes(known, {name: BundleCost(0.1, 10 + i, 50) for i, name in enumerate(known)})
     sweeps = skin(places=6, each=2)
     sweeps = sweeps.take(sweeps.labels < 2).select(())
@@ -232,7 +272,8 @@ def test_the_nested_figure_is_not_optimistic(fakes):
 
 
 def test_an_inner_choice_never_sees_its_part(fakes):
-    """Neither trained on nor tested on: of every training that it looks at, and in every score that it has."""
+    """Neither trained on nor tested on: of every training that it looks at, and in every score that
+    it has."""
     trials = parts_of(two(), varies=("place", "day"))
     for p, part in enumerate(trials.parts):
         for tested, unseen in trials.seen_from(p).items():
@@ -254,7 +295,9 @@ def test_the_error_is_that_of_what_fails_together(fakes):
     everywhere[0, ::8] = 0
     assert trials.difference(ones, here).mean == trials.difference(ones, everywhere).mean == 0.125
     assert trials.difference(ones, here).se == pytest.approx(0.125)  # of eight places one failed
-    assert trials.difference(ones, everywhere).se == pytest.approx(np.std(everywhere, ddof=1) / np.sqrt(96))
+    assert trials.difference(ones, everywhere).se == pytest.approx(
+        np.std(everywhere, ddof=1) / np.sqrt(96)
+    )
     assert trials.difference(ones, ones).json() == {"mean": 0, "se": 0, "low": 0, "high": 0}
 
 
@@ -263,7 +306,9 @@ def test_corruptions_count_like_sweeps_as_recorded(fakes):
     choice = chosen(skin(each=2), stress={"noise": 0.5})
     result = choice.json(asked())
     assert [c["name"] for c in result["conditions"]] == ["as recorded", "noise 0.5 deviations"]
-    assert result["accuracy"]["mean"] == pytest.approx(np.mean([c["accuracy"] for c in result["conditions"]]), abs=1e-3)
+    assert result["accuracy"]["mean"] == pytest.approx(
+        np.mean([c["accuracy"] for c in result["conditions"]]), abs=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -279,8 +324,11 @@ def test_corruptions_count_like_sweeps_as_recorded(fakes):
         (skin(places=1, each=2), (), "random:3 needs 3 recordings of each material"),
     ],
 )
-def test_a_scene_that_cannot_be_judged_is_refused(fakes, sweeps: Dataset, varies: tuple[str, ...], why: str):
-    """Too few values of a group, or a material that goes with one of them; before anything is trained."""
+def test_a_scene_that_cannot_be_judged_is_refused(
+    fakes, sweeps: Dataset, varies: tuple[str, ...], why: str
+):
+    """Too few values of a group, or a material that goes with one of them; before anything is
+    trained."""
     with pytest.raises(FormatError, match=why):
         chosen(sweeps, varies=varies)
 
@@ -292,19 +340,23 @@ def test_parts_are_whole_and_few():
     assert np.sum([p.out for p in found[:4]], axis=0).tolist() == [1] * 96
     assert len(nested_cv.parts(two(), ("place",))) == 5
     assert len(nested_cv.parts(two(), ("place",), folds=8)) == 8
-    assert [p.values for p in nested_cv.parts(two(), ("day",))] == [p.values for p in nested_cv.parts(two(), ("day",))]
+    assert [p.values for p in nested_cv.parts(two(), ("day",))] == [
+        p.values for p in nested_cv.parts(two(), ("day",))
+    ]
     assert len(nested_cv.parts(two(), ())) == 5
 
 
 def reduced(sweeps: Dataset, **more) -> dict[str, dict]:
-    """The curves of a scene by what there is less of, and under "change" what would be left out of the bundle."""
+    """The curves of a scene by what there is less of, and under "change" what would be left out of
+    the bundle."""
     wish = asked(**more)
     result, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish)
     return {curve["kind"]: curve for curve in result} | {"change": change, "accuracy": accuracy}
 
 
 def test_two_taxels_are_all_that_is_needed(fakes):
-    """Of six the third and the fifth have all the information: these two are kept, one alone is not enough."""
+    """Of six the third and the fifth have all the information: these two are kept, one alone is not
+    enough."""
     fakes({"see-6": FAKES["see-6"]}, {"see-6": COSTS["see-6"]})
     found = reduced(skin(taxels=(2, 4)), reduce=("taxels",), apply=("taxels",))
     assert found["taxels"]["kept"] == "2 taxels"
@@ -315,12 +367,15 @@ def test_two_taxels_are_all_that_is_needed(fakes):
 
 
 def hum(slow: float, fast: float, places: int = 4) -> Dataset:
-    """Two materials that differ by the strength of a swing of 40 frames, of one of two frames, or of both."""
+    """Two materials that differ by the strength of a swing of 40 frames, of one of two frames, or
+    of both."""
     labels = np.tile([0, 1], places * 3)
     rng = np.random.default_rng(2)
     strength = np.exp(0.3 * rng.standard_normal((2, len(labels), 1)))
     swing = (
-        strength[0] * slow ** labels[:, None] * np.sin(2 * np.pi * (np.arange(160) / 40 + rng.random((len(labels), 1))))
+        strength[0]
+        * slow ** labels[:, None]
+        * np.sin(2 * np.pi * (np.arange(160) / 40 + rng.random((len(labels), 1))))
     )
     edge = 9 * strength[1] * fast ** labels[:, None] * np.cumprod(-np.ones(160))
     x = 100 + swing + edge + 0.1 * rng.standard_normal((len(labels), 160))
@@ -329,7 +384,8 @@ def hum(slow: float, fast: float, places: int = 4) -> Dataset:
 
 
 def test_a_low_rate_is_enough_for_slow_things(fakes):
-    """Averaging takes the fast noise away: the lowest rate is kept, with what to set; nothing is applied unasked."""
+    """Averaging takes the fast noise away: the lowest rate is kept, with what to set; nothing is
+    applied unasked."""
     found = reduced(hum(slow=5, fast=1), reduce=("rate",))
     assert found["rate"]["kept"] == "25 Hz"
     assert found["rate"]["set"] == "set the readout board to average 8 frames and send one"
@@ -338,7 +394,8 @@ def test_a_low_rate_is_enough_for_slow_things(fakes):
 
 
 def test_a_rate_that_is_needed_is_kept(fakes):
-    """Materials that differ by the fast part alone: half the rate loses it, and the curve ends where it has fallen."""
+    """Materials that differ by the fast part alone: half the rate loses it, and the curve ends
+    where it has fallen."""
     found = reduced(hum(slow=1, fast=5), reduce=("rate",), apply=("rate",))
     assert (found["rate"]["kept"], found["change"].rate) == ("all", 1)
     assert [p["fine"] for p in found["rate"]["points"]] == [True, False, False]
@@ -346,7 +403,8 @@ def test_a_rate_that_is_needed_is_kept(fakes):
 
 @pytest.mark.slow
 def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
-    """Sixty frames are more than needed; the fake refuses fewer than four, and the curve says so."""
+    """Sixty frames are more than needed; the fake refuses fewer than four, and the curve says
+    so."""
     found = reduced(two(), reduce=("window",))
     assert found["window"]["kept"] == "0.15 s"
     assert found["window"]["applied"] is True
@@ -356,7 +414,8 @@ def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
 
 
 def test_less_does_not_fall_below_what_is_wanted(fakes):
-    """A loss within the error is still refused where the whole reaches the wanted accuracy and less does not."""
+    """A loss within the error is still refused where the whole reaches the wanted accuracy and less
+    does not."""
     trials = parts_of(two())
     full, less = np.ones((2, 1, len(two())))
     less[0, 0] = 0
@@ -367,10 +426,14 @@ def test_less_does_not_fall_below_what_is_wanted(fakes):
 
 @pytest.mark.slow
 def test_materials_that_look_alike_are_proposed_as_one(fakes):
-    """Only the first taxel has information: a and c, b and d are the same to it. Proposed, not applied."""
+    """Only the first taxel has information: a and c, b and d are the same to it. Proposed, not
+    applied."""
     sweeps = skin(taxels=(0, 0))
     strength = replace(
-        sweeps, samples=np.where(np.arange(6)[:, None] == 0, skin().samples, skin(taxels=(5, 5)).samples[:, :, :1])
+        sweeps,
+        samples=np.where(
+            np.arange(6)[:, None] == 0, skin().samples, skin(taxels=(5, 5)).samples[:, :, :1]
+        ),
     )
     found = reduced(strength, reduce=("classes",), accuracy=0.9)["classes"]
     assert sorted(map(sorted, found["proposed"])) == [["a", "c"], ["b", "d"]]
@@ -400,11 +463,17 @@ def test_an_interrupted_choice_continues(fakes, tmp_path: Path, monkeypatch: pyt
 
 
 def test_all_trainings_have_one_count(fakes):
-    """From the first candidate to the last reduction: it never starts anew, and what is left at most only shrinks."""
+    """From the first candidate to the last reduction: it never starts anew, and what is left at
+    most only shrinks."""
     lines: list[ProgressLine] = []
     wish = asked(reduce=("window", "taxels", "classes"), apply=("window",))
     choice = select.choose(
-        two(), wish, FULL_EFFORT, HERE, lines.append, lambda t: reduction_curves.most(t, wish.reduce)
+        two(),
+        wish,
+        FULL_EFFORT,
+        HERE,
+        lines.append,
+        lambda t: reduction_curves.most(t, wish.reduce),
     )
     before = len(lines)
     reduction_curves.curves(choice, wish)
@@ -418,7 +487,8 @@ def test_all_trainings_have_one_count(fakes):
 
 @pytest.mark.slow
 def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
-    """Real methods on a real bundle: L-features suffice, so they are deployed; the page needs nothing from outside."""
+    """Real methods on a real bundle: L-features suffice, so they are deployed; the page needs
+    nothing from outside."""
     skin().save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text(
         'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds = 3\naccuracy = 0.8\n'
@@ -440,7 +510,11 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     packed = bundle.load(tmp_path / "b")
     assert result["chosen"] == packed.manifest.made["method"]
     assert (packed.manifest.name, packed.manifest.labels) == ("drawer", ("a", "d"))
-    assert packed.format.window == result["bundle"]["format"]["window"] == round(60 * result["applied"]["window"])
+    assert (
+        packed.format.window
+        == result["bundle"]["format"]["window"]
+        == round(60 * result["applied"]["window"])
+    )
     nested = packed.manifest.figures["the choice, made without each part and tested on it"]
     assert nested["accuracy"] == result["honest"]["mean"] > 0.9
     assert 0 < max(result["bundle"]["used"].values()) < 1
@@ -455,30 +529,41 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
 
 
 @pytest.mark.slow
-def test_what_is_wanted_and_not_reached_is_said_first(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+def test_what_is_wanted_and_not_reached_is_said_first(
+    fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
     """The best is reported and packed all the same."""
     monkeypatch.setattr(measure, "memory", lambda folder, sweeps: {"rss_mib": 50.0, "foreign": []})
     hard = skin(noise=0.9)
     hard.save(tmp_path / "skin.npz")
-    (tmp_path / "scene.toml").write_text('sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n')
+    (tmp_path / "scene.toml").write_text(
+        'sets = ["skin.npz"]\nvaries = ["place"]\naccuracy = 0.99\nreduce = []\n'
+    )
     scene_file, out, cache = (str(tmp_path / name) for name in ("scene.toml", "b", "c"))
-    assert main(["choose", "--scene", scene_file, "--out", out, "--jobs", "1", "--cache", cache]) == 0
+    assert (
+        main(["choose", "--scene", scene_file, "--out", out, "--jobs", "1", "--cache", cache]) == 0
+    )
     printed = capsys.readouterr().out
     assert "Not reached: 99 % is wanted" in printed
-    assert printed.splitlines()[-1].endswith(f"palpate-train report {out} --set SET --out report.html")
+    assert printed.splitlines()[-1].endswith(
+        f"palpate-train report {out} --set SET --out report.html"
+    )
     assert 'class="stop">Not reached' in (tmp_path / "b-why" / "index.html").read_text()
     assert bundle.load(tmp_path / "b").manifest.name == "scene"
 
 
 def test_cheap_is_what_takes_little_of_the_scarcer():
-    """Of time and storage, whichever the board has less of; without a budget the smaller; of equals the faster."""
+    """Of time and storage, whichever the board has less of; without a budget the smaller; of equals
+    the faster."""
     small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
     tight = {
         "time": scene.Budget(ms=1, kb=1000, slower=2),
         "storage": scene.Budget(ms=100, kb=50),
         "none": scene.Budget(),
     }
-    cheaper = {name: min((small, fast), key=lambda cost: cost.order(b)) for name, b in tight.items()}
+    cheaper = {
+        name: min((small, fast), key=lambda cost: cost.order(b)) for name, b in tight.items()
+    }
     assert cheaper == {"time": fast, "storage": small, "none": small}
     assert BundleCost(0.1, 20, 50).order(scene.Budget()) < small.order(scene.Budget())
     assert small.used(tight["time"]) == {"ms": 0.8, "kb": 0.02}

@@ -52,9 +52,9 @@ def written(folder: Path, text: str) -> Path:
 def three(folder: Path) -> Path:
     """A set of three materials in a file: two forces, two sweeps of each there."""
     labels = np.repeat([0, 1, 2], 4)
-    samples = (10 * labels[:, None, None, None] + np.arange(5)[:, None, None]).astype(np.int16) * np.ones(
-        (2, 1), np.int16
-    )
+    samples = (10 * labels[:, None, None, None] + np.arange(5)[:, None, None]).astype(
+        np.int16
+    ) * np.ones((2, 1), np.int16)
     groups = {"force": np.tile([100, 200], 6)}
     Dataset(samples, labels, ("a", "b", "c"), 50.0, groups).save(folder / "a.npz")
     return folder
@@ -66,7 +66,12 @@ def test_every_key_is_read(tmp_path: Path):
     assert (found.name, found.version, found.folds, found.seeds) == ("drawer", "2.1", 4, 2)
     assert found.merge == {"a or c": ("a", "b")}
     assert found.stress == {"noise": 0.3, "dead": 1.0}
-    assert (found.budget.ms, found.budget.kb, found.budget.mb, found.budget.slower) == (5, 96.5, 64, 3.0)
+    assert (found.budget.ms, found.budget.kb, found.budget.mb, found.budget.slower) == (
+        5,
+        96.5,
+        64,
+        3.0,
+    )
     assert (found.reduce, found.apply, found.full_scale) == (("window", "rate"), ("rate",), 4095)
     least = scene.read(written(tmp_path, 'sets = ["a.npz"]'))
     assert (least.name, least.varies, least.accuracy, least.apply) == ("scene", (), 0, ("window",))
@@ -81,7 +86,10 @@ def test_every_key_is_read(tmp_path: Path):
         ('sets = ["a"]\nvarys = ["x"]', "scene.toml: key varys is unknown; did you mean 'varies'"),
         ('sets = ["a"]\nqqq = 1', "key qqq is unknown; use name, version, sets"),
         ('sets = ["a"]\n[budget]\nkB = 3', r"key budget\.kB is unknown; did you mean 'kb'"),
-        ('sets = ["a"]\n[budget]\nms = "5"', r"budget\.ms = '5' is not allowed; use a number from 0\.001"),
+        (
+            'sets = ["a"]\n[budget]\nms = "5"',
+            r"budget\.ms = '5' is not allowed; use a number from 0\.001",
+        ),
         ('sets = ["a"]\n[budget]\nms = 0', r"budget\.ms = 0 is not allowed"),
         ('sets = ["a"]\n[budget]\nslower = nan', r"budget\.slower = nan is not allowed"),
         ('sets = ["a"]\nbudget = 3', "budget = 3 is not allowed; write a table"),
@@ -90,21 +98,45 @@ def test_every_key_is_read(tmp_path: Path):
         ('sets = ["a", 1]', "is not allowed; use a list of different texts"),
         ('sets = ["a"]\naccuracy = 90', "accuracy = 90 is not allowed; use a number from 0 to 1"),
         ('sets = ["a"]\naccuracy = true', "accuracy = True is not allowed"),
-        ('sets = ["a"]\nseeds = 1.5', "seeds = 1.5 is not allowed; use a whole number from 1 to 20"),
+        (
+            'sets = ["a"]\nseeds = 1.5',
+            "seeds = 1.5 is not allowed; use a whole number from 1 to 20",
+        ),
         ('sets = ["a"]\nfolds = 2', "folds = 2 is not allowed; use a whole number from 3"),
-        ('sets = ["a"]\nname = "a,b"', "name = 'a,b' is not allowed; use a text of 1 to 24 letters"),
-        ('sets = ["a"]\nreduce = ["windows"]', "reduce = .* is not allowed; use a list of some of window, rate"),
-        ('sets = ["a"]\napply = ["bits"]', "apply = .* is not allowed; use a list of some of window, rate, taxels$"),
-        ('sets = ["a"]\nreduce = ["rate"]\napply = ["taxels"]', "apply names 'taxels', which is not in reduce"),
-        ('sets = ["a"]\nmethods = ["L-gaus"]', "method 'L-gaus' is unknown; did you mean 'L-gauss'"),
+        (
+            'sets = ["a"]\nname = "a,b"',
+            "name = 'a,b' is not allowed; use a text of 1 to 24 letters",
+        ),
+        (
+            'sets = ["a"]\nreduce = ["windows"]',
+            "reduce = .* is not allowed; use a list of some of window, rate",
+        ),
+        (
+            'sets = ["a"]\napply = ["bits"]',
+            "apply = .* is not allowed; use a list of some of window, rate, taxels$",
+        ),
+        (
+            'sets = ["a"]\nreduce = ["rate"]\napply = ["taxels"]',
+            "apply names 'taxels', which is not in reduce",
+        ),
+        (
+            'sets = ["a"]\nmethods = ["L-gaus"]',
+            "method 'L-gaus' is unknown; did you mean 'L-gauss'",
+        ),
         ('sets = ["a"]\n[stress]\nnoize = 0.1', "stress 'noize' is none .*; did you mean 'noise'"),
         ('sets = ["a"]\n[stress]\nshift-rows = 1', "stress 'shift-rows' is none that any sweep"),
-        ('sets = ["a"]\n[stress]\nnoise = 3', r"stress\.noise = 3 is out of range; use up to 0.5 deviations"),
+        (
+            'sets = ["a"]\n[stress]\nnoise = 3',
+            r"stress\.noise = 3 is out of range; use up to 0.5 deviations",
+        ),
         ('sets = ["a"]\n[stress]\nnoise = 0', "stress = .* is not allowed; use numbers above 0"),
         ('sets = ["a"]\n[merge]\nx = "a"', "merge = .* is not allowed; use lists of materials"),
         ('sets = ["a"]\n[merge]\n"x,y" = ["a"]', "merge = .* is not allowed"),
         ('sets = ["a"]\n[merge]\nx = ["a"]\ny = ["a"]', "merge names 'a' twice"),
-        ('sets = ["a"]\nmaterials = ["b", "c"]\n[merge]\nx = ["a"]', "merge names 'a', which is not among materials"),
+        (
+            'sets = ["a"]\nmaterials = ["b", "c"]\n[merge]\nx = ["a"]',
+            "merge names 'a', which is not among materials",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(text: str, why: str, tmp_path: Path):
@@ -122,7 +154,8 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
 
 
 def test_sets_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A file is sought from where scene.toml is, a variable is filled in, and one that is not set is named."""
+    """A file is sought from where scene.toml is, a variable is filled in, and one that is not set
+    is named."""
     three(tmp_path)
     monkeypatch.chdir("/")
     assert len(scene.read(written(tmp_path, 'sets = ["a.npz"]')).sweeps()) == 12
@@ -137,7 +170,9 @@ def test_sets_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_materials_are_narrowed_and_merged(tmp_path: Path):
     """Those at hand, with their new names, in their old order; labels and groups follow."""
     three(tmp_path)
-    found = scene.read(written(tmp_path, 'sets = ["a.npz"]\nmaterials = ["a", "c"]\nonly = ["force=100"]')).sweeps()
+    found = scene.read(
+        written(tmp_path, 'sets = ["a.npz"]\nmaterials = ["a", "c"]\nonly = ["force=100"]')
+    ).sweeps()
     assert (found.materials, found.labels.tolist()) == (("a", "c"), [0, 0, 1, 1])
     assert found.samples[:, 0, 0, 0].tolist() == [0, 0, 20, 20]
     merged = scene.read(written(tmp_path, 'sets = ["a.npz"]\n[merge]\nboth = ["c", "a"]')).sweeps()
@@ -168,10 +203,13 @@ def test_a_label_that_the_box_cannot_send_is_refused_at_once(tmp_path: Path):
     samples = np.arange(40, dtype=np.int16).reshape(4, 10, 1, 1)
     Dataset(samples, np.array([0, 0, 1, 1]), ("wood, oiled", "b"), 50.0).save(tmp_path / "a.npz")
     with pytest.raises(
-        FormatError, match=r"cannot send 'wood, oiled' \(11 characters\); .* name each anew in \[merge\]"
+        FormatError,
+        match=r"cannot send 'wood, oiled' \(11 characters\); .* name each anew in \[merge\]",
     ):
         scene.read(written(tmp_path, 'sets = ["a.npz"]')).sweeps()
-    renamed = scene.read(written(tmp_path, 'sets = ["a.npz"]\n[merge]\n"oiled wood" = ["wood, oiled"]')).sweeps()
+    renamed = scene.read(
+        written(tmp_path, 'sets = ["a.npz"]\n[merge]\n"oiled wood" = ["wood, oiled"]')
+    ).sweeps()
     assert renamed.materials == ("oiled wood", "b")
 
 

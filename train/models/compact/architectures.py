@@ -1,7 +1,8 @@
-"""The architectures of the compact network. In: a size. Out: an Architecture, with its stages and its cost.
+"""The architectures of the compact network. In: a size. Out: an Architecture, with its stages and
+its cost.
 
-All sizes are alike: dense strided convolutions over time with the taxels as input channels; the head sees the logarithm
-of every stage's mean responses.
+All sizes are alike: dense strided convolutions over time with the taxels as input channels; the
+head sees the logarithm of every stage's mean responses.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ LATER = (5, 2)
 SHORT_KERNEL = 4
 """The first kernel for a window that does not allow any stride."""
 MAINS_HZ = 50.0
-"""Frequency that is filtered out unless a fit is asked for another. Of 50 Hz nothing passes then, but of 60 Hz three quarters
-pass a kernel of 32 frames at 750 Hz."""
+"""Frequency that is filtered out unless a fit is asked for another. Of 50 Hz nothing passes then,
+but of 60 Hz three quarters pass a kernel of 32 frames at 750 Hz."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One convolution. steps: how many responses it gives; reach: frames of the window that one of them sees.
+    """One convolution. steps: how many responses it gives; reach: frames of the window that one of
+    them sees.
 
     Response j sees the frames from j * hop to j * hop + reach.
     """
@@ -40,7 +42,8 @@ class Stage:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a network costs: trained numbers, and multiply-accumulates of one sweep (convolutions and head)."""
+    """What a network costs: trained numbers, and multiply-accumulates of one sweep (convolutions
+    and head)."""
 
     weights: int
     macs: int
@@ -48,13 +51,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Architecture:
-    """The layers of one size. channels: of each stage; kernel and stride: of the first stage for long windows.
+    """The layers of one size. channels: of each stage; kernel and stride: of the first stage for
+    long windows.
 
-    planned: how many stages there were before some were cut off, 0 if none were; with none left the head sees only the
-    spectrum. spectrum: whether the head sees the bands of spectrum.py after the stages' responses. fewest: number of
-    stages that are never cut off. pools: how the filter bank of bank.py is pooled: 0 where there is none, 1 by magnitudes,
-    2 by shares as well. distribution: whether the head sees the shares of distribution.py. mains_hz:
-    of the mains whose hum stages and spectrum do not respond to.
+    planned: how many stages there were before some were cut off, 0 if none were; with none left the
+    head sees only the spectrum. spectrum: whether the head sees the bands of spectrum.py after the
+    stages' responses. fewest: number of stages that are never cut off. pools: how the filter bank
+    of bank.py is pooled: 0 where there is none, 1 by magnitudes, 2 by shares as well. distribution:
+    whether the head sees the shares of distribution.py. mains_hz: of the mains whose hum stages and
+    spectrum do not respond to.
     """
 
     channels: tuple[int, ...]
@@ -75,18 +80,23 @@ class Architecture:
     def stages(self, window: int) -> tuple[Stage, ...]:
         """The stages for a window of so many frames.
 
-        Kernel and stride of the first are halved as long as the last stage has fewer steps than MIN_LAST_STEPS; where
-        that leaves no stride, the kernel is SHORT_KERNEL. Raises FormatError where the window is too short for any.
+        Kernel and stride of the first are halved as long as the last stage has fewer steps than
+        MIN_LAST_STEPS; where that leaves no stride, the kernel is SHORT_KERNEL. Raises FormatError
+        where the window is too short for any.
         """
         return self._planned_stages(window)[: len(self.channels)]
 
     def _planned_stages(self, window: int) -> tuple[Stage, ...]:
         kernel, stride = self.kernel, self.stride
-        while (plan := self._plan(window, kernel, stride))[-1].steps < MIN_LAST_STEPS and stride > 1:
+        while (plan := self._plan(window, kernel, stride))[
+            -1
+        ].steps < MIN_LAST_STEPS and stride > 1:
             stride //= 2
             kernel = kernel // 2 if stride > 1 else SHORT_KERNEL
         if plan[-1].steps < 1:
-            raise FormatError(f"a window of {window} frames is too short for the network; record at least 16")
+            raise FormatError(
+                f"a window of {window} frames is too short for the network; record at least 16"
+            )
         return plan
 
     def _plan(self, window: int, kernel: int, stride: int) -> tuple[Stage, ...]:
@@ -97,10 +107,11 @@ class Architecture:
         return tuple(plan)
 
     def zero_sum(self, window: int) -> bool:
-        """Whether the first stage's kernels sum to zero over time for every taxel, so that no offset or slow drift matters.
+        """Whether the first stage's kernels sum to zero over time for every taxel, so that no
+        offset or slow drift matters.
 
-        They do where the window is long enough for a stride. A slow sensor's texture lies in just these low frequencies:
-        there each taxel's mean over the window is subtracted instead.
+        They do where the window is long enough for a stride. A slow sensor's texture lies in just
+        these low frequencies: there each taxel's mean over the window is subtracted instead.
         """
         return self._planned_stages(window)[0].stride > 1
 
@@ -123,8 +134,8 @@ ARCHITECTURES = {
     "50k": Architecture((40, 48, 64)),
     "100k": Architecture((32, 72, 104)),
 }
-"""By the approximate maximum of their weights, for 1500 x 4 x 4 raw counts and six materials. The last is as large as its
-bundle may be; the first has only the spectrum and a head."""
+"""By the approximate maximum of their weights, for 1500 x 4 x 4 raw counts and six materials. The
+last is as large as its bundle may be; the first has only the spectrum and a head."""
 DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
 """Of the method `compact`: all stages may be cut off where the spectrum alone does as well."""
 
@@ -133,10 +144,11 @@ DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
 class NoiseLimit:
     """A taxel that is much noisier than others is attenuated: a broken one must not drown the rest.
 
-    A taxel's noise is its mean difference between neighbouring frames, over `pairs` pairs at most. The reference is the
-    taxel at rank a quarter of all, the noisiest first (the fifth of 16, the noisiest of three): more than `times` its
-    noise is scaled down to that. A quarter and not half: where a finger touches only a few taxels, most are silent.
-    Nothing is attenuated where the reference is silent.
+    A taxel's noise is its mean difference between neighbouring frames, over `pairs` pairs at most.
+    The reference is the taxel at rank a quarter of all, the noisiest first (the fifth of 16, the
+    noisiest of three): more than `times` its noise is scaled down to that. A quarter and not half:
+    where a finger touches only a few taxels, most are silent. Nothing is attenuated where the
+    reference is silent.
     """
 
     times: float = 3.0

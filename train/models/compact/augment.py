@@ -1,8 +1,9 @@
-"""Augmentation. In: prepared sweeps and an Augmentation, which says what varies. Out: the same sweeps, changed.
+"""Augmentation. In: prepared sweeps and an Augmentation, which says what varies. Out: the same
+sweeps, changed.
 
-Each sweep becomes one that the skin might have given when attached anew, slid at another speed or read by a worse
-amplifier. Everything is drawn anew for every sweep, from one generator; a parameter at 0 draws and changes nothing. Neither
-PyTorch nor double precision is needed.
+Each sweep becomes one that the skin might have given when attached anew, slid at another speed or
+read by a worse amplifier. Everything is drawn anew for every sweep, from one generator; a parameter
+at 0 draws and changes nothing. Neither PyTorch nor double precision is needed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from scipy import fft
 
 Array = NDArray[np.float32]
 OCTAVES = 5.0
-"""How far below half the sampling rate the cut-off of a damped sweep may lie: at 750 Hz it is 12 to 375 Hz."""
+"""How far below half the sampling rate the cut-off of a damped sweep may lie: at 750 Hz it is 12 to
+375 Hz."""
 NOISY = 4.0
 """Maximum noise of a noisy taxel."""
 HUMMING = 0.25
@@ -29,17 +31,18 @@ PIECES = 1 << 16
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What varies; 0 is off. Spreads are standard deviations; amplitudes are in deviations of all taxels together, which
-    `Network.prepare` makes 1.
+    """What varies; 0 is off. Spreads are standard deviations; amplitudes are in deviations of all
+    taxels together, which `Network.prepare` makes 1.
 
-    What is not 0 by default was better in single runs on simulated sweeps at 750 Hz (T-REAL and T-HARD, seeds 301 to
-    399). The rest was not, there: the network's first layers deal with hum, drift and noisy taxels at less cost.
+    What is not 0 by default was better in single runs on simulated sweeps at 750 Hz (T-REAL and
+    T-HARD, seeds 301 to 399). The rest was not, there: the network's first layers deal with hum,
+    drift and noisy taxels at less cost.
     """
 
     shift: float = 1.0
-    """Largest displacement of the skin along the rows, in rows, either way; uniform, and interpolated between rows. A row
-    that enters over the edge carries between nothing and all of what the row at the edge feels. A line of taxels is not
-    moved."""
+    """Largest displacement of the skin along the rows, in rows, either way; uniform, and
+    interpolated between rows. A row that enters over the edge carries between nothing and all of
+    what the row at the edge feels. A line of taxels is not moved."""
     moved: float = 0.5
     """Share of the sweeps that are displaced so."""
     gain: float = 0.2
@@ -51,37 +54,43 @@ class Augmentation:
     stretch: float = 0.0
     """Largest change of speed, as a share of it, below 1."""
     damped: float = 0.5
-    """Share of the sweeps in which skin and tape absorb high frequencies: a first-order low-pass with its cut-off anywhere
-    in the OCTAVES below half the sampling rate."""
+    """Share of the sweeps in which skin and tape absorb high frequencies: a first-order low-pass
+    with its cut-off anywhere in the OCTAVES below half the sampling rate."""
     colour: float = 0.3
-    """Spread of the logarithm of the gain of each octave: tape and glove pass some frequencies better than others."""
+    """Spread of the logarithm of the gain of each octave: tape and glove pass some frequencies
+    better than others."""
     noise: float = 0.5
-    """Maximum white noise, on all taxels; drawn squared, so that little of it is more common than much."""
+    """Maximum white noise, on all taxels; drawn squared, so that little of it is more common than
+    much."""
     noisy: float = 0.0
     """Share of the taxels with white noise of their own, up to NOISY."""
     drift: float = 0.0
-    """Spread of a taxel's offset at the sweep's end; it changes linearly, from the opposite value at the start."""
+    """Spread of a taxel's offset at the sweep's end; it changes linearly, from the opposite value
+    at the start."""
     hum: float = 0.0
     """Largest amplitude of a sine of any frequency, the same on all taxels."""
     clipped: float = 0.0
-    """Share of the taxels that are clipped from above, anywhere within two of their own deviations of their mean."""
+    """Share of the taxels that are clipped from above, anywhere within two of their own deviations
+    of their mean."""
 
 
 SLOW = Augmentation(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
-"""For sensors that are too slow for vibrations: fingers and tape do not damp what these measure, and what they measure
-depends more on force and friction."""
+"""For sensors that are too slow for vibrations: fingers and tape do not damp what these measure,
+and what they measure depends more on force and friction."""
 
 
 def default_augmentation(zero_sum: bool) -> Augmentation:
-    """The augmentation where none is given. zero_sum: whether the sensor is fast enough for kernels that sum to zero."""
+    """The augmentation where none is given. zero_sum: whether the sensor is fast enough for kernels
+    that sum to zero."""
     return Augmentation() if zero_sum else SLOW
 
 
 def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
-    """Sweeps float32 [B, R * C * A, T], varied as `augmentation` says, R being `rows`; the same for the same state of `rng`.
+    """Sweeps float32 [B, R * C * A, T], varied as `augmentation` says, R being `rows`; the same for
+    the same state of `rng`.
 
-    rows: 1 where the taxels stand in a line, which is not moved.
-    x: what `Network.prepare` gives, about 1 and, where something is drawn that shows it, around 0. It is not changed.
+    rows: 1 where the taxels stand in a line, which is not moved. x: what `Network.prepare` gives,
+    about 1 and, where something is drawn that shows it, around 0. It is not changed.
     """
     x = _attached(x, rows, augmentation, rng)  # new memory: what follows may write to it
     for change in (_stretched, _filtered, _disturbed, _clipped):
@@ -107,8 +116,11 @@ def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -
 def _moved(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
     """Along the rows, in a share of the sweeps."""
     n, row = len(x), np.arange(rows, dtype=np.float32)
-    source = row + augmentation.shift * _symmetric(rng, n, 1) * _chosen(augmentation.moved, rng, n, 1)
-    # what lies under the row that enters is unknown: as much as its neighbour feels, nothing, or in between
+    source = row + augmentation.shift * _symmetric(rng, n, 1) * _chosen(
+        augmentation.moved, rng, n, 1
+    )
+    # what lies under the row that enters is unknown: as much as its neighbour feels, nothing, or in
+    # between
     level = np.where((source < 0) | (source > rows - 1), _uniform(rng, n, rows), np.float32(1))
     near = np.maximum(1 - np.abs(source.clip(0, rows - 1)[..., None] - row), 0)
     moved: Array = np.matmul(near * level[..., None], x.reshape(n, rows, -1)).reshape(x.shape)
@@ -124,7 +136,9 @@ def _stretched(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
     at = last - np.abs(last - time * (1 + augmentation.stretch * _symmetric(rng, n, 1)))
     left = np.floor(at).clip(0, last - 1)
     take = left.astype(np.int64)[:, None]
-    return _lerp(np.take_along_axis(x, take, 2), np.take_along_axis(x, take + 1, 2), (at - left)[:, None])
+    return _lerp(
+        np.take_along_axis(x, take, 2), np.take_along_axis(x, take + 1, 2), (at - left)[:, None]
+    )
 
 
 def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
@@ -139,7 +153,9 @@ def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
         damped = _chosen(augmentation.damped, rng, n, 1)
         passed = np.where(damped, 1 / np.sqrt(1 + (frequency / cut) ** 2), passed)
     if augmentation.colour:
-        octave = -np.log2(np.maximum(frequency, frequency[1]))  # from the highest frequency downwards
+        octave = -np.log2(
+            np.maximum(frequency, frequency[1])
+        )  # from the highest frequency downwards
         knot = octave.astype(np.int64)
         log_gain = augmentation.colour * _normal(rng, n, int(knot.max()) + 2)
         passed *= np.exp(_lerp(log_gain[:, knot], log_gain[:, knot + 1], octave % 1))
@@ -159,11 +175,17 @@ def _disturbed(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
         noise *= level + own
         x += noise
     if augmentation.drift:
-        x += augmentation.drift * _normal(rng, n, taxels, 1) * np.linspace(-1, 1, frames, dtype=np.float32)
+        x += (
+            augmentation.drift
+            * _normal(rng, n, taxels, 1)
+            * np.linspace(-1, 1, frames, dtype=np.float32)
+        )
     if augmentation.hum:
         amplitude = augmentation.hum * _uniform(rng, n, 1, 1) * _chosen(HUMMING, rng, n, 1, 1)
         frequency, phase = _uniform(rng, 2, n, 1, 1)
-        x += amplitude * np.sin(2 * pi * (frequency / 2 * np.arange(frames, dtype=np.float32) + phase))
+        x += amplitude * np.sin(
+            2 * pi * (frequency / 2 * np.arange(frames, dtype=np.float32) + phase)
+        )
     return x
 
 
@@ -177,7 +199,8 @@ def _clipped(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 
 
 def _white_noise(rng: Generator, n: int, taxels: int, frames: int) -> Array:
-    """White noise [n, taxels, frames]: pieces of one draw, since a draw for each would take longer than all else."""
+    """White noise [n, taxels, frames]: pieces of one draw, since a draw for each would take longer
+    than all else."""
     distance, angle = _uniform(
         rng, 2, (PIECES + frames + 1) // 2
     )  # Box and Muller 1958: NumPy's own takes three times as long

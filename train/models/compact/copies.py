@@ -1,4 +1,5 @@
-"""Augmented copies. In: sweeps of raw counts and an Augmentation. Out: the sweeps again, changed, as raw counts.
+"""Augmented copies. In: sweeps of raw counts and an Augmentation. Out: the sweeps again, changed,
+as raw counts.
 
 They show a head in closed form how materials vary. PyTorch is not needed.
 """
@@ -24,7 +25,8 @@ BATCH = 128
 
 
 def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -> Iterator[Dataset]:
-    """The sweeps again, `count` times, each time changed otherwise; in their order, of the same data type."""
+    """The sweeps again, `count` times, each time changed otherwise; in their order, of the same
+    data type."""
     rng, scale = np.random.default_rng(seed), texture_scale(sweeps.samples)
     for _ in range(count):
         samples = np.empty_like(sweeps.samples)
@@ -34,9 +36,11 @@ def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -
         yield replace(sweeps, samples=samples)
 
 
-def _changed(counts: NDArray[Any], scale: float, augmentation: Augmentation, rng: Generator) -> NDArray[np.float32]:
-    """Raw counts [B, T, R, C] or [B, T, R, C, A], changed; where they are integers rounded and clipped to what their data
-    type holds."""
+def _changed(
+    counts: NDArray[Any], scale: float, augmentation: Augmentation, rng: Generator
+) -> NDArray[np.float32]:
+    """Raw counts [B, T, R, C] or [B, T, R, C, A], changed; where they are integers rounded and
+    clipped to what their data type holds."""
     n, frames, rows, cols = counts.shape[:4]
     x = np.ascontiguousarray(counts.reshape(n, frames, -1).transpose(0, 2, 1), np.float32)
     means = x.mean(axis=2, keepdims=True)

@@ -1,4 +1,5 @@
-"""The methods of the default recipe. In: an Effort. Out: the METHODS default, default-reattached, filter-bank.
+"""The methods of the default recipe. In: an Effort. Out: the METHODS default, default-reattached,
+filter-bank.
 
 Each is what the box runs, the int8 graph; the form "float" is the same before quantization.
 """
@@ -22,22 +23,33 @@ from train.onnx_tools.graph_builder import GraphModel, with_head
 Array = NDArray[Any]
 
 
-def train(sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log) -> CompactModel:
-    """Choose and fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
+def train(
+    sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log
+) -> CompactModel:
+    """Choose and fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of
+    `sweeps`.
 
     Raises FormatError as recipe.fit, and where only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
     fit = recipe.fit(known, seed, settings, log)
     present = np.unique(sweeps.labels)
-    heads = {name: expanded_head(fit.weights[f"{name}.weight"], fit.weights[f"{name}.bias"], present, len(sweeps.materials))
-             for name in ("head", "int8")}  # fmt: skip
+    heads = {
+        name: expanded_head(
+            fit.weights[f"{name}.weight"],
+            fit.weights[f"{name}.bias"],
+            present,
+            len(sweeps.materials),
+        )
+        for name in ("head", "int8")
+    }
     forms = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
     return CompactModel(fit, *heads["int8"], fit.about["chosen"], forms=forms)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
-    """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which chooses and trains nothing."""
+    """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which
+    chooses and trains nothing."""
     settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
     return (
         Method(

@@ -1,7 +1,8 @@
 """Heads of a trunk in closed form. In: a HeadPlan, features of sweeps. Out: one linear head.
 
-A plan adds the logits of a few discriminants, each of some of the features: several that were fitted apart know more of
-an unseen condition than one that was fitted to all features at once, and together they are still one matrix.
+A plan adds the logits of a few discriminants, each of some of the features: several that were
+fitted apart know more of an unseen condition than one that was fitted to all features at once, and
+together they are still one matrix.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from train.models import discriminant
 
 Array = NDArray[Any]
 Given = tuple[Array, Array, Array, Array]
-"""What a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and labels [M] of augmented copies."""
+"""What a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and labels
+[M] of augmented copies."""
 
 
 @dataclass(frozen=True)
 class HeadPart:
-    """One discriminant. columns: numbers of the features that it sees. copies: whether it sees augmented copies of the
-    sweeps too. factor: of its logits; temperatures are in it."""
+    """One discriminant. columns: numbers of the features that it sees. copies: whether it sees
+    augmented copies of the sweeps too. factor: of its logits; temperatures are in it."""
 
     columns: tuple[int, ...]
     copies: bool
@@ -41,8 +43,8 @@ class HeadPart:
 
 @dataclass(frozen=True)
 class HeadData:
-    """Sweeps that a head is fitted to. features: [N, F], labels [N]; copied: [M, F] of augmented copies, and the number
-    [M] of the sweep that each was made of."""
+    """Sweeps that a head is fitted to. features: [N, F], labels [N]; copied: [M, F] of augmented
+    copies, and the number [M] of the sweep that each was made of."""
 
     features: Array
     labels: Array
@@ -53,7 +55,9 @@ class HeadData:
         """The sweeps `kept` (mask) and their copies."""
         position = np.cumsum(kept) - 1
         also = kept[self.source]
-        return HeadData(self.features[kept], self.labels[kept], self.copied[also], position[self.source[also]])
+        return HeadData(
+            self.features[kept], self.labels[kept], self.copied[also], position[self.source[also]]
+        )
 
     def given(self) -> Given:
         """What heads are fitted to."""
@@ -78,7 +82,8 @@ class HeadPlan:
         return HeadPlan(tuple(replace(p, factor=p.factor / temperature) for p in self.parts))
 
     def uncooled(self) -> HeadPlan:
-        """The same with logits as sure as discriminants are by themselves, which is never too modest."""
+        """The same with logits as sure as discriminants are by themselves, which is never too
+        modest."""
         return self.cooled(max(part.factor for part in self.parts))
 
     def columns(self) -> Array:
@@ -86,8 +91,14 @@ class HeadPlan:
         return np.unique(np.concatenate([np.array(part.columns) for part in self.parts]))
 
     def renumbered(self, kept: Array) -> HeadPlan:
-        """The same for a trunk with only the features `kept` (ascending numbers), which include `columns`."""
-        return HeadPlan(tuple(replace(p, columns=tuple(np.searchsorted(kept, p.columns).tolist())) for p in self.parts))
+        """The same for a trunk with only the features `kept` (ascending numbers), which include
+        `columns`."""
+        return HeadPlan(
+            tuple(
+                replace(p, columns=tuple(np.searchsorted(kept, p.columns).tolist()))
+                for p in self.parts
+            )
+        )
 
     def json(self) -> list[dict[str, Any]]:
         """For a fit's record."""
@@ -96,4 +107,6 @@ class HeadPlan:
     @classmethod
     def read(cls, entries: Sequence[dict[str, Any]]) -> Self:
         """What `json` gave."""
-        return cls(tuple(HeadPart(**entry | {"columns": tuple(entry["columns"])}) for entry in entries))
+        return cls(
+            tuple(HeadPart(**entry | {"columns": tuple(entry["columns"])}) for entry in entries)
+        )

@@ -1,7 +1,8 @@
-"""The methods of the compact network. In: an Effort. Out: the METHODS compact-bands to compact-100k, and compact.
+"""The methods of the compact network. In: an Effort. Out: the METHODS compact-bands to
+compact-100k, and compact.
 
-Each is trained as `palpate-train fit` does. The method is what the box runs, the int8 graph; its form "float" is the
-network that the graph was made from.
+Each is trained as `palpate-train fit` does. The method is what the box runs, the int8 graph; its
+form "float" is the network that the graph was made from.
 """
 
 from __future__ import annotations
@@ -26,30 +27,43 @@ RECIPE = FitRecipe()
 
 
 def train_compact(
-    sweeps: Dataset, inputs: Array, seed: int, *, architecture: Architecture, recipe: FitRecipe, log: Log
+    sweeps: Dataset,
+    inputs: Array,
+    seed: int,
+    *,
+    architecture: Architecture,
+    recipe: FitRecipe,
+    log: Log,
 ) -> CompactModel:
     """Train a network of this architecture and its closed-form heads, as `palpate-train fit` does.
 
-    inputs: the raw counts [N, T, R, C] of `sweeps`. Raises FormatError where only one material occurs, where each occurs
-    only once, or where a window is too short.
+    inputs: the raw counts [N, T, R, C] of `sweeps`. Raises FormatError where only one material
+    occurs, where each occurs only once, or where a window is too short.
     """
     known = replace(sweeps, samples=inputs).select(())
     fit = fit_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)
-    network, present, ran = fit.network(), np.unique(sweeps.labels), describe_run(recipe, "cpu", False, False)
+    network, present, ran = (
+        fit.network(),
+        np.unique(sweeps.labels),
+        describe_run(recipe, "cpu", False, False),
+    )
     network.expand_head(present, len(sweeps.materials), 1.0)
     head = expanded_head(*fit.int8_head(), present, len(sweeps.materials))
     return CompactModel(fit, *head, ran, fit.cost, {"float": NetworkModel(network, ran, fit.cost)})
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """One method for each size and `compact`, trained with this effort. log: called after every iteration."""
+    """One method for each size and `compact`, trained with this effort. log: called after every
+    iteration."""
     recipe = scale_steps(RECIPE, effort)
 
     def method(name: str, about: str, architecture: Architecture) -> Method:
         train = partial(train_compact, architecture=architecture, recipe=recipe, log=log)
         return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations")
 
-    convolutions = "strided convolutions, a spectrum and a closed-form head in int8, {},000 weights at most"
+    convolutions = (
+        "strided convolutions, a spectrum and a closed-form head in int8, {},000 weights at most"
+    )
     bands = "the spectrum that all taxels share, and a closed-form head: nothing else is learned"
     sizes = (
         method(f"compact-{size}", convolutions.format(size[:-1]) if one.channels else bands, one)

@@ -27,16 +27,21 @@ Array = NDArray[Any]
 
 
 class ZeroSum(nn.Conv1d):
-    """A convolution whose taps sum to zero for every filter and taxel: no offset changes its output.
+    """A convolution whose taps sum to zero for every filter and taxel: no offset changes its
+    output.
 
-    Gradient descent may hold any taps; their unwanted part is subtracted. mains: periods of the mains per frame; where it
-    is not 0 the hum is removed as well.
+    Gradient descent may hold any taps; their unwanted part is subtracted. mains: periods of the
+    mains per frame; where it is not 0 the hum is removed as well.
     """
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, mains: float = 0.0) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, stride: int, mains: float = 0.0
+    ) -> None:
         super().__init__(inputs, outputs, kernel, stride)
         phase = 2 * np.pi * mains * np.arange(kernel)
-        unwanted = np.stack([np.ones(kernel), np.sin(phase), np.cos(phase)][: 3 if mains else 1], axis=1)
+        unwanted = np.stack(
+            [np.ones(kernel), np.sin(phase), np.cos(phase)][: 3 if mains else 1], axis=1
+        )
         self.unwanted = torch.from_numpy(np.linalg.qr(unwanted)[0].astype(np.float32))
 
     def effective(self, weight: Tensor) -> Tensor:
@@ -51,7 +56,8 @@ class ZeroSum(nn.Conv1d):
 
 
 def limit_noise(x: Tensor) -> Tensor:
-    """Taxels [B, R * C, T], those that are much noisier than others attenuated; see architectures.NoiseLimit."""
+    """Taxels [B, R * C, T], those that are much noisier than others attenuated; see
+    architectures.NoiseLimit."""
     step, rank = NOISE_LIMIT.step(x.shape[2]), NOISE_LIMIT.rank(x.shape[1])
     noise = (x[:, :, 1::step] - x[:, :, :-1:step]).abs().mean(2, keepdim=True)
     limit = NOISE_LIMIT.times * noise.topk(rank + 1, dim=1).values[:, -1:]
@@ -59,21 +65,26 @@ def limit_noise(x: Tensor) -> Tensor:
 
 
 def band_powers(x: Tensor, form: SweepFormat, mains_hz: float) -> Tensor:
-    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis first."""
+    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis
+    first."""
     length = form.window // spectrum.SEGMENTS
-    waves, averaging = (torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form, mains_hz)))
+    waves, averaging = (
+        torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form, mains_hz))
+    )
     mean = x.unflatten(1, (-1, form.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
     cut = mean.unflatten(2, (spectrum.SEGMENTS, length))
     return torch.log(((cut @ waves).square() @ averaging).mean(2) + spectrum.QUIET).flatten(1)
 
 
 class Compact(Network):
-    """Strided convolutions over time with the taxels as channels; the head sees the logarithm of every mean response.
+    """Strided convolutions over time with the taxels as channels; the head sees the logarithm of
+    every mean response.
 
-    Where the window is long the first kernels sum to zero and do not respond to the mains: what is left is texture, and
-    int8 may take the raw counts as they are. `scale` brings the texture to about 1. The batch norms only serve training;
-    `fused` folds them in. keep_means: show the head each taxel's mean as well, for comparison: where materials were
-    recorded one after another the means reveal the session rather than the material.
+    Where the window is long the first kernels sum to zero and do not respond to the mains: what is
+    left is texture, and int8 may take the raw counts as they are. `scale` brings the texture to
+    about 1. The batch norms only serve training; `fused` folds them in. keep_means: show the head
+    each taxel's mean as well, for comparison: where materials were recorded one after another the
+    means reveal the session rather than the material.
     """
 
     def __init__(
@@ -95,9 +106,15 @@ class Compact(Network):
         if architecture.channels and architecture.zero_sum(form.window):
             first = stages[0]
             periods = first.kernel * architecture.mains_hz / form.rate_hz
-            mains = architecture.mains_hz / form.rate_hz if norm and 1 <= periods <= first.kernel / 4 else 0.0
+            mains = (
+                architecture.mains_hz / form.rate_hz
+                if norm and 1 <= periods <= first.kernel / 4
+                else 0.0
+            )
             self.convs[0] = ZeroSum(inputs[0], inputs[1], first.kernel, first.stride, mains)
-        self.norms = nn.ModuleList(nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels)
+        self.norms = nn.ModuleList(
+            nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels
+        )
         bands = architecture.spectrum * spectrum.count(form)
         self.head = nn.Linear(sum(architecture.channels) + keep_means * inputs[0] + bands, classes)
 
@@ -111,7 +128,11 @@ class Compact(Network):
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] -> log mean responses [B, sum of channels]."""
         means = [x.mean(2) for x in self.responses(prepared)]
-        return torch.log(torch.cat(means, 1) + FLOOR) if means else prepared.new_zeros(len(prepared), 0)
+        return (
+            torch.log(torch.cat(means, 1) + FLOOR)
+            if means
+            else prepared.new_zeros(len(prepared), 0)
+        )
 
     def head_input(self, counts: Tensor) -> Tensor:
         """Raw counts [B, T, R, C] -> what the head sees of them [B, F]."""
@@ -125,7 +146,13 @@ class Compact(Network):
 
     def fused(self) -> Compact:
         """The same network for inference, its batch norms folded into the convolutions."""
-        plain = Compact(self.form, self.head.out_features, self.scale, norm=False, architecture=self.architecture)
+        plain = Compact(
+            self.form,
+            self.head.out_features,
+            self.scale,
+            norm=False,
+            architecture=self.architecture,
+        )
         plain.head.load_state_dict(self.head.state_dict())
         for target, conv, norm in zip(plain.convs, self.convs, self.norms, strict=True):
             assert isinstance(conv, nn.Conv1d)
@@ -137,9 +164,12 @@ class Compact(Network):
         return plain.eval()
 
     def cut(self, depth: int, spectrum: bool) -> Compact:
-        """The first `depth` stages of a fused network, with the spectrum or without; its head is not fitted yet."""
+        """The first `depth` stages of a fused network, with the spectrum or without; its head is
+        not fitted yet."""
         architecture = self.architecture.cut(depth, spectrum)
-        less = Compact(self.form, self.head.out_features, self.scale, False, self.keep_means, architecture)
+        less = Compact(
+            self.form, self.head.out_features, self.scale, False, self.keep_means, architecture
+        )
         less.convs.load_state_dict(self.convs[:depth].state_dict())
         return less.eval()
 
@@ -154,17 +184,22 @@ class Compact(Network):
         weights = {k: v.numpy() for k, v in self.state_dict().items()}
         if not self.convs:
             return weights
-        return weights | {"convs.0.weight": self.first_taps(self.convs[0].get_parameter("weight")).numpy()}
+        return weights | {
+            "convs.0.weight": self.first_taps(self.convs[0].get_parameter("weight")).numpy()
+        }
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; of a fused network."""
         weights = self.weights()
-        trunk = trunk_graph(self.form, self.scale, weights, self.architecture, keep_means=self.keep_means)
+        trunk = trunk_graph(
+            self.form, self.scale, weights, self.architecture, keep_means=self.keep_means
+        )
         return with_head(trunk, weights["head.weight"], weights["head.bias"])
 
     @torch.no_grad()
     def ranges(self, samples: Array) -> Ranges:
-        """The ranges for int8, found on some of the training sweeps [N, T, R, C]; of a fused network."""
+        """The ranges for int8, found on some of the training sweeps [N, T, R, C]; of a fused
+        network."""
         some = calibration_sweeps(samples)
         window = level_frames(self.form.window, self.architecture)
         level = some[:, :window].mean(axis=1, keepdims=True, dtype=np.float64)
@@ -173,5 +208,7 @@ class Compact(Network):
             for stage, x in zip(values[1:], self.responses(self.prepare(counts)), strict=True):
                 stage.append(x.numpy().ravel())
         # the minimum keeps the ranges of a silent set above 0
-        largest, *responses = (max(float(np.percentile(np.concatenate(x), PERCENTILE)), 1e-6) for x in values)
+        largest, *responses = (
+            max(float(np.percentile(np.concatenate(x), PERCENTILE)), 1e-6) for x in values
+        )
         return Ranges(largest, tuple(responses))

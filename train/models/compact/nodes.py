@@ -1,4 +1,5 @@
-"""Nodes that stages and filter bank share. In: tensors of a graph. Out: the same in integers, or summed over time.
+"""Nodes that stages and filter bank share. In: tensors of a graph. Out: the same in integers, or
+summed over time.
 
 Integers go up to the sums over time, so that all machines give the same bits there.
 """
@@ -21,8 +22,8 @@ FLOAT = TensorProto.FLOAT
 TENTHS = spectrum.SEGMENTS
 """Into how many parts a window is cut for early decisions."""
 MAX_TAP = 64
-"""Largest integer tap, seven bits: two products of eight bits overflow the 16-bit sums of an x86 without VNNI, and the
-answer there would differ from that on Arm."""
+"""Largest integer tap, seven bits: two products of eight bits overflow the 16-bit sums of an x86
+without VNNI, and the answer there would differ from that on Arm."""
 MIDDLE = 128
 """The byte that stands for 0 where bytes have a sign."""
 
@@ -42,26 +43,45 @@ def channels_first(g: GraphBuilder, x: str, step: float, zero: int) -> str:
     return counts_of(g, g("Transpose", x, perm=[0, 2, 1]), step, zero)
 
 
-def int8_weights(g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool) -> tuple[str, str]:
-    """Weight [filters, inputs, kernel] in seven bits, a step for each filter; bias in 32 bits, in the product of both
-    steps."""
+def int8_weights(
+    g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool
+) -> tuple[str, str]:
+    """Weight [filters, inputs, kernel] in seven bits, a step for each filter; bias in 32 bits, in
+    the product of both steps."""
     least = np.abs(bias) / (step * 2**30)  # a silent filter's bias must fit as well
-    steps = np.maximum(np.maximum(np.abs(weight).max(axis=(1, 2)) / MAX_TAP, least), 1e-12).astype(np.float32)
-    taps = (zero_sum_taps if zero_sum else np.rint)(weight / steps[:, None, None].astype(np.float64))
+    steps = np.maximum(np.maximum(np.abs(weight).max(axis=(1, 2)) / MAX_TAP, least), 1e-12).astype(
+        np.float32
+    )
+    taps = (zero_sum_taps if zero_sum else np.rint)(
+        weight / steps[:, None, None].astype(np.float64)
+    )
     zeros = np.zeros(len(weight))
     product = steps.astype(np.float64) * step
     return (
-        g("DequantizeLinear", g.constant(taps, "int8"), g.constant(steps), g.constant(zeros, "int8"), axis=0),
-        g("DequantizeLinear", g.constant(np.rint(bias / product), "int32"), g.constant(product),
-          g.constant(zeros, "int32"), axis=0),
-    )  # fmt: skip
+        g(
+            "DequantizeLinear",
+            g.constant(taps, "int8"),
+            g.constant(steps),
+            g.constant(zeros, "int8"),
+            axis=0,
+        ),
+        g(
+            "DequantizeLinear",
+            g.constant(np.rint(bias / product), "int32"),
+            g.constant(product),
+            g.constant(zeros, "int32"),
+            axis=0,
+        ),
+    )
 
 
 def zero_sum_taps(taps: Array) -> Array:
-    """Taps [filters, taxels, kernel] rounded so that each kernel sums to zero, as it did before rounding.
+    """Taps [filters, taxels, kernel] rounded so that each kernel sums to zero, as it did before
+    rounding.
 
-    The sum after rounding is the surplus. As many taps, those nearest to being rounded the other way, are rounded that
-    way instead. None leaves the range: a tap at its end is whole and was not rounded, and there are enough others.
+    The sum after rounding is the surplus. As many taps, those nearest to being rounded the other
+    way, are rounded that way instead. None leaves the range: a tap at its end is whole and was not
+    rounded, and there are enough others.
     """
     taps = taps - taps.mean(axis=2, keepdims=True)
     rounded = np.rint(taps)
@@ -86,16 +106,32 @@ def known_steps(stage: Stage, window: int, tenths: bool) -> list[int]:
 
 
 def sums(
-    g: GraphBuilder, x: str, steps: int, counts: ArrayLike, integers: bool = False, rowwise: bool = False, time_last: bool = False
-) -> str:  # fmt: skip
-    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, number of counts, C].
+    g: GraphBuilder,
+    x: str,
+    steps: int,
+    counts: ArrayLike,
+    integers: bool = False,
+    rowwise: bool = False,
+    time_last: bool = False,
+) -> str:
+    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, number of
+    counts, C].
 
-    rowwise: [m, steps, C], `counts` of m rows -> [m, counts in a row, C]. time_last: of [..., C, steps]. The matrix of ones
-    and zeros is computed from a few numbers when the box loads the graph; as a constant it would be large.
+    rowwise: [m, steps, C], `counts` of m rows -> [m, counts in a row, C]. time_last: of [..., C,
+    steps]. The matrix of ones and zeros is computed from a few numbers when the box loads the
+    graph; as a constant it would be large.
     """
-    at = g("Reshape", g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))), g.constant([1, steps], "int64"))
+    at = g(
+        "Reshape",
+        g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))),
+        g.constant([1, steps], "int64"),
+    )
     counts = np.asarray(counts)
-    known = g("Less", at, g.constant(counts.reshape((len(counts), -1, 1) if rowwise else (-1, 1)), "int32"))
+    known = g(
+        "Less",
+        at,
+        g.constant(counts.reshape((len(counts), -1, 1) if rowwise else (-1, 1)), "int32"),
+    )
     ones = g("Cast", known, to=TensorProto.UINT8 if integers else FLOAT)
     product = "MatMulInteger" if integers else "MatMul"
     if not time_last:
@@ -104,9 +140,13 @@ def sums(
     return g("Transpose", g(product, x, ones), perm=[0, 2, 1])
 
 
-def mean_factors(g: GraphBuilder, step: float, counts: list[int], size: int, rowwise: bool = False) -> str:
+def mean_factors(
+    g: GraphBuilder, step: float, counts: list[int], size: int, rowwise: bool = False
+) -> str:
     """What makes means of sums over `counts`, in the shape that `_sums` gives."""
-    factors = np.array([step / max(n, 1) for n in counts])  # where nothing is known the sum is 0 as well
+    factors = np.array(
+        [step / max(n, 1) for n in counts]
+    )  # where nothing is known the sum is 0 as well
     lead = (len(counts), 1) if rowwise else (1, len(counts))
     factors = factors.reshape(*lead, 1) if len(counts) > 1 else factors[0]
     return g("Expand", g.constant(factors), g.constant([*lead, size], "int64"))

@@ -1,10 +1,12 @@
-"""The spectrum that all taxels share. In: the form of a sweep. Out: log band powers, in PyTorch and as ONNX nodes.
+"""The spectrum that all taxels share. In: the form of a sweep. Out: log band powers, in PyTorch and
+as ONNX nodes.
 
-Fixed features beside the learned ones. What is trained to separate materials discards what does not help it: it hardly
-sees that a material is none of them, and it fits its training sweeps too closely. Here the taxels' mean over the grid, on
-each axis by itself, is cut into tenths of the window, and the power in bands of each tenth's spectrum is taken (Welch
-1967), as logarithms. Each tenth is processed by itself, so that no offset and no later frame matters; the hum of the
-mains is removed.
+Fixed features beside the learned ones. What is trained to separate materials discards what does not
+help it: it hardly sees that a material is none of them, and it fits its training sweeps too
+closely. Here the taxels' mean over the grid, on each axis by itself, is cut into tenths of the
+window, and the power in bands of each tenth's spectrum is taken (Welch 1967), as logarithms. Each
+tenth is processed by itself, so that no offset and no later frame matters; the hum of the mains is
+removed.
 """
 
 from __future__ import annotations
@@ -25,40 +27,57 @@ SEGMENTS = 10
 BANDS = 24
 """Of a spectrum, at most: their edges lie evenly on a logarithmic axis, at whole half bins."""
 QUIET = 1e-4
-"""Added to a band's power before its logarithm, where the texture's is about 1: a silent skin stays finite."""
+"""Added to a band's power before its logarithm, where the texture's is about 1: a silent skin stays
+finite."""
 MIN_SEGMENT = 4
 """Frames of the shortest tenth that has a spectrum."""
 
 
 def count(form: SweepFormat) -> int:
-    """How many bands of all axes there are; 0 where a tenth of the window has fewer frames than MIN_SEGMENT."""
+    """How many bands of all axes there are; 0 where a tenth of the window has fewer frames than
+    MIN_SEGMENT."""
     length = form.window // SEGMENTS
     return form.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
 
 
 def nodes(
-    g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float, mains_hz: float, tenths: bool
+    g: GraphBuilder,
+    raw: str,
+    attenuation: str,
+    form: SweepFormat,
+    scale: float,
+    mains_hz: float,
+    tenths: bool,
 ) -> str:
-    """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1, rows, bands], those of
-    the first axis first.
+    """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1,
+    rows, bands], those of the first axis first.
 
-    One row for the whole window; with `tenths` one for each of the first tenth, the first two tenths, and so on.
+    One row for the whole window; with `tenths` one for each of the first tenth, the first two
+    tenths, and so on.
     """
     length, axes, taxels = form.window // SEGMENTS, form.axes, form.rows * form.cols
     mean = scale / taxels * (np.tile(np.eye(axes), (taxels, 1)) if axes > 1 else 1)  # [M, A]
-    share = g("Mul", g("Reshape", attenuation, g.constant([form.channels, 1], "int64")), g.constant(mean))
+    share = g(
+        "Mul", g("Reshape", attenuation, g.constant([form.channels, 1], "int64")), g.constant(mean)
+    )
     x = g("MatMul", g("Cast", raw, to=TensorProto.FLOAT), share)
     if form.window % SEGMENTS:
         x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * SEGMENTS, 1)))
     if axes > 1:
-        x = g("Transpose", g("Reshape", x, g.constant([SEGMENTS, length, axes], "int64")), perm=[0, 2, 1])
+        x = g(
+            "Transpose",
+            g("Reshape", x, g.constant([SEGMENTS, length, axes], "int64")),
+            perm=[0, 2, 1],
+        )
     x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
     x = g("MatMul", x, _wave_nodes(g, length, mains(form, mains_hz)))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
         power = g("Reshape", power, g.constant([SEGMENTS, count(form)], "int64"))
     if tenths:
-        power = g("MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power)
+        power = g(
+            "MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power
+        )
     else:
         power = g("ReduceMean", power, axes=[0])
     power = g("Log", g("Add", power, g.constant(QUIET)))
@@ -66,15 +85,18 @@ def nodes(
 
 
 def _edges(length: int) -> Array:
-    """Edges [n + 1] of the n bands of a segment of `length` frames, in half bins of its spectrum: from 2 to `length`.
+    """Edges [n + 1] of the n bands of a segment of `length` frames, in half bins of its spectrum:
+    from 2 to `length`.
 
-    With whole bins, which are as far apart as Hann's window is wide, the AUROC of unknown materials falls by .007.
+    With whole bins, which are as far apart as Hann's window is wide, the AUROC of unknown materials
+    falls by .007.
     """
     return np.unique(np.rint(np.geomspace(2, length + 1, BANDS + 1)).astype(int))
 
 
 def mains(form: SweepFormat, mains_hz: float) -> float:
-    """Periods of mains of this frequency per frame; 0 where a segment holds less than two, or the hum is too fast to be told apart."""
+    """Periods of mains of this frequency per frame; 0 where a segment holds less than two, or the
+    hum is too fast to be told apart."""
     periods = mains_hz / form.rate_hz
     return periods if periods * (form.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
 
@@ -88,7 +110,8 @@ def _unwanted(length: int, mains: float) -> Array:
 
 
 def _window(length: int) -> Array:
-    """Hann's window without its zeros [length, 1], scaled so that white noise has the same power for all lengths."""
+    """Hann's window without its zeros [length, 1], scaled so that white noise has the same power
+    for all lengths."""
     window = np.hanning(length + 2)[1:-1, None]
     scaled: Array = window / np.sqrt((window**2).sum())
     return scaled
@@ -96,32 +119,44 @@ def _window(length: int) -> Array:
 
 @cache
 def matrices(length: int, mains: float) -> tuple[Array, Array]:
-    """Waves [length, 2 * half bins], and the matrix that averages their squares over each band, float32."""
+    """Waves [length, 2 * half bins], and the matrix that averages their squares over each band,
+    float32."""
     k = np.arange(2, length + 1)
     phase = np.pi / length * (np.arange(length)[:, None] * k % (2 * length))
     waves = np.hstack([np.cos(phase), np.sin(phase)]) * _window(length)
     unwanted, edges = _unwanted(length, mains), _edges(length)
     both = np.tile(k, 2)[:, None]
     averaging = ((both >= edges[:-1]) & (both < edges[1:])) / np.diff(edges)
-    return (waves - unwanted @ (unwanted.T @ waves)).astype(np.float32), averaging.astype(np.float32)
+    return (waves - unwanted @ (unwanted.T @ waves)).astype(np.float32), averaging.astype(
+        np.float32
+    )
 
 
 def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:
-    """Nodes that compute the waves. onnxruntime folds them into one constant when it loads the model, so that the file
-    does not hold them."""
+    """Nodes that compute the waves. onnxruntime folds them into one constant when it loads the
+    model, so that the file does not hold them."""
     one = g.constant(1, "int64")
-    n = g("Unsqueeze", g("Range", g.constant(0, "int64"), g.constant(length, "int64"), one), g.constant([1], "int64"))
+    n = g(
+        "Unsqueeze",
+        g("Range", g.constant(0, "int64"), g.constant(length, "int64"), one),
+        g.constant([1], "int64"),
+    )
     k = g("Range", g.constant(2, "int64"), g.constant(length + 1, "int64"), one)
-    phase = g("Cast", g("Mod", g("Mul", n, k), g.constant(2 * length, "int64")), to=TensorProto.FLOAT)
+    phase = g(
+        "Cast", g("Mod", g("Mul", n, k), g.constant(2 * length, "int64")), to=TensorProto.FLOAT
+    )
     phase = g("Mul", phase, g.constant(np.pi / length))
-    waves = g("Mul", g("Concat", g("Cos", phase), g("Sin", phase), axis=1), g.constant(_window(length)))
+    waves = g(
+        "Mul", g("Concat", g("Cos", phase), g("Sin", phase), axis=1), g.constant(_window(length))
+    )
     unwanted = g.constant(_unwanted(length, mains))
     removed = g("MatMul", unwanted, g("MatMul", g("Transpose", unwanted, perm=[1, 0]), waves))
     return g("Sub", waves, removed)
 
 
 def _averaging_nodes(g: GraphBuilder, edges: Array) -> str:
-    """Nodes that compute the matrix that averages squares over each band; folded as those of `_wave_nodes` are."""
+    """Nodes that compute the matrix that averages squares over each band; folded as those of
+    `_wave_nodes` are."""
     k = g("Range", *(g.constant(n, "int64") for n in (2, int(edges[-1]), 1)))
     k = g("Unsqueeze", g("Concat", k, k, axis=0), g.constant([1], "int64"))
     below, beyond = (g("Less", k, g.constant(side, "int64")) for side in (edges[:-1], edges[1:]))

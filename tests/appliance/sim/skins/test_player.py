@@ -1,4 +1,5 @@
-"""The terminal of an emulated skin: its times, its plug, commands, readers that are slow or not there, and bad cables."""
+"""The terminal of an emulated skin: its times, its plug, commands, readers that are slow or not
+there, and bad cables."""
 
 from __future__ import annotations
 
@@ -25,7 +26,9 @@ class PlayedSkin:
         self.source = Numbered(name)
         self.virtual = VirtualClock()
         self.clock = PlayerClock(self.virtual)
-        self.player = Player(wire(name, self.source.rate_hz), self.source, self.clock, folder / "ttySkin", **how)
+        self.player = Player(
+            wire(name, self.source.rate_hz), self.source, self.clock, folder / "ttySkin", **how
+        )
         self.clock.player = self.player
         self.fd = -1
 
@@ -49,7 +52,9 @@ class PlayedSkin:
 
     def expected(self, first: int, n: int) -> bytes:
         """Frames `first` to `first + n` of a skin without counters."""
-        return b"".join(wire("flexitac", 100).frame(self.source.frame(i), 0) for i in range(first, first + n))
+        return b"".join(
+            wire("flexitac", 100).frame(self.source.frame(i), 0) for i in range(first, first + n)
+        )
 
 
 @pytest.fixture
@@ -80,7 +85,8 @@ def test_sends_only_while_a_program_has_it_open(bench: PlayedSkin) -> None:
 
 
 def test_unplugged_and_plugged_in_again(bench: PlayedSkin) -> None:
-    """The reader gets an end of file or EIO, the link is gone; then there is another terminal under it."""
+    """The reader gets an end of file or EIO, the link is gone; then there is another terminal under
+    it."""
     bench.open()
     bench.read(0.1)
     bench.player.unplug()
@@ -96,7 +102,8 @@ def test_unplugged_and_plugged_in_again(bench: PlayedSkin) -> None:
 
 
 def test_slow_reader_gets_what_the_driver_held(bench: PlayedSkin) -> None:
-    """A backlog: what the driver could hold comes first, unchanged; the rest was thrown away and is counted."""
+    """A backlog: what the driver could hold comes first, unchanged; the rest was thrown away and is
+    counted."""
     bench.open()
     bench.clock.sleep_until(bench.clock.now_ns() + 5 * SECOND)
     data = bench.read(0.505)
@@ -107,7 +114,8 @@ def test_slow_reader_gets_what_the_driver_held(bench: PlayedSkin) -> None:
 
 
 def test_a_computer_that_is_too_slow_for_the_skin_skips_frames(tmp_path: Path) -> None:
-    """A step makes a bounded number of frames, however long ago the last one was; a skin's counter shows the gap."""
+    """A step makes a bounded number of frames, however long ago the last one was; a skin's counter
+    shows the gap."""
     bench = PlayedSkin("papillarray", tmp_path)
     bench.open()
     bench.virtual.sleep_until(bench.clock.now_ns() + 3600 * SECOND)
@@ -129,7 +137,8 @@ def test_pause_and_bad_cable(bench: PlayedSkin) -> None:
 
 
 def test_as_fast_as_it_is_read(tmp_path: Path) -> None:
-    """Without pace the next frame is sent when the one before is read: all come, and time plays no part."""
+    """Without pace the next frame is sent when the one before is read: all come, and time plays no
+    part."""
     bench = PlayedSkin("flexitac", tmp_path, paced=False)
     bench.open()
     data = b""
@@ -160,7 +169,8 @@ def test_adapter_that_collects(tmp_path: Path) -> None:
 
 
 def test_commands_reach_the_skin(tmp_path: Path) -> None:
-    """A command changes the rate from then on; an adapter answers at once and sends when it was told to."""
+    """A command changes the rate from then on; an adapter answers at once and sends when it was
+    told to."""
     bench = PlayedSkin("papillarray", tmp_path)
     bench.open()
     bench.read(0.1)

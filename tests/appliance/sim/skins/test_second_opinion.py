@@ -1,4 +1,5 @@
-"""The makers' and users' own packages read the emulated skins: they see the frames that were played.
+"""The makers' and users' own packages read the emulated skins: they see the frames that were
+played.
 
 The packages block while nothing comes, so each runs in a process of its own that is given a minute.
 """
@@ -42,17 +43,21 @@ assert all(len(f.pressure) == 2 and f.accelerometer[1].tolist() == [0, 0, 16384]
 frames = [f.pressure for f in frames]
 """,
 }
-"""Each skin's reader, by its own documentation. ReSkin's text has no first frame: a reader joins in the middle of a line."""
+"""Each skin's reader, by its own documentation. ReSkin's text has no first frame: a reader joins in
+the middle of a line."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
-    """Every frame that it reads is one that was played, in order; only text is rounded, to two digits."""
+    """Every frame that it reads is one that was played, in order; only text is rounded, to two
+    digits."""
     end = "\nprint(json.dumps([np.asarray(f).ravel().tolist() for f in frames]))"
     with played(name) as player:
         program = f"import json, numpy as np\nport, n = {str(player.path)!r}, {FRAMES}\n{READERS[name]}{end}"
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+        )
     assert done.returncode == 0, done.stderr[-800:]
     read = np.array(json.loads(done.stdout.splitlines()[-1]))
     source = Numbered(name)
@@ -65,6 +70,8 @@ def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
 
 def _number(frame: np.ndarray, source: Numbered) -> int:
     """The number of the frame that was played and looks so."""
-    same = [i for i in range(199) if np.allclose(source.frame(i).ravel(), frame, rtol=0, atol=0.0051)]
+    same = [
+        i for i in range(199) if np.allclose(source.frame(i).ravel(), frame, rtol=0, atol=0.0051)
+    ]
     assert len(same) == 1, f"no such frame was played: {frame[:8]}…"
     return same[0]

@@ -1,4 +1,5 @@
-"""What the emulated skins send, against bytes put together by hand from the published layouts. None of them was at hand."""
+"""What the emulated skins send, against bytes put together by hand from the published layouts. None
+of them was at hand."""
 
 from __future__ import annotations
 
@@ -17,13 +18,15 @@ PREVIEW = bytes.fromhex(
     "556677880201001b0003002700040029020500630206000f0307002b0300004efa320031aa768f0000000002002d002b01"
     "090041005b0075008f00a900c300dd"
 )
-"""The first bytes that a real PapillArray controller (v2.0, two sensors) sent to a user, who published them in the tests
-of the project langxin11/parallel_gripper_tactile."""
+"""The first bytes that a real PapillArray controller (v2.0, two sensors) sent to a user, who
+published them in the tests of the project langxin11/parallel_gripper_tactile."""
 
 
 def test_marked() -> None:
     """FlexiTac: AA 55, then the rows."""
-    assert wires.wire("flexitac", 100).frame(np.array([[1, 2], [3, 255]], np.uint8), 0) == bytes.fromhex("aa55010203ff")
+    assert wires.wire("flexitac", 100).frame(
+        np.array([[1, 2], [3, 255]], np.uint8), 0
+    ) == bytes.fromhex("aa55010203ff")
     big = wires.Marked(100, b"\x55\xaa\x01", ">u2", b"\r\n")
     assert big.frame(np.array([[1, 0x1234]], np.uint16), 0) == bytes.fromhex("55aa01000112340d0a")
 
@@ -34,8 +37,28 @@ def test_magnetic() -> None:
     sent = wires.wire("anyskin", 28).frame(taxels, 0)
     assert len(sent) == 82
     assert struct.unpack("<20f2s", sent) == (
-        25, -7, -6, -5, 25, -4, -3, -2, 25, -1, 0, 1, 25, 2, 3, 4, 25, 5, 6, 7, b"\r\n",
-    )  # fmt: skip
+        25,
+        -7,
+        -6,
+        -5,
+        25,
+        -4,
+        -3,
+        -2,
+        25,
+        -1,
+        0,
+        1,
+        25,
+        2,
+        3,
+        4,
+        25,
+        5,
+        6,
+        7,
+        b"\r\n",
+    )
     text = wires.wire("reskin", 28).frame(np.array([[[1.25, -2, 300.126]]], np.float32), 0)
     assert text == b"25.00\t1.25\t-2.00\t300.13\r\n"
 
@@ -51,7 +74,8 @@ def test_rows() -> None:
 
 
 def test_papillarray_as_a_controller_sends_it() -> None:
-    """The form of two sensors is that of a real controller to the byte; sum and end marker follow from the layout."""
+    """The form of two sensors is that of a real controller to the byte; sum and end marker follow
+    from the layout."""
     sent = wires.PapillArray(counter=0x32FA4E).frame(np.zeros((6, 3, 3), np.float32), 0x8F76AA31)
     assert sent.startswith(PREVIEW)
     body = sent[4:-6]
@@ -59,7 +83,8 @@ def test_papillarray_as_a_controller_sends_it() -> None:
 
 
 def test_papillarray_numbers() -> None:
-    """One sensor, by hand: block 3 lies where the table says, and pillar 9's force is the last but its displacement."""
+    """One sensor, by hand: block 3 lies where the table says, and pillar 9's force is the last but
+    its displacement."""
     skin = wires.PapillArray(500, counter=7)
     force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     sent = skin.frame(force, 123_456_789_012)
@@ -79,7 +104,8 @@ def test_papillarray_numbers() -> None:
 
 
 def test_papillarray_commands() -> None:
-    """f sets one of four rates, in parts, too; z makes the mean of two seconds the zero; nothing answers."""
+    """f sets one of four rates, in parts, too; z makes the mean of two seconds the zero; nothing
+    answers."""
     skin = wires.PapillArray(1000)
     assert skin.hear(b"f2") == b""
     assert skin.period_ns == 1e6
@@ -97,7 +123,8 @@ def test_papillarray_commands() -> None:
 
 
 def test_slcan() -> None:
-    """The adapter answers as Lawicel's; the sensor is quiet until the channel is open at 1 Mbit/s and it was started."""
+    """The adapter answers as Lawicel's; the sensor is quiet until the channel is open at 1 Mbit/s
+    and it was started."""
     skin = wires.Slcan(100)
     taxels = np.arange(48).reshape(4, 4, 3).astype(np.uint16) + 0x1234
     assert skin.hear(b"t20120700\rO\rS9\r") == b"\a\a\a"
@@ -119,7 +146,8 @@ def test_slcan() -> None:
 
 
 def test_robotiq() -> None:
-    """It sends after autosend with a period, stops at 0, and tells its version; fields in the published order."""
+    """It sends after autosend with a period, stops at 0, and tells its version; fields in the
+    published order."""
     skin = wires.Robotiq(60)
     assert not skin.streaming
     assert skin.hear(bytes.fromhex("009a00e300 9a0058")) == bytes.fromhex("9a00e305") + b"2.0.1"
@@ -145,7 +173,8 @@ def test_unknown_name() -> None:
 
 
 def test_a_zero_that_is_missing_makes_no_frame() -> None:
-    """The controller's sum does not see it. Wherever one is missing, the box takes the frame as it was sent, or none."""
+    """The controller's sum does not see it. Wherever one is missing, the box takes the frame as it
+    was sent, or none."""
     profile = skin_profile.load("papillarray", [ROOT / "firmware_config" / "skins"])
     force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     sent = wires.PapillArray().frame(force, 1000)

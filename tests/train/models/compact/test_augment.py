@@ -11,7 +11,19 @@ from scipy.stats import kurtosis
 from train.models.compact.augment import SLOW, Augmentation, augment, default_augmentation
 
 OFF = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
-NAMES = ("gain", "gains", "silent", "stretch", "damped", "colour", "noise", "noisy", "drift", "hum", "clipped")
+NAMES = (
+    "gain",
+    "gains",
+    "silent",
+    "stretch",
+    "damped",
+    "colour",
+    "noise",
+    "noisy",
+    "drift",
+    "hum",
+    "clipped",
+)
 
 
 def sweeps(n: int = 16, taxels: int = 16, frames: int = 300, seed: int = 1) -> np.ndarray:
@@ -39,13 +51,21 @@ def test_nothing_varies_at_zero_and_nothing_is_drawn():
 
 
 @pytest.mark.parametrize(
-    "settings", [Augmentation(), replace(OFF, shift=1.0, moved=0.5), *(replace(OFF, **{k: 0.5}) for k in NAMES)]
+    "settings",
+    [
+        Augmentation(),
+        replace(OFF, shift=1.0, moved=0.5),
+        *(replace(OFF, **{k: 0.5}) for k in NAMES),
+    ],
 )
 def test_every_parameter_changes_sweeps_each_otherwise_and_leaves_its_input(settings: Augmentation):
-    """Same generator, same bits; another one, others; sweeps that were equal differ; the input stays."""
+    """Same generator, same bits; another one, others; sweeps that were equal differ; the input
+    stays."""
     x = np.repeat(sweeps(1), 12, axis=0)
     before = x.copy()
-    once, again, other = (augment(x, 4, settings, np.random.default_rng(seed)) for seed in (4, 4, 5))
+    once, again, other = (
+        augment(x, 4, settings, np.random.default_rng(seed)) for seed in (4, 4, 5)
+    )
     assert once.shape == x.shape
     assert once.dtype == np.float32
     assert np.isfinite(once).all()
@@ -63,7 +83,8 @@ def test_sensors_without_vibrations_get_an_augmentation_of_their_own():
 
 @pytest.mark.slow
 def test_a_shift_reads_between_rows_and_fills_the_edge():
-    """Each row becomes a mixture of two neighbours, the same in all rows; what comes in is part of the edge's row."""
+    """Each row becomes a mixture of two neighbours, the same in all rows; what comes in is part of
+    the edge's row."""
     x = sweeps(200, frames=50)
     now = varied(x, shift=1.0, moved=0.5).reshape(200, 4, 200)
     mixtures = now @ np.linalg.pinv(x.reshape(200, 4, 200))
@@ -89,7 +110,8 @@ def test_a_line_of_taxels_is_not_moved(rows: int):
 
 
 def test_gains_are_of_all_taxels_or_of_each():
-    """A logarithm of the wanted spread; `gain` the same for all taxels of a sweep, `gains` not; the same at all times."""
+    """A logarithm of the wanted spread; `gain` the same for all taxels of a sweep, `gains` not; the
+    same at all times."""
     x = sweeps(400, frames=20)
     for name, taxels in (("gain", 1), ("gains", 16)):
         ratio = varied(x, **{name: 0.3}) / x
@@ -122,7 +144,8 @@ def test_a_stretch_changes_the_rate_by_no_more_than_asked():
 
 @pytest.mark.slow
 def test_damping_takes_high_rates_and_colour_any():
-    """Damping lowers the highest rates of its share of the sweeps, never the lowest; colour raises some bands as well."""
+    """Damping lowers the highest rates of its share of the sweeps, never the lowest; colour raises
+    some bands as well."""
     x = sweeps(200, frames=512)
     damped = varied(x, damped=0.5)
     high, low = (band(damped, *edges) / band(x, *edges) for edges in ((0.8, 1), (0.002, 0.008)))
@@ -131,7 +154,9 @@ def test_damping_takes_high_rates_and_colour_any():
     assert low.min() > 0.9
     assert high.min() < 0.01
     coloured = varied(x, colour=0.3)
-    log_high, log_low = (0.5 * np.log(band(coloured, *e) / band(x, *e)) for e in ((0.9, 1), (0.1, 0.15)))
+    log_high, log_low = (
+        0.5 * np.log(band(coloured, *e) / band(x, *e)) for e in ((0.9, 1), (0.1, 0.15))
+    )
     assert 0.2 < log_high.std() < 0.35
     assert (log_high > 0.1).any()
     assert np.corrcoef(log_high, log_low)[0, 1] < 0.3
@@ -179,7 +204,9 @@ def test_hum_is_one_sine_on_all_taxels():
     peak = spectrum.argmax(axis=1)
     assert peak.min() < 30
     assert peak.max() > 220
-    assert all(s[max(p - 3, 0) : p + 4].sum() > 0.99 * s.sum() for s, p in zip(spectrum, peak, strict=True))
+    assert all(
+        s[max(p - 3, 0) : p + 4].sum() > 0.99 * s.sum() for s, p in zip(spectrum, peak, strict=True)
+    )
 
 
 def test_what_is_clipped_is_cut_off_above():
@@ -198,7 +225,8 @@ def test_what_is_clipped_is_cut_off_above():
     [(1, 1, 1), (1, 1, 2), (3, 9, 20), (16, 16, 128), (1, 5, 33), (2, 6, 3000), (6, 12, 21)],
 )
 def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames: int):
-    """One taxel, one frame, odd lengths: with every parameter on, silent sweeps stay finite and keep their shape."""
+    """One taxel, one frame, odd lengths: with every parameter on, silent sweeps stay finite and
+    keep their shape."""
     everything = replace(Augmentation(), **dict.fromkeys(NAMES, 0.5))
     x = np.zeros((5, taxels, frames), np.float32)
     now = augment(x, rows, everything, np.random.default_rng(7))

@@ -1,4 +1,5 @@
-"""The family: what each size costs, what int8 keeps exactly, what a tenth knows, that a method is its int8 graph."""
+"""The family: what each size costs, what int8 keeps exactly, what a tenth knows, that a method is
+its int8 graph."""
 
 from __future__ import annotations
 
@@ -36,10 +37,16 @@ CONVOLUTIONAL = {name: shape for name, shape in ARCHITECTURES.items() if shape.c
 
 
 def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much noisier than others."""
-    rng, t = np.random.default_rng(seed), np.arange(form.window).reshape(-1, *(1,) * len(form.shape))
+    """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much
+    noisier than others."""
+    rng, t = (
+        np.random.default_rng(seed),
+        np.arange(form.window).reshape(-1, *(1,) * len(form.shape)),
+    )
     taxels = (n, 1, *form.shape)
-    x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(t * rng.uniform(0.6, 1.2, taxels))
+    x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(
+        t * rng.uniform(0.6, 1.2, taxels)
+    )
     return (x + rng.standard_normal((n, form.window, *form.shape))).astype(form.dtype)
 
 
@@ -52,8 +59,14 @@ def trunks(
         model = Compact(form, 3, 0.1, architecture=architecture)
         model.train()(torch.from_numpy(drawn(form).astype(np.float32)))
     model = model.fused()
-    weights, found = {k: v.numpy() for k, v in model.state_dict().items()}, model.ranges(drawn(form))
-    return model, *(graph.trunk_graph(form, 0.1, weights, architecture, ranges, **asked) for ranges in (None, found))
+    weights, found = (
+        {k: v.numpy() for k, v in model.state_dict().items()},
+        model.ranges(drawn(form)),
+    )
+    return model, *(
+        graph.trunk_graph(form, 0.1, weights, architecture, ranges, **asked)
+        for ranges in (None, found)
+    )
 
 
 def seen(model: Compact, counts: np.ndarray) -> np.ndarray:
@@ -69,11 +82,20 @@ def fitted() -> Fit:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rows", "cols", "window", "dtype", "axes"),
-                         [(4, 4, 1500, "uint8", 1), (3, 3, 150, "int16", 1), (1, 1, 20, "uint16", 1), (16, 1, 128, "float32", 1),
-                          (3, 3, 600, "float32", 3), (2, 1, 150, "uint8", 2)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rows", "cols", "window", "dtype", "axes"),
+    [
+        (4, 4, 1500, "uint8", 1),
+        (3, 3, 150, "int16", 1),
+        (1, 1, 20, "uint16", 1),
+        (16, 1, 128, "float32", 1),
+        (3, 3, 600, "float32", 3),
+        (2, 1, 150, "uint8", 2),
+    ],
+)
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str, axes: int):
-    """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the same as one at another level."""
+    """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the
+    same as one at another level."""
     form = SweepFormat(rows, cols, 100.0, window, dtype, axes)
     model, plain, int8 = trunks(form)
     counts = drawn(form, seed=1)
@@ -89,7 +111,8 @@ def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: s
 
 
 def test_no_offset_moves_a_bit_of_bytes():
-    """Every kernel's integer taps sum to zero and need no more than seven bits: offsets change nothing at all."""
+    """Every kernel's integer taps sum to zero and need no more than seven bits: offsets change
+    nothing at all."""
     form = skin.FORMAT
     _, _, int8 = trunks(form)
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
@@ -98,11 +121,14 @@ def test_no_offset_moves_a_bit_of_bytes():
     assert np.abs(first).max() == nodes.MAX_TAP
     counts = drawn(form, 2)
     offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
-    np.testing.assert_array_equal(graph_builder.run(int8, counts + offset), graph_builder.run(int8, counts))
+    np.testing.assert_array_equal(
+        graph_builder.run(int8, counts + offset), graph_builder.run(int8, counts)
+    )
 
 
 def test_rounding_to_zero_sums_moves_as_little_as_it_can():
-    """Against all ways to round up or down that sum to zero: none is nearer; whole taps stay as they are."""
+    """Against all ways to round up or down that sum to zero: none is nearer; whole taps stay as
+    they are."""
     rng = np.random.default_rng(0)
     taps = rng.uniform(-60, 60, (40, 3, 6))
     taps -= taps.mean(axis=2, keepdims=True)
@@ -120,7 +146,8 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
 @pytest.mark.parametrize("int8", [False, True])
 @pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (25, "float32")])
 def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
-    """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came just before."""
+    """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came
+    just before."""
     form = SweepFormat(2, 2, 100.0, window, dtype)
     trunk, whole = trunks(form, tenths=True)[1 + int8], trunks(form)[1 + int8]
     counts, other = drawn(form, 3), drawn(form, 3, seed=7)
@@ -132,7 +159,10 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
         have = graph_builder.run(trunk, np.concatenate([counts[:, :end], other[:, end:]], axis=1))
         np.testing.assert_array_equal(have[:, : d + 1], want[:, : d + 1])
         held = graph_builder.run(
-            trunk, np.concatenate([counts[:, :end], np.repeat(counts[:, end - 1 : end], window - end, 1)], 1)
+            trunk,
+            np.concatenate(
+                [counts[:, :end], np.repeat(counts[:, end - 1 : end], window - end, 1)], 1
+            ),
         )
         np.testing.assert_array_equal(held[:, d], want[:, d])
     if window == 1500:
@@ -144,14 +174,18 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
 
 @pytest.mark.parametrize("mains_hz", [50, 60])
 def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
-    """Hum of any phase gives nothing, twice its frequency does, in training and after; a kernel shorter than a period hears
-    both."""
+    """Hum of any phase gives nothing, twice its frequency does, in training and after; a kernel
+    shorter than a period hears both."""
     at = torch.arange(750) / 750
-    hum, tone = (torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (mains_hz, 2 * mains_hz))
+    hum, tone = (
+        torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (mains_hz, 2 * mains_hz)
+    )
     with torch.random.fork_rng():
         torch.manual_seed(0)
         deaf, short = (
-            Compact(skin.FORMAT, 3, 1.0, architecture=Architecture((6, 8), kernel, 4, mains_hz=mains_hz))
+            Compact(
+                skin.FORMAT, 3, 1.0, architecture=Architecture((6, 8), kernel, 4, mains_hz=mains_hz)
+            )
             for kernel in (16, 8)
         )
     with torch.no_grad():
@@ -163,13 +197,16 @@ def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
 
 
 def test_a_noisy_taxel_is_attenuated():
-    """To three times the fifth of sixteen; the others stay to the bit, and all do where only a few are touched."""
+    """To three times the fifth of sixteen; the others stay to the bit, and all do where only a few
+    are touched."""
     x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
     loud = x.clone()
     loud[0, 3] *= 40
     have = network.limit_noise(loud)
     noise = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
-    assert noise[0, 3] == pytest.approx(3 * noise[0].sort(descending=True).values[4].item(), rel=1e-5)
+    assert noise[0, 3] == pytest.approx(
+        3 * noise[0].sort(descending=True).values[4].item(), rel=1e-5
+    )
     others = torch.arange(16) != 3
     assert torch.equal(have[:, others], x[:, others])
     assert torch.equal(have[1], x[1])
@@ -180,7 +217,8 @@ def test_a_noisy_taxel_is_attenuated():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_int8_attenuates_as_the_network_does(dtype: str):
-    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the limit."""
+    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the
+    limit."""
     form = SweepFormat(4, 4, 750.0, 600, dtype)
     model, plain, int8 = trunks(form)
     counts = drawn(form, 4)
@@ -191,7 +229,8 @@ def test_int8_attenuates_as_the_network_does(dtype: str):
 
 
 def test_tenths_are_means_of_what_was_known():
-    """In float: the first half's features are those of a window of half the length, as both see the same responses."""
+    """In float: the first half's features are those of a window of half the length, as both see the
+    same responses."""
     form = SweepFormat(2, 2, 100.0, 800, "uint8")
     model, trunk, _ = trunks(form, tenths=True)
     counts = drawn(form, 3)
@@ -202,19 +241,29 @@ def test_tenths_are_means_of_what_was_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONVOLUTIONAL)
 def test_a_size_costs_what_it_states(name: str):
-    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what is allowed."""
+    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what is
+    allowed."""
     cost = ARCHITECTURES[name].cost(skin.FORMAT, 6)
     assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.45)
-    plain = Compact(skin.FORMAT, 6, 0.1, norm=False, architecture=ARCHITECTURES[name]).eval().graph()
+    plain = (
+        Compact(skin.FORMAT, 6, 0.1, norm=False, architecture=ARCHITECTURES[name]).eval().graph()
+    )
     assert graph_cost.weights(plain) == cost.weights
     inferred = onnx.shape_inference.infer_shapes(plain, strict_mode=True, data_prop=True).graph
     steps = {v.name: v.type.tensor_type.shape.dim[-1].dim_value for v in inferred.value_info}
     sizes = {c.name: c.dims for c in plain.graph.initializer}
-    macs = sum(np.prod(sizes[n.input[1]]) * steps[n.output[0]] for n in plain.graph.node if n.op_type == "Conv")
+    macs = sum(
+        np.prod(sizes[n.input[1]]) * steps[n.output[0]]
+        for n in plain.graph.node
+        if n.op_type == "Conv"
+    )
     assert cost.macs == macs + np.prod(sizes["head.weight"])
     macs, kilobytes = LIMITS.get(f"compact-{name}", (12e6, 96))
     assert cost.macs <= macs
-    for shape, limit in ((ARCHITECTURES[name], kilobytes), (replace(ARCHITECTURES[name], spectrum=True), 96)):
+    for shape, limit in (
+        (ARCHITECTURES[name], kilobytes),
+        (replace(ARCHITECTURES[name], spectrum=True), 96),
+    ):
         _, _, int8 = trunks(skin.FORMAT, architecture=shape)
         features = sum(shape.channels) + shape.spectrum * spectrum.count(skin.FORMAT)
         whole = graph_builder.with_head(int8, np.zeros((6, features)), np.zeros(6))
@@ -222,12 +271,15 @@ def test_a_size_costs_what_it_states(name: str):
 
 
 def test_every_operator_of_int8_is_fused(tmp_path: Path):
-    """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and turns nothing."""
+    """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and
+    turns nothing."""
     _, _, int8 = trunks(skin.FORMAT, architecture=ARCHITECTURES["20k"])
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
     options.log_severity_level = 3
-    onnxruntime.InferenceSession(int8.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    onnxruntime.InferenceSession(
+        int8.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
     done = Counter(n.op_type for n in onnx.load(tmp_path / "optimized.onnx").graph.node)
     assert (done["QLinearConv"], done["QLinearMul"], done["MatMulInteger"]) == (3, 1, 3)
     assert not {"Conv", "DequantizeLinear", "Range", "Less", "MatMul"} & set(done)
@@ -236,13 +288,18 @@ def test_every_operator_of_int8_is_fused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_method_is_its_int8_graph():
-    """Logits are the graph's to the bit; the float form is the fit's network; the same fit gives the same head."""
+    """Logits are the graph's to the bit; the float form is the fit's network; the same fit gives
+    the same head."""
     s = easy(12)
     model = methods.find(["compact-1k"], Effort(share=0.02))[0].train(s, s.samples, 1)
-    np.testing.assert_array_equal(model.logits(s.samples), graph_builder.run(model.graph(), s.samples))
+    np.testing.assert_array_equal(
+        model.logits(s.samples), graph_builder.run(model.graph(), s.samples)
+    )
     assert any(n.op_type == "MatMulInteger" for n in model.graph().graph.node)
     plain = model.forms["float"]
-    np.testing.assert_allclose(plain.logits(s.samples), graph_builder.run(plain.graph(), s.samples), atol=1e-3)
+    np.testing.assert_allclose(
+        plain.logits(s.samples), graph_builder.run(plain.graph(), s.samples), atol=1e-3
+    )
     assert not any(n.op_type == "QuantizeLinear" for n in plain.graph().graph.node)
     weight, bias = model.fit.int8_head()
     z = model.features(s.samples) @ weight.T + bias
@@ -252,13 +309,14 @@ def test_the_method_is_its_int8_graph():
 
 
 def test_all_sizes_share_one_recipe():
-    """Names in order of size; `compact` is one of the sizes that may lose all stages; effort reaches all."""
+    """Names in order of size; `compact` is one of the sizes that may lose all stages; effort
+    reaches all."""
     made = {m.name: m for m in compact_methods.methods(Effort(share=0.01))}
     assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
     assert made["compact"].train.keywords["architecture"] == replace(ARCHITECTURES["20k"], fewest=0)
-    assert {name: shape.fewest for name, shape in ARCHITECTURES.items()} == dict.fromkeys(ARCHITECTURES, 1) | {
-        "bands": 0
-    }
+    assert {name: shape.fewest for name, shape in ARCHITECTURES.items()} == dict.fromkeys(
+        ARCHITECTURES, 1
+    ) | {"bands": 0}
     assert ARCHITECTURES["bands"].spectrum
     assert {m.effort for m in made.values()} == {"6 iterations"}
 
@@ -281,8 +339,8 @@ FIRST, SECOND, THIRD, BANDS = (np.repeat(np.arange(4), (6, 8, 8, 5)) == k for k 
     ],
 )
 def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, banded: bool):
-    """The heads see the stages, and the spectrum or not, that help where they never were: no stage at all where that is
-    allowed. A set without a spectrum has none to choose."""
+    """The heads see the stages, and the spectrum or not, that help where they never were: no stage
+    at all where that is allowed. A set without a spectrum has none to choose."""
     rng, labels, held = np.random.default_rng(0), np.arange(90) % 3, np.arange(60) % 3
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
     known = rng.standard_normal((3, 27))
@@ -292,7 +350,10 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
         model.architecture = replace(SMALL, spectrum=True, fewest=fewest)
         less, weights = fit._select_depth(model, ((x, y), (x, y)), labels, held)
         least = max(depth, fewest)
-        assert (len(less.convs), less.architecture) == (least, model.architecture.cut(least, banded))
+        assert (len(less.convs), less.architecture) == (
+            least,
+            model.architecture.cut(least, banded),
+        )
         seen_by_heads = sum(SMALL.channels[:least]) + 5 * banded
         assert weights["int8.weight"].shape == weights["head.weight"].shape == (3, seen_by_heads)
     if not useful[BANDS].any():
@@ -308,7 +369,11 @@ def test_a_cut_network_gives_what_its_first_stages_gave():
     model.architecture = replace(SMALL, spectrum=True)
     every = seen(model, counts)
     assert every.shape == (6, 27)
-    for depth, banded, columns in ((2, False, FIRST | SECOND), (1, True, FIRST | BANDS), (0, True, BANDS)):
+    for depth, banded, columns in (
+        (2, False, FIRST | SECOND),
+        (1, True, FIRST | BANDS),
+        (0, True, BANDS),
+    ):
         less = model.cut(depth, banded)
         np.testing.assert_array_equal(seen(less, counts), every[:, columns])
         assert less.architecture.stages(64) == SMALL.stages(64)[:depth]
@@ -333,7 +398,8 @@ def bare() -> compact_methods.CompactModel:
 
 @pytest.mark.slow
 def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactModel):
-    """Then nothing in its graph is int8, its float form gives the same, and it learns what is easy."""
+    """Then nothing in its graph is int8, its float form gives the same, and it learns what is
+    easy."""
     assert bare.fit.architecture == DEFAULT.cut(0, spectrum=True)
     assert bare.fit.ranges.responses == ()
     done = {n.op_type for n in bare.graph().graph.node}
@@ -342,16 +408,24 @@ def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactMode
     logits = bare.logits(other)
     np.testing.assert_array_equal(logits, graph_builder.run(bare.graph(), other))
     np.testing.assert_allclose(bare.forms["float"].logits(other), logits, atol=2e-3)
-    np.testing.assert_allclose(graph_builder.run(bare.forms["float"].graph(), other), logits, atol=2e-3)
+    np.testing.assert_allclose(
+        graph_builder.run(bare.forms["float"].graph(), other), logits, atol=2e-3
+    )
     assert np.mean(logits.argmax(1) == easy(seed=9).labels) > 0.9
     assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.fit.bands)
 
 
-def test_a_fit_without_a_convolution_survives_its_file(bare: compact_methods.CompactModel, tmp_path: Path):
+def test_a_fit_without_a_convolution_survives_its_file(
+    bare: compact_methods.CompactModel, tmp_path: Path
+):
     """It gives the same bits in PyTorch and in its graphs."""
     bare.fit.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
-    assert (again.architecture, again.ranges, again.bands) == (bare.fit.architecture, bare.fit.ranges, 5)
+    assert (again.architecture, again.ranges, again.bands) == (
+        bare.fit.architecture,
+        bare.fit.ranges,
+        5,
+    )
     counts = easy(2).samples
     with torch.no_grad():
         x = torch.from_numpy(counts.astype(np.float32))
@@ -363,9 +437,14 @@ def test_a_fit_without_a_convolution_survives_its_file(bare: compact_methods.Com
 
 @pytest.mark.parametrize("frames", [64, 1500])
 def test_training_augments_as_its_generator_says(frames: int):
-    """What PyTorch trains on: the same for the same state of its generator, which moves on; the sweeps stay as they are."""
+    """What PyTorch trains on: the same for the same state of its generator, which moves on; the
+    sweeps stay as they are."""
     form, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
-    before, rng, again = x.clone(), torch.Generator().manual_seed(3), torch.Generator().manual_seed(3)
+    before, rng, again = (
+        x.clone(),
+        torch.Generator().manual_seed(3),
+        torch.Generator().manual_seed(3),
+    )
     change = fit.augmenter(form, Augmentation())
     first, second, same = change(x, rng), change(x, rng), change(x, again)
     assert first.shape == x.shape
@@ -376,7 +455,8 @@ def test_training_augments_as_its_generator_says(frames: int):
 
 
 def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
-    """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each tenth."""
+    """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each
+    tenth."""
     s = easy(6)
     made = fit.fit(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
     level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
@@ -388,4 +468,7 @@ def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
         of_tenths = graph_builder.run(made.trunk(int8, tenths=True), s.samples)
         np.testing.assert_allclose(of_tenths[:, -1, first : first + 4], level, rtol=1e-5)
         assert of_tenths.shape[2] == first + 4 + made.bands
-    assert graph_builder.run(fitted.trunk(), s.samples).shape[1] == sum(fitted.architecture.channels) + fitted.bands
+    assert (
+        graph_builder.run(fitted.trunk(), s.samples).shape[1]
+        == sum(fitted.architecture.channels) + fitted.bands
+    )

@@ -1,4 +1,5 @@
-"""The distribution of counts: its graph against the definition, what it cannot see, and how many features it may have."""
+"""The distribution of counts: its graph against the definition, what it cannot see, and how many
+features it may have."""
 
 from __future__ import annotations
 
@@ -49,17 +50,22 @@ def trunk(form: SweepFormat, some: Levels, int8: bool, tenths: bool = False) -> 
 
 def defined(form: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
     """Shares of frames above the levels, of counts about their mean and of differences."""
-    x = given.reshape(len(given), form.window, -1)[:, :, some.taxels] * texture_scale(counts(form, 12))
+    x = given.reshape(len(given), form.window, -1)[:, :, some.taxels] * texture_scale(
+        counts(form, 12)
+    )
     hop = max(form.window // distribution.MOST_FRAMES, 1)
     older = x[:, : form.window - 1 : hop]
     signals = older - older.mean(axis=1, keepdims=True), np.diff(x, axis=1)[:, ::hop]
     pairs = zip(signals, some.levels, strict=True)
-    return np.hstack([(y[..., None] > level).mean(axis=1).reshape(len(x), -1) for y, level in pairs])
+    return np.hstack(
+        [(y[..., None] > level).mean(axis=1).reshape(len(x), -1) for y, level in pairs]
+    )
 
 
 @forms
 def test_the_graph_is_the_definition(form: SweepFormat):
-    """In both forms, but for a few frames about a level: bytes about their mean are rounded to bytes again."""
+    """In both forms, but for a few frames about a level: bytes about their mean are rounded to
+    bytes again."""
     some, given = levels(form), counts(form)
     wanted = defined(form, some, given)
     for int8 in (False, True):

@@ -34,7 +34,8 @@ def fitted() -> Fit:
 
 @pytest.mark.slow
 def test_stages_follow_the_window():
-    """The kernels of the two windows that are known; every window gets a last stage, or a message."""
+    """The kernels of the two windows that are known; every window gets a last stage, or a
+    message."""
     assert [(s.kernel, s.stride) for s in DEFAULT.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
     assert [(s.kernel, s.stride) for s in DEFAULT.stages(128)] == [(4, 1), (5, 2), (5, 2)]
     assert DEFAULT.stages(1500)[-1] == architectures.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
@@ -54,15 +55,22 @@ def test_stages_follow_the_window():
 def test_compact_is_as_small_as_it_says(size: str, weights: int):
     """For the skin of the paper with six classes; what a shape costs is what its network holds."""
     model = Compact(skin.FORMAT, 6, 1.0, norm=False, architecture=ARCHITECTURES[size])
-    assert sum(p.numel() for p in model.parameters()) == weights == ARCHITECTURES[size].cost(skin.FORMAT, 6).weights
+    assert (
+        sum(p.numel() for p in model.parameters())
+        == weights
+        == ARCHITECTURES[size].cost(skin.FORMAT, 6).weights
+    )
     assert model(torch.zeros(2, 1500, 4, 4)).shape == (2, 6)
-    more = Compact(skin.FORMAT, 6, 1.0, norm=False, architecture=replace(ARCHITECTURES[size], spectrum=True))
+    more = Compact(
+        skin.FORMAT, 6, 1.0, norm=False, architecture=replace(ARCHITECTURES[size], spectrum=True)
+    )
     assert sum(p.numel() for p in more.parameters()) == weights + 6 * spectrum.count(skin.FORMAT)
 
 
 @pytest.mark.slow
 def test_compact_ignores_offsets():
-    """A constant on each taxel changes nothing: it is the offset, not the texture; by its kernels, not by `prepare`."""
+    """A constant on each taxel changes nothing: it is the offset, not the texture; by its kernels,
+    not by `prepare`."""
     model = Compact(skin.FORMAT, 6, 0.1, norm=False)
     rng = np.random.default_rng(0)
     counts = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
@@ -71,7 +79,9 @@ def test_compact_ignores_offsets():
         torch.testing.assert_close(
             model.training_logits(counts + offset), model.training_logits(counts), rtol=0, atol=1e-4
         )
-        assert (model.training_logits(counts * 2) - model.training_logits(counts)).abs().max() > 0.01
+        assert (
+            model.training_logits(counts * 2) - model.training_logits(counts)
+        ).abs().max() > 0.01
 
 
 def test_fused_norms_change_nothing():
@@ -87,10 +97,13 @@ def test_fused_norms_change_nothing():
 
 
 def test_temperature_scaling_calibrates():
-    """Logits made five times too large are divided by five; a few right answers do not allow any certainty."""
+    """Logits made five times too large are divided by five; a few right answers do not allow any
+    certainty."""
     rng = np.random.default_rng(0)
     calibrated = 2 * rng.standard_normal((4000, 4))
-    labels = np.array([rng.choice(4, p=p) for p in np.exp(calibrated) / np.exp(calibrated).sum(1, keepdims=True)])
+    labels = np.array(
+        [rng.choice(4, p=p) for p in np.exp(calibrated) / np.exp(calibrated).sum(1, keepdims=True)]
+    )
     assert linear_head.fit_temperature(5 * calibrated, labels) == pytest.approx(5, rel=0.1)
     sure = 50 * np.eye(3)[np.arange(9) % 3]
     assert 50 / linear_head.fit_temperature(sure, np.arange(9) % 3) < 6
@@ -111,7 +124,9 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
     """Far above the third of chance on sweeps of another seed, with calibrated probabilities."""
     other = easy(seed=9)
     with torch.no_grad():
-        p = torch.softmax(fitted.network()(torch.from_numpy(other.samples.astype(np.float32))), 1).numpy()
+        p = torch.softmax(
+            fitted.network()(torch.from_numpy(other.samples.astype(np.float32))), 1
+        ).numpy()
     assert np.mean(p.argmax(1) == other.labels) > 0.9
     assert p.max(1).mean() == pytest.approx(np.mean(p.argmax(1) == other.labels), abs=0.1)
     assert not set(fitted.train.groups["recording"]) & set(fitted.held.groups["recording"])
@@ -120,7 +135,8 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
 
 @pytest.mark.slow
 def test_a_fit_is_its_seed_s_alone(fitted: Fit):
-    """The same bits again, whatever the state outside, which stays as it was; another seed gives others."""
+    """The same bits again, whatever the state outside, which stays as it was; another seed gives
+    others."""
     torch.manual_seed(99)
     before, threads = torch.get_rng_state(), torch.get_num_threads()
     again = fit.fit(easy(), 1, QUICK)
@@ -128,7 +144,9 @@ def test_a_fit_is_its_seed_s_alone(fitted: Fit):
     assert torch.get_num_threads() == threads
     for name, value in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], value)
-    assert not np.array_equal(fit.fit(easy(), 2, QUICK).weights["convs.0.weight"], fitted.weights["convs.0.weight"])
+    assert not np.array_equal(
+        fit.fit(easy(), 2, QUICK).weights["convs.0.weight"], fitted.weights["convs.0.weight"]
+    )
 
 
 @pytest.mark.slow
@@ -147,7 +165,11 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
     """Weights, sweeps and description come back; another file is refused by name."""
     fitted.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
-    assert (again.scale, again.about, again.train.materials) == (fitted.scale, fitted.about, fitted.train.materials)
+    assert (again.scale, again.about, again.train.materials) == (
+        fitted.scale,
+        fitted.about,
+        fitted.train.materials,
+    )
     for mine, theirs in ((again.train, fitted.train), (again.held, fitted.held)):
         np.testing.assert_array_equal(mine.samples, theirs.samples)
         np.testing.assert_array_equal(mine.group("recording"), theirs.group("recording"))
@@ -168,12 +190,15 @@ def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
     made.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
     assert (again.architecture, again.ranges) == (made.architecture, made.ranges)
-    np.testing.assert_array_equal(fit.features(again.network(), made.held), fit.features(made.network(), made.held))
+    np.testing.assert_array_equal(
+        fit.features(again.network(), made.held), fit.features(made.network(), made.held)
+    )
     assert again.trunk() == made.trunk()
 
 
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
-    """Weights that are not of the shape that the file names, and a file from before there were shapes."""
+    """Weights that are not of the shape that the file names, and a file from before there were
+    shapes."""
     replace(fitted, architecture=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
         FormatError,
@@ -189,14 +214,19 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
         Fit.load(tmp_path / "old.npz")
 
 
-@pytest.mark.skipif("PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps")
+@pytest.mark.skipif(
+    "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
+)
 def test_fabrics_are_distinguished(tmp_path: Path):
-    """Real sweeps, seven fabrics, another skin: a short fit reaches nine of ten windows of recordings it never saw."""
+    """Real sweeps, seven fabrics, another skin: a short fit reaches nine of ten windows of
+    recordings it never saw."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
     whole = sets.load(str(path)).select(["direction=0", "force<=180"])
     assert len(whole.materials) == 7
     seen, unseen = whole.split("recording", 0.7, 1)
     made = fit.fit(seen, 1, FitRecipe(steps=300))
     with torch.no_grad():
-        given = made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()
+        given = (
+            made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()
+        )
     assert np.mean(given == unseen.labels) > 0.9

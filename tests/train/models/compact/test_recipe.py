@@ -1,4 +1,5 @@
-"""The default recipe: what it chooses, that its forms agree, that it needs no PyTorch, and what it cannot be fitted to."""
+"""The default recipe: what it chooses, that its forms agree, that it needs no PyTorch, and what it
+cannot be fitted to."""
 
 from __future__ import annotations
 
@@ -60,14 +61,28 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
     easy().save(folder / "easy.npz")
     out = folder / "fit.npz"
     assert (
-        main(["fit", "--set", str(folder / "easy.npz"), "--seed", "1", "--steps", "0", "--out", str(out), *options])
+        main(
+            [
+                "fit",
+                "--set",
+                str(folder / "easy.npz"),
+                "--seed",
+                "1",
+                "--steps",
+                "0",
+                "--out",
+                str(out),
+                *options,
+            ]
+        )
         == 0
     )
     return Fit.load(out)
 
 
 def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
-    """The command's option: all discriminants see copies, which else the held-out parts of the easy set do not ask for."""
+    """The command's option: all discriminants see copies, which else the held-out parts of the easy
+    set do not ask for."""
     made = fitted_by_command(tmp_path, "--reattached")
     assert made.about["recipe"]["reattached"]
     assert all(part.copies for part in made.plan.parts)
@@ -76,8 +91,8 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
 
 @pytest.mark.slow
 def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
-    """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little as 50 Hz that of the usual
-    fit, which hears 60 Hz."""
+    """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little
+    as 50 Hz that of the usual fit, which hears 60 Hz."""
     sixty = fitted_by_command(tmp_path, "--mains", "60")
     assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
     assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
@@ -91,14 +106,20 @@ def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
         before = trunk.features(sweeps)[:, bands]
         for hz in (50, 60):
             hummed = np.rint(sweeps.samples + 6 * np.sin(2 * np.pi * hz * seconds)).astype(np.uint8)
-            moved[hz, mains_hz] = np.abs(trunk.features(replace(sweeps, samples=hummed))[:, bands] - before).mean()
+            moved[hz, mains_hz] = np.abs(
+                trunk.features(replace(sweeps, samples=hummed))[:, bands] - before
+            ).mean()
     assert max(moved[50, 50], moved[60, 60]) < min(moved[50, 60], moved[60, 50]) / 3, moved
 
 
 def test_int8_and_float_agree(fitted: Fit):
     """Each with a head of its own."""
-    forms = [with_head(fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias")))
-             for int8, name in ((True, "int8"), (False, "head"))]  # fmt: skip
+    forms = [
+        with_head(
+            fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias"))
+        )
+        for int8, name in ((True, "int8"), (False, "head"))
+    ]
     rounded, precise = (run(form, easy().samples).argmax(axis=1) for form in forms)
     assert np.mean(rounded == precise) > 0.98
 
@@ -110,27 +131,35 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
     assert again.plan == fitted.plan
     x = easy().samples[:4]
     np.testing.assert_array_equal(run(again.trunk(), x), run(fitted.trunk(), x))
-    gone = {name: values for name, values in fitted.weights.items() if name not in ("bank.along", "int8.weight")}
+    gone = {
+        name: values
+        for name, values in fitted.weights.items()
+        if name not in ("bank.along", "int8.weight")
+    }
     replace(fitted, weights=gone).save(tmp_path / "fit.npz")
     with pytest.raises(FormatError, match=r"fit\.npz.*fit again"):
         Fit.load(tmp_path / "fit.npz")
 
 
 def test_the_same_seed_gives_the_same_fit(fitted: Fit):
-    """And another one other filters. Where no stages can follow, the choice is the second part of two."""
+    """And another one other filters. Where no stages can follow, the choice is the second part of
+    two."""
     told: list[str] = []
     again, other = (recipe.fit(easy(), seed, CLOSED, told.append) for seed in (1, 2))
     assert told[0].startswith("part 1 of 2, features of")
     assert told[1].startswith("part 2 of 2, choosing: ")
     for name, values in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], values)
-    assert other.plan != fitted.plan or not np.array_equal(other.weights["int8.weight"], fitted.weights["int8.weight"])
+    assert other.plan != fitted.plan or not np.array_equal(
+        other.weights["int8.weight"], fitted.weights["int8.weight"]
+    )
 
 
 @pytest.mark.slow
 def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
-    """From LEAST_SWEEPS on, where filters leave something to mend: their features come first, with a discriminant of their own; a fifth of the sweeps is held out
-    from them, and their scale is that of the filters."""
+    """From LEAST_SWEEPS on, where filters leave something to mend: their features come first, with
+    a discriminant of their own; a fifth of the sweeps is held out from them, and their scale is
+    that of the filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
         monkeypatch.setattr(recipe, name, value)
@@ -141,7 +170,9 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     steps = [line for line in told if " step " in line]
     assert re.fullmatch(r"part 3 of 3, step 10/20 loss \d+\.\d+, \d+ s left", steps[9])
     assert steps[-1].endswith(", 0 s left")
-    assert re.fullmatch(r"part 3 of 3, choosing: \d+ filters", told[-1])  # fewer may do beside stages
+    assert re.fullmatch(
+        r"part 3 of 3, choosing: \d+ filters", told[-1]
+    )  # fewer may do beside stages
     assert fit.architecture.channels == recipe.STAGES.channels
     stages = sum(recipe.STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
@@ -154,8 +185,11 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("better", [True, False])
-def test_stages_and_the_spectrum_are_enough_unless_more_is_better(monkeypatch: pytest.MonkeyPatch, better: bool):
-    """For a skin that is put back: each stage then has a discriminant with the spectrum, and the trunk holds no filters."""
+def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
+    monkeypatch: pytest.MonkeyPatch, better: bool
+):
+    """For a skin that is put back: each stage then has a discriminant with the spectrum, and the
+    trunk holds no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.Court, "better", lambda *_: better)
@@ -180,8 +214,9 @@ def refused(fit: Fit) -> NoReturn:
 
 @pytest.mark.slow
 def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The command, interrupted in its training: the next one begins after the last step that was kept, and gives the same
-    bits as one that was never interrupted. Another seed begins anew. Nothing is left in the cache."""
+    """The command, interrupted in its training: the next one begins after the last step that was
+    kept, and gives the same bits as one that was never interrupted. Another seed begins anew.
+    Nothing is left in the cache."""
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
@@ -198,7 +233,16 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def fitted(name: str, seed: int = 1) -> Fit | None:
         out = tmp_path / f"{name}.npz"
-        args = ["--set", str(tmp_path / "easy.npz"), "--seed", str(seed), "--steps", "12", "--out", str(out)]
+        args = [
+            "--set",
+            str(tmp_path / "easy.npz"),
+            "--seed",
+            str(seed),
+            "--steps",
+            "12",
+            "--out",
+            str(out),
+        ]
         assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
         return Fit.load(out) if stop < 0 else None
 
@@ -224,7 +268,8 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_filters_need_no_pytorch(tmp_path: Path):
-    """A process in which PyTorch cannot be imported fits and exports; the command says what it chose."""
+    """A process in which PyTorch cannot be imported fits and exports; the command says what it
+    chose."""
     easy().save(tmp_path / "easy.npz")
     script = (
         "import sys\n"
@@ -239,14 +284,17 @@ def test_filters_need_no_pytorch(tmp_path: Path):
         f"code = main(['fit', '--set', {str(tmp_path / 'easy.npz')!r}, '--seed', '1', '--steps', '0', '--out', {str(tmp_path / 'f.npz')!r}])\n"
         f"sys.exit(code or main(['export', {str(tmp_path / 'f.npz')!r}, '--out', {str(tmp_path / 'b')!r}, '--name', 'b', '--version', '1']))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "chosen: " in done.stdout
     assert (tmp_path / "b" / "manifest.json").is_file()
 
 
 def test_the_method_names_materials_that_it_never_saw_last():
-    """A material without a training sweep gets a logit below all others; labels keep their numbers."""
+    """A material without a training sweep gets a logit below all others; labels keep their
+    numbers."""
     sweeps = easy()
     part = sweeps.take(sweeps.labels != 1)
     model = default.train(part, part.samples, 1, settings=CLOSED)
@@ -255,20 +303,36 @@ def test_the_method_names_materials_that_it_never_saw_last():
     assert (logits.argmax(axis=1) != 1).all()
     named = logits.argmax(axis=1)[sweeps.labels != 1]
     assert np.mean(named == part.labels) > 0.9
-    assert np.mean(model.forms["float"].logits(part.samples).argmax(axis=1) == named[: len(part)]) > 0.95
+    assert (
+        np.mean(model.forms["float"].logits(part.samples).argmax(axis=1) == named[: len(part)])
+        > 0.95
+    )
 
 
 def test_groups_that_can_be_left_out_judge():
-    """Each group in parts, the first ones first; one that cuts recordings or counts trials does not, and recordings do where
-    there is none."""
+    """Each group in parts, the first ones first; one that cuts recordings or counts trials does
+    not, and recordings do where there is none."""
     n = 24
     labels, recording = np.arange(n) % 2, np.arange(n) // 2
-    groups = {"recording": recording, "speed": recording % 3, "force": recording % 2, "odd": np.arange(n) % 2}
+    groups = {
+        "recording": recording,
+        "speed": recording % 3,
+        "force": recording % 2,
+        "odd": np.arange(n) % 2,
+    }
     groups["trial"] = recording % 4
     sweeps = Dataset(np.zeros((n, 16, 1, 1), np.uint8), labels, ("a", "b"), 10.0, groups, "x")
-    assert [part.group for part in inner_parts(sweeps)] == ["force", "speed", "force", "speed", "speed"]
+    assert [part.group for part in inner_parts(sweeps)] == [
+        "force",
+        "speed",
+        "force",
+        "speed",
+        "speed",
+    ]
     for part in inner_parts(sweeps):
-        assert set(sweeps.groups[part.group][part.out]).isdisjoint(sweeps.groups[part.group][~part.out])
+        assert set(sweeps.groups[part.group][part.out]).isdisjoint(
+            sweeps.groups[part.group][~part.out]
+        )
     pure = replace(sweeps, labels=recording % 2, groups={"recording": recording})
     parts = inner_parts(pure)
     assert [part.group for part in parts] == ["recording"] * 5
@@ -283,5 +347,7 @@ def test_what_cannot_be_fitted_is_named():
     still = replace(easy(), samples=np.full_like(easy().samples, 7))
     with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
         recipe.fit(still, 1, CLOSED)
-    with pytest.raises(FormatError, match="a window of 12 frames is too short for the network; record at least 16"):
+    with pytest.raises(
+        FormatError, match="a window of 12 frames is too short for the network; record at least 16"
+    ):
         recipe.fit(replace(easy(), samples=easy().samples[:, :12]), 1, CLOSED)

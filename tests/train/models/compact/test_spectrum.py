@@ -1,4 +1,5 @@
-"""The spectrum against its definition, in PyTorch and in graphs: what it responds to, what it ignores, when there is one."""
+"""The spectrum against its definition, in PyTorch and in graphs: what it responds to, what it
+ignores, when there is one."""
 
 from __future__ import annotations
 
@@ -42,19 +43,24 @@ FORMS = {
 
 
 def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much noisier than others."""
+    """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much
+    noisier than others."""
     rng = np.random.default_rng(seed)
     own = rng.standard_normal((n, form.window, *form.shape))
     x = 90 + 8 * rng.standard_normal((n, form.window, *(1,) * len(form.shape))) + 4 * own
     return x.astype(form.dtype)
 
 
-def trunk(form: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0) -> onnx.ModelProto:
+def trunk(
+    form: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0
+) -> onnx.ModelProto:
     """The graph that gives nothing but the spectrum."""
     return graph.trunk_graph(form, scale, {}, replace(BARE, mains_hz=mains_hz), tenths=tenths)
 
 
-def heard(form: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0) -> np.ndarray:
+def heard(
+    form: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
+) -> np.ndarray:
     """What PyTorch's head sees where there is nothing but the spectrum."""
     with torch.no_grad():
         model = Compact(form, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
@@ -62,18 +68,22 @@ def heard(form: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: f
 
 
 def turned(x: np.ndarray) -> np.ndarray:
-    """What each series of [n, T, R * C * A] is multiplied with: more than three times the fifth of sixteen is turned down."""
+    """What each series of [n, T, R * C * A] is multiplied with: more than three times the fifth of
+    sixteen is turned down."""
     step = max(x.shape[1] // 150, 1)
     noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
     limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
     return np.minimum(limit / noise, 1)
 
 
-def defined(form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True) -> np.ndarray:
-    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of one axis after the other.
+def defined(
+    form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True
+) -> np.ndarray:
+    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of
+    one axis after the other.
 
-    Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a transform at half
-    bins, the mean of each band.
+    Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a
+    transform at half bins, the mean of each band.
     """
     x, length = counts.reshape(len(counts), form.window, -1).astype(np.float64), form.window // 10
     each = (x * turned(x) if limited else x).reshape(len(x), form.window, -1, form.axes).mean(2)
@@ -84,17 +94,23 @@ def defined(form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0
     window = np.hanning(length + 2)[1:-1]
     power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
     edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
-    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(len(counts), form.axes, 10, -1)
+    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(
+        len(counts), form.axes, 10, -1
+    )
     bands = bands.swapaxes(1, 2).reshape(len(counts), 10, -1)
     return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
 
 
 @pytest.mark.parametrize(("form", "mains"), FORMS.values(), ids=FORMS)
 def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
-    """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth holds two periods."""
+    """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth
+    holds two periods."""
     counts = drawn(form)
     want = defined(form, counts, mains)
-    rows, whole = graph_builder.run(trunk(form, tenths=True), counts), graph_builder.run(trunk(form), counts)
+    rows, whole = (
+        graph_builder.run(trunk(form, tenths=True), counts),
+        graph_builder.run(trunk(form), counts),
+    )
     assert rows.shape == want.shape == (2, 10, spectrum.count(form))
     np.testing.assert_allclose(rows, want, atol=2e-3)
     np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
@@ -105,7 +121,8 @@ def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
-    """Behind the trunk's own features, in float and in int8; without the limit it would be measured."""
+    """Behind the trunk's own features, in float and in int8; without the limit it would be
+    measured."""
     form = SweepFormat(4, 4, 750.0, 600, dtype)
     counts = drawn(form)
     counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
@@ -118,25 +135,34 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
     for ranges in (None, found):
         for tenths in (False, True):
             both, alone = (
-                graph_builder.run(graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), counts)
+                graph_builder.run(
+                    graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), counts
+                )
                 for shape in (SMALL.cut(3, True), SMALL)
             )
             np.testing.assert_array_equal(both[..., :-size], alone)
-            np.testing.assert_allclose(both[..., -size:], want if tenths else want[:, -1], atol=2e-3)
+            np.testing.assert_allclose(
+                both[..., -size:], want if tenths else want[:, -1], atol=2e-3
+            )
 
 
 @pytest.mark.parametrize("mains_hz", [50.0, 60.0])
 @pytest.mark.parametrize(
-    ("rate_hz", "window", "deaf"), [(750.0, 1500, True), (250.0, 500, True), (750.0, 200, False), (150.0, 450, False)]
+    ("rate_hz", "window", "deaf"),
+    [(750.0, 1500, True), (250.0, 500, True), (750.0, 200, False), (150.0, 450, False)],
 )
-def test_the_hum_of_the_mains_changes_nothing(rate_hz: float, window: int, deaf: bool, mains_hz: float):
-    """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is measured everywhere. Of a fit for
-    60 Hz the other way round."""
+def test_the_hum_of_the_mains_changes_nothing(
+    rate_hz: float, window: int, deaf: bool, mains_hz: float
+):
+    """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is
+    measured everywhere. Of a fit for 60 Hz the other way round."""
     form = SweepFormat(2, 2, rate_hz, window, "float32")
     counts, rng = drawn(form), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
     for hz, silent in ((mains_hz, deaf), (110 - mains_hz, False)):
-        hum = strength * np.sin(2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase))
+        hum = strength * np.sin(
+            2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase)
+        )
         hummed = (counts + hum).astype(np.float32)
         for ask in (
             lambda form, x: heard(form, x, mains_hz=mains_hz),
@@ -153,18 +179,25 @@ def test_a_fit_that_names_no_mains_is_as_before_it_could():
         for shape in (BARE, replace(BARE, mains_hz=50.0), replace(BARE, mains_hz=60.0))
     )
     assert usual.SerializeToString() == fifty.SerializeToString()
-    assert [node.op_type for node in usual.graph.node] == [node.op_type for node in sixty.graph.node]
+    assert [node.op_type for node in usual.graph.node] == [
+        node.op_type for node in sixty.graph.node
+    ]
     pairs = zip(usual.graph.initializer, sixty.graph.initializer, strict=True)
-    assert [list(one.dims) for one, other in pairs if one != other] == [[skin.FORMAT.window // 10, 3]]
+    assert [list(one.dims) for one, other in pairs if one != other] == [
+        [skin.FORMAT.window // 10, 3]
+    ]
 
 
 def test_later_frames_and_offsets_do_not_matter():
-    """Row d is of the first d + 1 tenths alone, to the bit; frames left over at the end are not used; a skin that
-    is loaded more has the same spectrum."""
+    """Row d is of the first d + 1 tenths alone, to the bit; frames left over at the end are not
+    used; a skin that is loaded more has the same spectrum."""
     counts = drawn(ODD)
     held, late = counts.copy(), counts.copy()
     held[:, 64:], late[:, 160:] = held[:, 63:64], 91
-    a, b, c, d = (graph_builder.run(trunk(ODD, tenths=True), x) for x in (counts, held, late, counts + np.int16(300)))
+    a, b, c, d = (
+        graph_builder.run(trunk(ODD, tenths=True), x)
+        for x in (counts, held, late, counts + np.int16(300))
+    )
     np.testing.assert_array_equal(a[:, :4], b[:, :4])
     assert (np.abs(a[:, 4:] - b[:, 4:]).max(2) > 1e-3).all()
     np.testing.assert_array_equal(a, c)
@@ -186,12 +219,18 @@ def test_silence_is_finite(name: str):
 
 
 def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
-    """What the graph makes of a few numbers is one constant when it is loaded; the file stays below 10 kB for 180 kB."""
+    """What the graph makes of a few numbers is one constant when it is loaded; the file stays below
+    10 kB for 180 kB."""
     model = trunk(skin.FORMAT)
     assert len(model.SerializeToString()) < 10_000
     options = onnxruntime.SessionOptions()
-    options.optimized_model_filepath, options.log_severity_level = str(tmp_path / "optimized.onnx"), 3
-    onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    options.optimized_model_filepath, options.log_severity_level = (
+        str(tmp_path / "optimized.onnx"),
+        3,
+    )
+    onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
     optimized = onnx.load(tmp_path / "optimized.onnx").graph
     done = Counter(n.op_type for n in optimized.node)
     assert not {"Range", "Mod", "Cos", "Sin", "Less", "And", "Not"} & set(done)
@@ -199,14 +238,17 @@ def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
 
 
 def test_a_window_too_short_has_no_spectrum():
-    """Less than four frames a tenth: none is counted, a fit has none, and the size without convolutions refuses with the reason."""
+    """Less than four frames a tenth: none is counted, a fit has none, and the size without
+    convolutions refuses with the reason."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
     made = fit.fit(short, 1, FitRecipe(steps=2))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
     assert made.architecture.channels
     method = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
-    with pytest.raises(FormatError, match="a window of 39 frames is too short for a spectrum; take another size"):
+    with pytest.raises(
+        FormatError, match="a window of 39 frames is too short for a spectrum; take another size"
+    ):
         method.train(short, short.samples, 1)
     enough = replace(easy(12), samples=easy(12).samples[:, :40])
     assert spectrum.count(enough.format) == 3
