@@ -24,7 +24,7 @@ from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
 from train.data import sets
 from train.export import quantized_bundle
-from train.models.compact import fit
+from train.models.recipe import fit
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 

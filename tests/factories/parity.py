@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.models.compact import fit
+from train.models.recipe import fit
 
 
 def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.Dataset:

@@ -18,7 +18,7 @@ from appliance.bundle.bundle import Classes, Moved, MovedClasses
 from appliance.inference.classifier import softmax
 from train.calibration.novelty import Embedding, embed, limit
 from train.calibration.temperature import fit_temperature
-from train.models.compact.augment import Augmentation
+from train.models.recipe.augment import Augmentation
 
 Array = NDArray[Any]
 MOST_WRONG = 0.0125

@@ -26,11 +26,11 @@ from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.moved import AugmentedCopies, MovedFit, displaced, fit_moved
 from train.calibration.novelty import Embedding
 from train.calibration.temperature import fit_temperature
-from train.models.compact.augment import Augmentation
-from train.models.compact.copies import COPIES, copies
-from train.models.compact.fitted import Fit
-from train.models.compact.heads import HeadPart, HeadPlan
 from train.models.linear_head import hold_out
+from train.models.recipe.augment import Augmentation
+from train.models.recipe.copies import COPIES, copies
+from train.models.recipe.fitted import Fit
+from train.models.recipe.heads import HeadPart, HeadPlan
 from train.onnx_tools.graph_builder import joined, run
 from train.onnx_tools.quantize import sixteen_bits
 

@@ -28,11 +28,11 @@ from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
 from train.models import methods
-from train.models.compact import recipe
-from train.models.compact.architectures import ARCHITECTURES, MAINS_HZ
-from train.models.compact.augment import Augmentation, default_augmentation
-from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
+from train.models.recipe import recipe
+from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ
+from train.models.recipe.augment import Augmentation, default_augmentation
+from train.models.recipe.fitted import Fit
 
 MAINS = (50, 60)
 """Hz; there are no others for the public."""
@@ -220,7 +220,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
             raise FormatError(
                 f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with --size {args.size}"
             )
-        from train.models.compact import fit  # here: the default recipe needs no PyTorch
+        from train.models.recipe import fit  # here: the default recipe needs no PyTorch
 
         trained = fit.FitRecipe(
             steps=args.steps, augmentation=augmentation, keep_means=args.keep_means
@@ -249,8 +249,7 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augment
     depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation), args.mains]
     return (
-        CACHE
-        / f"{fingerprint(about, 'train.models.compact.recipe', 'train.models.compact.fit')}.pt"
+        CACHE / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.fit')}.pt"
     )
 
 

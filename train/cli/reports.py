@@ -21,8 +21,8 @@ from train.data import sets
 from train.evaluation.evaluate import Where
 from train.export import quantized_bundle
 from train.metrics import score
-from train.models.compact.fitted import Fit
 from train.models.methods import Effort
+from train.models.recipe.fitted import Fit
 from train.reports import (
     bundle_experiment,
     bundle_report,

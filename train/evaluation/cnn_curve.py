@@ -27,9 +27,9 @@ from appliance.sim import skin
 from train.data import sets
 from train.data.sets import Dataset
 from train.metrics import score
-from train.models import paper_cnn
 from train.models.networks import Network
-from train.models.paper_cnn import PAPER_RECIPE, ImageLayers
+from train.models.peers import paper_cnn
+from train.models.peers.paper_cnn import PAPER_RECIPE, ImageLayers
 from train.models.training import (
     TrainingRecipe,
     batches,

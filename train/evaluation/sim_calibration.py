@@ -19,7 +19,8 @@ from appliance.sim import skin
 from train.data import sets
 from train.data.splitters import Protocol
 from train.evaluation import parallel
-from train.models import baselines, methods
+from train.models import methods
+from train.models.peers import baselines
 
 Array = NDArray[Any]
 METHODS = tuple(baselines.ESTIMATORS)

@@ -28,9 +28,9 @@ from train.evaluation import parallel
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.models import methods
-from train.models.compact.fitted import Fit
-from train.models.compact.heads import HeadPlan
 from train.models.methods import Effort
+from train.models.recipe.fitted import Fit
+from train.models.recipe.heads import HeadPlan
 from train.onnx_tools.graph_builder import run as run_graph
 
 Array = NDArray[Any]
@@ -119,7 +119,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     Raises FormatError where the method is none of the compact family, or cannot work with this set.
     """
     (method,) = methods.find([task.method], task.effort)
-    if not methods.module_of(task.method).startswith("train.models.compact."):
+    if not methods.module_of(task.method).startswith("train.models.recipe."):
         raise FormatError(
             f"method {task.method!r} gives no features of tenths; use default, compact or one of its family"
         )

@@ -21,8 +21,8 @@ from appliance.core import storage
 from train.data.sets import Dataset
 from train.export import measure, pack
 from train.export.measure import Measurement
-from train.models import minirocket
 from train.models.methods import Method
+from train.models.peers import minirocket
 from train.onnx_tools import cost
 
 Array = NDArray[Any]

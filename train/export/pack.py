@@ -38,9 +38,9 @@ from train.data.sets import Dataset
 from train.export import bundle_score, contact_limit
 from train.export.contact_positions import place_of
 from train.metrics.score import accuracy_figure, fuse
-from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
+from train.models.recipe.fitted import Fit
 from train.onnx_tools.graph_builder import run, slim
 
 Array = NDArray[Any]

@@ -21,11 +21,11 @@ from appliance.sim import skin
 from train.data.sets import Dataset
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
-from train.models.compact import graph, recipe
-from train.models.compact.bank import LEAST_FILTERS, Bank
-from train.models.compact.fitted import Fit
 from train.models.linear_head import hold_out
 from train.models.methods import model_inputs
+from train.models.recipe import graph, recipe
+from train.models.recipe.bank import LEAST_FILTERS, Bank
+from train.models.recipe.fitted import Fit
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
@@ -94,7 +94,7 @@ def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
     if not difference <= MOST_TORCH_DIFFERENCE:
         raise ExportRefused(
             f"the float graph differs from pytorch by {difference:.3g} in a logit (limit {MOST_TORCH_DIFFERENCE}); "
-            "fit again; if it stays, compare train/models/compact/graph.py with network.py"
+            "fit again; if it stays, compare train/models/recipe/graph.py with network.py"
         )
     return difference
 
@@ -202,8 +202,8 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     The first is a trunk like the packaged bundle's in float32, with stages and the fewest filters,
     the second the paper's CNN in int8; both take its sweeps.
     """
-    from train.models.compact.network import Compact  # here, as what follows: it imports PyTorch
-    from train.models.paper_cnn import INT8_NODES, random_paper_cnn
+    from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
+    from train.models.recipe.network import Compact  # here, as what follows: it imports PyTorch
 
     rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     counts = rng.integers(0, 256, (4, form.window, *form.shape), np.uint8)

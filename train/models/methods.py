@@ -34,19 +34,19 @@ SHIPPED = "default"
 PACKAGED = "default-reattached"
 """The method of `fit --reattached`, which made the packaged bundle."""
 MODULES = (
-    "train.models.baselines",
-    "train.models.prior_work",
-    "train.models.sthmp",
-    "train.models.minirocket",
-    "train.models.minirocket_augmented",
-    "train.models.aeon_peers",
-    "train.models.ds_cnn",
-    "train.models.lite",
-    "train.models.edge_spectral",
-    "train.models.compact.default",
-    "train.models.paper_cnn",
-    "train.models.recurrent",
-    "train.models.compact.methods",
+    "train.models.peers.baselines",
+    "train.models.peers.prior_work",
+    "train.models.peers.sthmp",
+    "train.models.peers.minirocket",
+    "train.models.peers.minirocket_augmented",
+    "train.models.peers.aeon_peers",
+    "train.models.peers.ds_cnn",
+    "train.models.peers.lite",
+    "train.models.peers.edge_spectral",
+    "train.models.recipe.default",
+    "train.models.peers.paper_cnn",
+    "train.models.peers.recurrent",
+    "train.models.recipe.methods",
 )
 """Each defines METHODS, and methods(effort) where it trains networks."""
 

@@ -20,8 +20,8 @@ from train.data.sets import Dataset
 from train.evaluation import evaluate, uncertainty
 from train.evaluation.evaluate import Plan, Where
 from train.models import methods
-from train.models.compact.fitted import Fit
 from train.models.methods import SHIPPED, Effort
+from train.models.recipe.fitted import Fit
 
 Json = dict[str, Any]
 Log = Callable[[str], None]

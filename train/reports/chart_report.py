@@ -28,8 +28,8 @@ from train.export import measure, model_forms
 from train.export.model_forms import Packed
 from train.metrics import score
 from train.models import methods
-from train.models.compact.architectures import ARCHITECTURES
 from train.models.methods import FULL_EFFORT, Effort, Method
+from train.models.recipe.architectures import ARCHITECTURES
 from train.reports import chart_page, html, provenance, scatter
 from train.reports.method_names import family
 

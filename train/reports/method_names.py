@@ -74,17 +74,17 @@ NAMES = {
 
 
 FAMILIES = {
-    "train.models.compact.default": OURS,
-    "train.models.compact.methods": OURS,
-    "train.models.baselines": "L and H",
-    "train.models.paper_cnn": "deep networks",
-    "train.models.recurrent": "deep networks",
-    "train.models.minirocket": "MiniRocket",
-    "train.models.minirocket_augmented": "MiniRocket",
-    "train.models.aeon_peers": "aeon",
-    "train.models.ds_cnn": "edge tools",
-    "train.models.lite": "edge tools",
-    "train.models.edge_spectral": "edge tools",
+    "train.models.recipe.default": OURS,
+    "train.models.recipe.methods": OURS,
+    "train.models.peers.baselines": "L and H",
+    "train.models.peers.paper_cnn": "deep networks",
+    "train.models.peers.recurrent": "deep networks",
+    "train.models.peers.minirocket": "MiniRocket",
+    "train.models.peers.minirocket_augmented": "MiniRocket",
+    "train.models.peers.aeon_peers": "aeon",
+    "train.models.peers.ds_cnn": "edge tools",
+    "train.models.peers.lite": "edge tools",
+    "train.models.peers.edge_spectral": "edge tools",
 }
 OTHERS = "related work"
 """Where a method is from, by its module."""

@@ -29,8 +29,9 @@ from train.data.progress import spoken
 from train.data.sets import Dataset
 from train.evaluation.evaluate import Plan, Result, Where, evaluate
 from train.metrics import score
-from train.models import methods, prior_work
+from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort
+from train.models.peers import prior_work
 from train.reports import html, paper_report, paper_values, provenance
 from train.reports.chart_report import BOX_ON_HARD, box_on_hard
 

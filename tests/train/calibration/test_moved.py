@@ -7,7 +7,7 @@ import pytest
 from appliance.bundle.bundle import Classes
 from train.calibration import moved, novelty
 from train.calibration.moved import AugmentedCopies, fit_moved
-from train.models.compact.augment import Augmentation
+from train.models.recipe.augment import Augmentation
 
 MEANS = 8 * np.eye(4)[:3]
 

@@ -7,7 +7,7 @@ import numpy as np
 from tests.factories.posthoc_inputs import plain_inputs
 from tests.factories.sweep_sets import easy
 from train.calibration.posthoc import ONE_IN, fit_posthoc, posthoc_inputs
-from train.models.compact import recipe
+from train.models.recipe import recipe
 
 NOISE = np.array([0.0, 0.0, 0.0, 12.0])
 """What disturbs: in the last feature, where no material differs from another."""

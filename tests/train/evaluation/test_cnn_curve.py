@@ -14,7 +14,8 @@ import pytest
 from appliance.sim import skin
 from train.cli.main import main
 from train.evaluation import cnn_curve
-from train.models import checkpoint, paper_cnn
+from train.models import checkpoint
+from train.models.peers import paper_cnn
 
 FEW = {"train": 1, "new": 1, "hard": 1}
 

@@ -17,7 +17,7 @@ from tests.factories.loud_model import loud, sweeps
 from train.cli.main import main
 from train.export import measure, model_forms
 from train.export.measure import Measurement
-from train.models import minirocket
+from train.models.peers import minirocket
 from train.reports import chart_report
 
 KEYS = (

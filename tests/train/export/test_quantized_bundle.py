@@ -31,13 +31,14 @@ from train.cli.main import main
 from train.data import sets
 from train.export import pack, quantized_bundle
 from train.export.pack import ExportRefused
-from train.models import methods, paper_cnn
-from train.models.compact import fit
-from train.models.compact.architectures import ARCHITECTURES
-from train.models.compact.fit import FitRecipe
-from train.models.compact.fitted import Fit
-from train.models.compact.network import Compact
+from train.models import methods
 from train.models.linear_head import closed_form_head, hold_out
+from train.models.peers import paper_cnn
+from train.models.recipe import fit
+from train.models.recipe.architectures import ARCHITECTURES
+from train.models.recipe.fit import FitRecipe
+from train.models.recipe.fitted import Fit
+from train.models.recipe.network import Compact
 from train.onnx_tools import cost, graph_builder, parity
 from train.onnx_tools.parity import Layer
 

@@ -17,7 +17,7 @@ from appliance.core.errors import FormatError
 from appliance.signal import features, time_series
 from train.features import kinds
 from train.features.prior_work import correlation, spectrogram, static
-from train.models.prior_work import explore
+from train.models.peers.prior_work import explore
 
 KINDS = ("static", "spectrogram", "correlation")
 RATE = 750.0

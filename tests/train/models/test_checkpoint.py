@@ -12,9 +12,10 @@ import torch
 from tests.factories.sweep_sets import tones
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Plan, Where
-from train.models import checkpoint, paper_cnn, training
+from train.models import checkpoint, training
 from train.models.methods import Effort
-from train.models.paper_cnn import ImageLayers, ImageNetwork
+from train.models.peers import paper_cnn
+from train.models.peers.paper_cnn import ImageLayers, ImageNetwork
 from train.models.training import TrainingRecipe
 
 LAYERS = ImageLayers((4, 4), ((2, 1), (2, 1)), 2, True, 8)

@@ -19,11 +19,12 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
-from train.models import ds_cnn, edge_spectral, lite, methods, paper_cnn, recurrent, training
-from train.models.compact import fit, network
-from train.models.compact.fit import FitRecipe
+from train.models import methods, training
 from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
+from train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
+from train.models.recipe import fit, network
+from train.models.recipe.fit import FitRecipe
 from train.onnx_tools import graph_builder
 
 NETS = (

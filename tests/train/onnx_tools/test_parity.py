@@ -16,8 +16,8 @@ from appliance.core.errors import FormatError
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from train.export import quantized_bundle
-from train.models.compact import fit
-from train.models.compact.fit import Fit, FitRecipe
+from train.models.recipe import fit
+from train.models.recipe.fit import Fit, FitRecipe
 from train.onnx_tools import parity
 from train.onnx_tools.parity import Layer
 from train.onnx_tools.quantize import quantize

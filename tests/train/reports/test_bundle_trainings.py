@@ -17,8 +17,8 @@ from tests.factories.sweep_sets import easy, tones
 from train.cli.main import main
 from train.data.sets import Dataset
 from train.evaluation.evaluate import Where
-from train.models.compact import recipe
-from train.models.compact.fitted import Fit
+from train.models.recipe import recipe
+from train.models.recipe.fitted import Fit
 from train.reports import bundle_report, bundle_trainings
 
 NOTHING = lambda line: None  # noqa: E731

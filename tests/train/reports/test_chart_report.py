@@ -23,8 +23,8 @@ from tests.factories.paths import ROOT
 from train.evaluation.evaluate import Where
 from train.metrics import score
 from train.models import methods
-from train.models.compact import graph
-from train.models.compact.architectures import ARCHITECTURES
+from train.models.recipe import graph
+from train.models.recipe.architectures import ARCHITECTURES
 from train.onnx_tools import cost
 from train.onnx_tools.quantize import quantize
 from train.reports import chart_page, chart_report, comparison, method_names, pareto, scatter

@@ -1,0 +1,169 @@
+"""The filter bank: its graph against the definition, float against int8, what it cannot see,
+windows too short for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from train.models.recipe import bank, graph
+from train.models.recipe.architectures import FLOOR, Architecture
+from train.models.recipe.bank import DILATIONS, TAPS, Bank
+from train.models.recipe.recipe import FIXED
+from train.models.scale import texture_scale
+from train.onnx_tools.graph_builder import run
+
+FORMS = [
+    SweepFormat(2, 2, 100.0, 64, "uint8"),
+    SweepFormat(3, 3, 50.0, 40, "int16"),
+    SweepFormat(1, 1, 10.0, 16, "uint16"),
+    SweepFormat(4, 4, 750.0, 600, "uint8"),
+    SweepFormat(4, 2, 750.0, 600, "float32"),
+    SweepFormat(2, 2, 750.0, 600, "int16", 3),
+]
+forms = pytest.mark.parametrize("form", FORMS, ids=str)
+BANK = replace(FIXED, pools=2)
+
+
+def counts(form: SweepFormat, n: int = 3) -> np.ndarray:
+    """Random walks [n, T, R, C] of raw counts."""
+    walk = np.random.default_rng(7).integers(-3, 4, (n, form.window, *form.shape)).cumsum(axis=1)
+    return (
+        1000 * (form.dtype != "uint8")
+        + np.clip(100 + walk - walk.mean(axis=1, keepdims=True).astype(int), 0, 255)
+    ).astype(form.dtype)
+
+
+def small(form: SweepFormat, architecture: Architecture = BANK) -> Bank:
+    """Twenty filters of the kinds that `form` allows, fitted to the random walks."""
+    rng, kinds = (
+        np.random.default_rng(3),
+        (False,) if architecture.zero_sum(form.window) else (False, True),
+    )
+    every = bank.draw(form, rng, kinds)
+    some = every.take(np.concatenate([np.flatnonzero(every.free == free)[:20] for free in kinds]))
+    given, seen = counts(form, 12), [np.empty(0)] * len(some)
+    for numbers, model in graph.bank_responses(form, texture_scale(given), architecture, some):
+        for number, values in zip(numbers, run(model, given).swapaxes(0, 2), strict=True):
+            seen[number] = values.ravel()
+    return bank.fitted(some, seen, rng)
+
+
+def trunk(form: SweepFormat, filters: Bank, int8: bool, tenths: bool = False) -> onnx.ModelProto:
+    """The trunk of these filters alone."""
+    given = counts(form, 12)
+    ranges = graph.Ranges(graph.count_range(given, BANK), ()) if int8 else None
+    return graph.trunk_graph(form, texture_scale(given), filters.weights(), BANK, ranges, tenths)
+
+
+@forms
+def test_the_graph_is_the_definition(form: SweepFormat):
+    """Each response tap by tap; log of its mean magnitude in deviations, share above its
+    threshold."""
+    filters, given = small(form), counts(form)
+    scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(form, 12))
+    for sweep, row in zip(
+        scaled.reshape(len(given), form.window, -1),
+        run(trunk(form, filters, False), given),
+        strict=True,
+    ):
+        sizes, shares = [], []
+        for weights, dilation, reach, limit in zip(
+            filters.taps(), filters.dilations, filters.reach, filters.limits, strict=True
+        ):
+            stride = bank.stage(form, dilation).stride
+            starts = range(0, form.window - (TAPS - 1) * dilation, stride)
+            y = np.array(
+                [
+                    sum(weights[:, tap] @ sweep[at + tap * dilation] for tap in range(TAPS))
+                    for at in starts
+                ]
+            )
+            sizes.append(np.log(np.abs(y).mean() * reach + FLOOR))
+            shares.append(np.mean(y > limit))
+        np.testing.assert_allclose(row[: len(filters)], sizes, atol=2e-3)
+        np.testing.assert_allclose(row[len(filters) :], shares, atol=3.5 / len(starts))
+
+
+@forms
+def test_int8_is_close_and_the_last_tenth_is_the_whole_window(form: SweepFormat):
+    """Magnitudes within a few hundredths of a logarithm, shares within a few responses; in both
+    forms."""
+    filters, given = small(form), counts(form)
+    precise, rounded = (run(trunk(form, filters, int8), given) for int8 in (False, True))
+    assert np.abs(precise - rounded).mean() < 0.03
+    for int8, whole in ((False, precise), (True, rounded)):
+        tenths = run(trunk(form, filters, int8, tenths=True), given)
+        assert tenths.shape == (len(given), 10, whole.shape[1])
+        np.testing.assert_allclose(tenths[:, -1], whole, atol=1e-5)
+
+
+def test_wide_counts_keep_what_a_byte_would_round_away():
+    """One sweep of eight is ten thousand times as large as the others, which are below a step of 8
+    bits then: the int8 form gives what the float form gives."""
+    form = FORMS[4]
+    given = counts(form, 8)
+    given[0] = (given[0] - 1000) * 1e4
+    assert graph.count_range(given, BANK) / 127 > given[1:].max() - given[1:].min()
+    ranges, filters = graph.Ranges(graph.count_range(given, BANK), ()), small(form)
+    rounded, precise = (
+        run(
+            graph.trunk_graph(form, texture_scale(counts(form, 12)), filters.weights(), BANK, some),
+            given,
+        )
+        for some in (ranges, None)
+    )
+    np.testing.assert_array_equal(rounded, precise)
+    assert len(np.unique(rounded[1:, len(filters) :])) > 20
+
+
+@forms
+def test_an_offset_changes_nothing(form: SweepFormat):
+    """Every taxel higher by as much: the same bits in int8, where counts are whole."""
+    filters, given = small(form), counts(form)
+    higher = (given.clip(0, 250) + 5 if form.dtype == "uint8" else given + 1000).astype(form.dtype)
+    given = given.clip(0, 250).astype(form.dtype) if form.dtype == "uint8" else given
+    model = trunk(form, filters, True)
+    np.testing.assert_allclose(
+        run(model, higher),
+        run(model, given),
+        atol=0 if form.dtype == "uint8" and form.window == 600 else 0.05,
+    )
+
+
+@forms
+def test_filters_fit_the_window(form: SweepFormat):
+    """Unit norm, sums of zero but for free ones; only dilations that fit; some see one taxel alone
+    and some see all."""
+    for free in (False, True):
+        drawn = bank.draw(form, np.random.default_rng(0), (free,))
+        assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)
+        assert 0 < max(np.abs(drawn.across).max(), np.abs(drawn.along).max()) <= bank.LARGEST
+        np.testing.assert_allclose(np.linalg.norm(drawn.taps(), axis=(1, 2)), 1, atol=1e-5)
+        assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < form.window}
+        seen = (drawn.across != 0).sum(axis=1)
+        assert (seen.min(), seen.max()) == (1, form.channels)
+        assert len(drawn) * form.channels * TAPS <= bank.MOST_TAPS
+        last = bank.stage(form, int(drawn.dilations.max()))
+        assert (last.steps - 1) * last.hop + last.reach <= form.window
+
+
+def test_thresholds_leave_the_shares_that_were_drawn():
+    """Of the responses that they were taken from."""
+    form = FORMS[0]
+    shares = run(trunk(form, small(form), False), counts(form, 12))[:, 40:].mean(axis=0)
+    assert 0.05 < shares.min() < 0.25
+    assert 0.75 < shares.max() < 0.95
+
+
+def test_a_window_shorter_than_a_filter():
+    """The message says how long it must be."""
+    with pytest.raises(
+        FormatError, match="a window of 8 frames is too short for a filter; record at least 9"
+    ):
+        bank.draw(SweepFormat(1, 1, 10.0, 8, "uint8"), np.random.default_rng(0), (False,))

@@ -1,0 +1,273 @@
+"""Heads that add discriminants, and the choice among candidates by held-out parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from appliance.inference.classifier import softmax
+from train.data.splitters import InnerPart
+from train.models import discriminant
+from train.models.recipe import choice
+from train.models.recipe.choice import Court
+from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
+
+GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
+"""Features: that name the material everywhere; that say nothing; that name it in one group and lie
+in the others."""
+
+
+def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
+    """Sweeps of three materials in three groups of equal size, with one copy of each, and a part
+    for each group."""
+    rng = np.random.default_rng(seed)
+    labels, group = np.arange(n) % 3, np.arange(n) // (n // 3)
+    angle = 2 * np.pi * labels / 3
+    x = rng.standard_normal((n, 5))
+    x[:, GOOD] += 2.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x[:, TRAP] = ((labels + group) % 3)[:, None] + 0.01 * x[:, TRAP]
+    copied = x + 0.1 * rng.standard_normal(x.shape)
+    given = HeadData(x.astype(np.float32), labels, copied.astype(np.float32), np.arange(n))
+    return given, [InnerPart("place", group == value) for value in range(3)]
+
+
+def court() -> Court:
+    """Of `known`."""
+    given, parts = known()
+    return Court([given] * 3, parts, 3)
+
+
+def test_a_plan_is_the_sum_of_its_discriminants():
+    """As one matrix over all features, each with its factor; copies are seen where they are asked
+    for."""
+    given, _ = known()
+    plan = HeadPlan((HeadPart(GOOD, False, factor=2.0), HeadPart((1, 2), True, factor=0.5)))
+    weight, bias = plan.fit(given.given(), 3)
+    apart = discriminant.fit(given.features[:, GOOD], given.labels, 3)
+    x, y, copied, of = given.given()
+    with_copies = discriminant.fit(np.concatenate([x, copied])[:, 1:3], np.append(y, of), 3)
+    want = 2 * (given.features[:, GOOD] @ apart[0].T + apart[1])
+    want += 0.5 * (given.features[:, 1:3] @ with_copies[0].T + with_copies[1])
+    np.testing.assert_allclose(given.features @ weight.T + bias, want, rtol=1e-4, atol=1e-3)
+    assert plan.columns().tolist() == [0, 1, 2]
+    kept = np.array([0, 1, 2, 4])
+    less = HeadData(given.features[:, kept], given.labels, given.copied[:, kept], given.source)
+    np.testing.assert_array_equal(
+        plan.renumbered(kept).fit(less.given(), 3)[0][:, :3], weight[:, :3]
+    )
+    cooler = plan.cooled(4.0).fit(given.given(), 3)
+    np.testing.assert_allclose(cooler[0] * 4, weight, rtol=1e-5)
+    assert HeadPlan.read(plan.json()) == plan
+
+
+def test_a_part_takes_the_copies_of_its_sweeps_alone():
+    """Each copy stays with the sweep that it was made of."""
+    given, _ = known()
+    kept = np.arange(240) % 2 == 0
+    less = given.take(kept)
+    assert len(less.labels) == len(less.copied) == 120
+    np.testing.assert_array_equal(less.features[less.source], given.features[kept])
+    np.testing.assert_array_equal(less.copied, given.copied[kept])
+
+
+def test_what_lies_in_another_group_is_not_chosen():
+    """The feature that names every material within a group is the worst of all for a group that was
+    not seen."""
+    at = court()
+    losses = [at.loss(at.judge([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
+    assert losses[0] < 0.2 < losses[1]
+    assert losses[0] < losses[2]
+    pools = np.array(GOOD), np.array(NOISE)
+    chosen = choice.choose(at, [np.array([0, 1])], pools, np.arange(0), np.array(TRAP), print)
+    assert (
+        sum(TRAP[0] in part.columns for part in chosen.plan.parts) <= 1
+    )  # where the usual one sees the spectrum
+    assert at.accuracy(chosen) > 0.9
+
+
+def test_what_is_clearly_better_is_chosen():
+    """Bands that name the materials, beside filters that say nothing; all discriminants see
+    them."""
+    at = court()
+    chosen = choice.choose(
+        at,
+        [np.arange(2)],
+        (np.array(NOISE), np.array(TRAP * 2)),
+        np.arange(0),
+        np.array(GOOD),
+        print,
+    )
+    assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
+    assert at.better(chosen, at.judge([HeadPart(NOISE, False)]))
+
+
+def test_the_usual_one_stays_where_nothing_is_clearly_better():
+    """A discriminant of all magnitudes and one of all features, without copies."""
+    at = court()
+    chosen = choice.choose(
+        at, [np.arange(2)], (np.array(GOOD), np.array(NOISE)), np.arange(0), np.arange(0), print
+    )
+    assert chosen.plan == at.judge([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
+
+
+def test_a_factor_from_before_does_not_count():
+    """A part that was judged once is judged the same again, beside others as well: an old factor is
+    of other sweeps."""
+    given, parts = known()
+    for factor in (1.0, 1e-3):
+        at = Court([given] * 3, parts, 3)
+        both = at.judge([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
+        fresh = Court([given] * 3, parts, 3).judge([HeadPart(GOOD, False), HeadPart(NOISE, False)])
+        assert both.plan == fresh.plan
+
+
+def test_loss_alone_is_no_reason():
+    """Of two that name the same sweeps rightly, neither is better, however sure one is of what it
+    names wrongly."""
+    at = court()
+    one = at.judge([HeadPart(GOOD, False)])
+    wrong = one.logits.argmax(axis=1) != at.labels
+    surer = replace(one, losses=one.losses + 5.0 * wrong)
+    assert at.loss(surer) > at.loss(one)
+    assert not at.better(one, surer)
+
+
+def test_fewer_filters_where_held_out_parts_show_no_loss():
+    """A half, a quarter and so on of filters that all say the same; no fewer than `least`, none of
+    what is no filter."""
+    given, parts = known(600)
+    rng = np.random.default_rng(2)
+    same = given.features[:, :1] @ np.ones((1, 16)) + given.features[:, 1:2] @ np.tile(
+        [[1.0, -1.0]], 8
+    )
+    x = np.hstack([same + 1e-3 * rng.standard_normal(same.shape), given.features[:, [2]]]).astype(
+        np.float32
+    )
+    own = HeadData(x, given.labels, np.empty((0, 17), np.float32), np.empty(0, int))
+    at, number = Court([own] * 3, parts, 3), np.append(np.arange(16), -1)
+    full = at.judge([HeadPart(tuple(range(17)), False)])
+    tried: list[str] = []
+    # every other of these has the same sign: a half is not enough to name the materials
+    assert choice.fewer(at, full, number, 4, tried.append) == full
+    assert tried == ["choosing: 8 filters"]
+    pairs = np.append(np.arange(16) // 2, -1)
+    less = choice.fewer(at, full, pairs, 2, print)
+    assert less.plan.parts[0].columns == (0, 1, 8, 9, 16)
+    assert at.accuracy(less) > at.accuracy(full) - 0.01
+
+
+def test_too_few_sweeps_show_nothing():
+    """A hundred sweeps, all named rightly by fewer filters: that may be luck, so all stay."""
+    given, parts = known(99)
+    at = Court([given] * 3, parts, 3)
+    sure = at.judge([HeadPart(GOOD, False)])
+    assert not at.holds(sure, sure)
+    many, parts = known(600)
+    at = Court([many] * 3, parts, 3)
+    sure = at.judge([HeadPart(GOOD, False)])
+    assert at.holds(sure, sure)
+    assert not at.holds(at.judge([HeadPart(NOISE, False)]), sure)
+
+
+def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
+    """A head that learns its sweeps by heart has nothing to say of others: far from right where it
+    was not fitted."""
+    given, parts = known()
+    rng = np.random.default_rng(1)
+    own = HeadData(
+        rng.standard_normal((240, 400)).astype(np.float32),
+        given.labels,
+        np.empty((0, 400)),
+        np.empty(0, int),
+    )
+    at = Court([own] * 3, parts, 3)
+    assert at.accuracy(at.judge([HeadPart(tuple(range(400)), False)])) < 0.5
+    assert at.labels.tolist() == given.labels.tolist()
+
+
+def test_copies_of_held_out_sweeps_count_as_much_as_these():
+    """Where they are judged, what fails on copies is no longer as good as what does not, and loses
+    to it."""
+    given, parts = known()
+    copied = given.copied.copy()
+    copied[:, GOOD[0]] = 0
+    blind = (
+        np.hstack([given.features, given.features[:, GOOD]]),
+        np.hstack([copied, given.copied[:, GOOD]]),
+    )
+    both = replace(given, features=blind[0], copied=blind[1])
+    fails, stands = [HeadPart(GOOD, False)], [HeadPart((5, 6), False)]
+    in_place, moved = Court([both] * 3, parts, 3), Court([both] * 3, parts, 3, copied=True)
+    assert in_place.own.all()
+    assert in_place.accuracy(in_place.judge(fails)) == in_place.accuracy(in_place.judge(stands))
+    assert moved.own.sum() == len(given.labels) == (~moved.own).sum()
+    assert moved.weights[moved.own].sum() == pytest.approx(0.5)
+    assert moved.better(moved.judge(stands), moved.judge(fails))
+    assert not moved.holds(moved.judge(fails), moved.judge(stands))
+    own = moved.judge(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
+    assert own.mean() == pytest.approx(in_place.accuracy(in_place.judge(fails)))
+
+
+def test_the_temperature_is_the_best_for_held_out_sweeps():
+    """No other divisor of its logits gives less loss; every group counts the same."""
+    at = court()
+    judged = at.judge([HeadPart(GOOD, False), HeadPart(NOISE, True)])
+
+    def loss(temperature: float) -> float:
+        p = softmax(judged.logits / temperature)[np.arange(240), at.labels]
+        return float(-np.log(p) @ at.weights)
+
+    assert loss(1) == pytest.approx(at.loss(judged))
+    assert loss(1) <= min(loss(0.9), loss(1.1)) + 1e-3
+    assert at.weights.sum() == pytest.approx(1)
+
+
+def test_candidates_are_what_the_features_allow():
+    """The usual one and magnitudes alone; then the best with copies, with the spectrum, and that
+    alone."""
+    tried: list[str] = []
+    kinds, pools, none = (
+        [np.array([0]), np.array([1])],
+        (np.array([0, 1]), np.array([2, 3])),
+        np.arange(0),
+    )
+    choice.choose(court(), kinds, pools, none, np.array([4]), tried.append)
+    assert len(tried) == len(set(tried)) == 2 + 5
+    assert tried[:2] == ["choosing: magnitudes, shares, distribution", "choosing: magnitudes"]
+    assert tried[-1] == "choosing: the spectrum alone, with copies"
+    tried.clear()
+    chosen = choice.choose(court(), kinds[:1], pools, none, none, tried.append)
+    assert len(tried) == 2 + 1
+    assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
+
+
+def test_every_discriminant_sees_copies_where_these_are_wanted():
+    """Fewer candidates: none is there without."""
+    tried: list[str] = []
+    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
+    chosen = choice.choose(court(), kinds, pools, np.arange(0), np.array([4]), tried.append, True)
+    assert all(part.copies for part in chosen.plan.parts)
+    assert len(tried) == len(set(tried)) == 2 + 2
+
+
+def test_the_usual_one_sees_each_kind_three_times():
+    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum: no feature
+    twice in one."""
+    given, parts = known()
+    x = np.hstack([given.features[:, [0]]] * 6 + [given.features[:, [1]]] * 6)
+    rng = np.random.default_rng(0)
+    own = replace(
+        given,
+        features=(x + 0.1 * rng.standard_normal(x.shape)).astype(np.float32),
+        copied=np.zeros((240, 12)),
+    )
+    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
+    at = Court([own] * 3, parts, 3)
+    chosen = choice.choose(at, kinds, pools, np.arange(4, 8), np.arange(8, 12), print)
+    wanted = [(0,), (1,)]
+    wanted += [(kind, kind + 2, 8, 9, 10, 11) for kind in (0, 1)] + [
+        (kind, *range(4, 12)) for kind in (0, 1)
+    ]
+    assert [part.columns for part in chosen.plan.parts] == wanted

@@ -1,0 +1,353 @@
+"""The default recipe: what it chooses, that its forms agree, that it needs no PyTorch, and what it
+cannot be fitted to."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from tests.factories.sweep_sets import easy
+from train.cli import bundles
+from train.cli.main import main
+from train.data import sets
+from train.data.sets import Dataset
+from train.data.splitters import inner_parts
+from train.models import checkpoint, training
+from train.models.recipe import choice, default, recipe
+from train.models.recipe.bank import Bank
+from train.models.recipe.fitted import Fit
+from train.models.recipe.recipe import Settings
+from train.onnx_tools.graph_builder import run, with_head
+
+CLOSED = Settings(steps=0)
+INTERRUPTED = 130
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """A fit on the easy set, without stages."""
+    return recipe.fit(easy(), 1, CLOSED)
+
+
+def test_an_easy_set_is_named_rightly(fitted: Fit):
+    """By heads that did not see the part; what was chosen is told."""
+    assert fitted.about["validation"]["accuracy"] > 0.9
+    assert "filters" in fitted.about["chosen"] or "spectrum" in fitted.about["chosen"]
+    assert len(fitted.train) + len(fitted.held) == len(easy())
+
+
+def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
+    """Each feature is in a discriminant, and the heads fit the trunk."""
+    columns = fitted.plan.columns()
+    size = fitted.weights["int8.weight"].shape[1]
+    assert columns.tolist() == list(range(size))
+    assert run(fitted.trunk(), easy().samples[:2]).shape == (2, size)
+    usual = recipe.fit(easy(), 1, replace(CLOSED, choose=False))
+    assert usual.architecture.pools == 2
+    assert not usual.architecture.spectrum
+    assert not Bank.of(usual.weights).free.any()
+
+
+def fitted_by_command(folder: Path, *options: str) -> Fit:
+    """What `palpate-train fit` makes of the easy set without stages."""
+    easy().save(folder / "easy.npz")
+    out = folder / "fit.npz"
+    assert (
+        main(
+            [
+                "fit",
+                "--set",
+                str(folder / "easy.npz"),
+                "--seed",
+                "1",
+                "--steps",
+                "0",
+                "--out",
+                str(out),
+                *options,
+            ]
+        )
+        == 0
+    )
+    return Fit.load(out)
+
+
+def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
+    """The command's option: all discriminants see copies, which else the held-out parts of the easy
+    set do not ask for."""
+    made = fitted_by_command(tmp_path, "--reattached")
+    assert made.about["recipe"]["reattached"]
+    assert all(part.copies for part in made.plan.parts)
+    assert not any(part.copies for part in fitted.plan.parts)
+
+
+@pytest.mark.slow
+def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
+    """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little
+    as 50 Hz that of the usual fit, which hears 60 Hz."""
+    sixty = fitted_by_command(tmp_path, "--mains", "60")
+    assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
+    assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
+    sweeps, moved = sets.load("sim:T-LAB:1:2", 1), {}
+    # away from the ends of the range, since what is clipped has overtones
+    sweeps = replace(sweeps, samples=(sweeps.samples.clip(None, 200) + 40).astype(np.uint8))
+    seconds = np.arange(sweeps.format.window)[:, None, None] / sweeps.rate_hz
+    for mains_hz in (50, 60):
+        trunk = recipe.fixed_trunk(sweeps, 1, mains_hz)
+        bands = trunk.layout()["bands"]
+        before = trunk.features(sweeps)[:, bands]
+        for hz in (50, 60):
+            hummed = np.rint(sweeps.samples + 6 * np.sin(2 * np.pi * hz * seconds)).astype(np.uint8)
+            moved[hz, mains_hz] = np.abs(
+                trunk.features(replace(sweeps, samples=hummed))[:, bands] - before
+            ).mean()
+    assert max(moved[50, 50], moved[60, 60]) < min(moved[50, 60], moved[60, 50]) / 3, moved
+
+
+def test_int8_and_float_agree(fitted: Fit):
+    """Each with a head of its own."""
+    forms = [
+        with_head(
+            fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias"))
+        )
+        for int8, name in ((True, "int8"), (False, "head"))
+    ]
+    rounded, precise = (run(form, easy().samples).argmax(axis=1) for form in forms)
+    assert np.mean(rounded == precise) > 0.98
+
+
+def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
+    """The same answers, the same plan; a fit whose bank is missing is refused by name."""
+    fitted.save(tmp_path / "fit.npz")
+    again = Fit.load(tmp_path / "fit.npz")
+    assert again.plan == fitted.plan
+    x = easy().samples[:4]
+    np.testing.assert_array_equal(run(again.trunk(), x), run(fitted.trunk(), x))
+    gone = {
+        name: values
+        for name, values in fitted.weights.items()
+        if name not in ("bank.along", "int8.weight")
+    }
+    replace(fitted, weights=gone).save(tmp_path / "fit.npz")
+    with pytest.raises(FormatError, match=r"fit\.npz.*fit again"):
+        Fit.load(tmp_path / "fit.npz")
+
+
+def test_the_same_seed_gives_the_same_fit(fitted: Fit):
+    """And another one other filters. Where no stages can follow, the choice is the second part of
+    two."""
+    told: list[str] = []
+    again, other = (recipe.fit(easy(), seed, CLOSED, told.append) for seed in (1, 2))
+    assert told[0].startswith("part 1 of 2, features of")
+    assert told[1].startswith("part 2 of 2, choosing: ")
+    for name, values in fitted.weights.items():
+        np.testing.assert_array_equal(again.weights[name], values)
+    assert other.plan != fitted.plan or not np.array_equal(
+        other.weights["int8.weight"], fitted.weights["int8.weight"]
+    )
+
+
+@pytest.mark.slow
+def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
+    """From LEAST_SWEEPS on, where filters leave something to mend: their features come first, with
+    a discriminant of their own; a fifth of the sweeps is held out from them, and their scale is
+    that of the filters."""
+    for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
+        assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
+        monkeypatch.setattr(recipe, name, value)
+    told: list[str] = []
+    fit = recipe.fit(easy(), 1, Settings(steps=20), told.append)
+    assert [int(line.split()[1]) for line in told] == sorted(int(line.split()[1]) for line in told)
+    assert told[0] == f"part 1 of 3, features of {len(easy())} sweeps and 2 copies of each"
+    steps = [line for line in told if " step " in line]
+    assert re.fullmatch(r"part 3 of 3, step 10/20 loss \d+\.\d+, \d+ s left", steps[9])
+    assert steps[-1].endswith(", 0 s left")
+    assert re.fullmatch(
+        r"part 3 of 3, choosing: \d+ filters", told[-1]
+    )  # fewer may do beside stages
+    assert fit.architecture.channels == recipe.STAGES.channels
+    stages = sum(recipe.STAGES.channels)
+    assert fit.plan.parts[0].columns == tuple(range(stages))
+    assert len(fit.plan.parts) > 1
+    assert 0 < len(fit.held) < len(fit.train) < len(easy())
+    assert fit.about["validation"]["n"] == len(fit.held)
+    logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
+    assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("better", [True, False])
+def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
+    monkeypatch: pytest.MonkeyPatch, better: bool
+):
+    """For a skin that is put back: each stage then has a discriminant with the spectrum, and the
+    trunk holds no filters."""
+    for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
+        monkeypatch.setattr(recipe, name, value)
+    monkeypatch.setattr(choice.Court, "better", lambda *_: better)
+    fit = recipe.fit(easy(), 1, Settings(steps=20, reattached=True))
+    bands = fit.bands
+    assert bands
+    assert bool(fit.architecture.pools) == better
+    assert bool(fit.architecture.distribution) == better
+    assert fit.about["validation"]["n"] == len(fit.held)  # copies were judged, and are not counted
+    if not better:
+        sizes = [len(part.columns) for part in fit.plan.parts]
+        assert sizes == [channels + bands for channels in recipe.STAGES.channels]
+        assert all(part.copies for part in fit.plan.parts)
+        logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
+        assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
+
+
+def refused(fit: Fit) -> NoReturn:
+    """As where too few sweeps judge; it would take longer than the fit."""
+    raise FormatError("not here")
+
+
+@pytest.mark.slow
+def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The command, interrupted in its training: the next one begins after the last step that was
+    kept, and gives the same bits as one that was never interrupted. Another seed begins anew.
+    Nothing is left in the cache."""
+    monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
+    monkeypatch.setattr(recipe, "ENOUGH", 1.01)
+    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
+    monkeypatch.setattr(bundles, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(bundles, "calibrate", refused)
+    easy().save(tmp_path / "easy.npz")
+    plain, steps = training.backward, []
+
+    def backward(*args):
+        if len(steps) == stop:
+            raise KeyboardInterrupt
+        steps.append("")
+        return plain(*args)
+
+    def fitted(name: str, seed: int = 1) -> Fit | None:
+        out = tmp_path / f"{name}.npz"
+        args = [
+            "--set",
+            str(tmp_path / "easy.npz"),
+            "--seed",
+            str(seed),
+            "--steps",
+            "12",
+            "--out",
+            str(out),
+        ]
+        assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
+        return Fit.load(out) if stop < 0 else None
+
+    monkeypatch.setattr(training, "backward", backward)
+    stop = 7
+    fitted("first")
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    stop = -1
+    steps.clear()
+    other = fitted("other", seed=2)
+    assert len(steps) == 12
+    steps.clear()
+    resumed = fitted("first")
+    assert len(steps) == 12 - 7
+    assert not list((tmp_path / "cache").iterdir())
+    whole = fitted("whole")
+    assert other
+    assert resumed
+    assert whole
+    for name, values in whole.weights.items():
+        np.testing.assert_array_equal(resumed.weights[name], values)
+    assert not np.array_equal(other.weights["convs.0.weight"], whole.weights["convs.0.weight"])
+
+
+def test_filters_need_no_pytorch(tmp_path: Path):
+    """A process in which PyTorch cannot be imported fits and exports; the command says what it
+    chose."""
+    easy().save(tmp_path / "easy.npz")
+    script = (
+        "import sys\n"
+        "import builtins, importlib.util as util\n"
+        "found, loaded = util.find_spec, builtins.__import__\n"
+        "def gone(name, *args, **kwargs):\n"
+        "    if name.partition('.')[0] == 'torch': raise ModuleNotFoundError(name)\n"
+        "    return loaded(name, *args, **kwargs)\n"
+        "util.find_spec = lambda name, *args: None if name == 'torch' else found(name, *args)\n"
+        "builtins.__import__ = gone\n"
+        "from train.cli.main import main\n"
+        f"code = main(['fit', '--set', {str(tmp_path / 'easy.npz')!r}, '--seed', '1', '--steps', '0', '--out', {str(tmp_path / 'f.npz')!r}])\n"
+        f"sys.exit(code or main(['export', {str(tmp_path / 'f.npz')!r}, '--out', {str(tmp_path / 'b')!r}, '--name', 'b', '--version', '1']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "chosen: " in done.stdout
+    assert (tmp_path / "b" / "manifest.json").is_file()
+
+
+def test_the_method_names_materials_that_it_never_saw_last():
+    """A material without a training sweep gets a logit below all others; labels keep their
+    numbers."""
+    sweeps = easy()
+    part = sweeps.take(sweeps.labels != 1)
+    model = default.train(part, part.samples, 1, settings=CLOSED)
+    logits = model.logits(sweeps.samples)
+    assert logits.shape == (len(sweeps), len(sweeps.materials))
+    assert (logits.argmax(axis=1) != 1).all()
+    named = logits.argmax(axis=1)[sweeps.labels != 1]
+    assert np.mean(named == part.labels) > 0.9
+    assert (
+        np.mean(model.forms["float"].logits(part.samples).argmax(axis=1) == named[: len(part)])
+        > 0.95
+    )
+
+
+def test_groups_that_can_be_left_out_judge():
+    """Each group in parts, the first ones first; one that cuts recordings or counts trials does
+    not, and recordings do where there is none."""
+    n = 24
+    labels, recording = np.arange(n) % 2, np.arange(n) // 2
+    groups = {
+        "recording": recording,
+        "speed": recording % 3,
+        "force": recording % 2,
+        "odd": np.arange(n) % 2,
+    }
+    groups["trial"] = recording % 4
+    sweeps = Dataset(np.zeros((n, 16, 1, 1), np.uint8), labels, ("a", "b"), 10.0, groups, "x")
+    assert [part.group for part in inner_parts(sweeps)] == [
+        "force",
+        "speed",
+        "force",
+        "speed",
+        "speed",
+    ]
+    for part in inner_parts(sweeps):
+        assert set(sweeps.groups[part.group][part.out]).isdisjoint(
+            sweeps.groups[part.group][~part.out]
+        )
+    pure = replace(sweeps, labels=recording % 2, groups={"recording": recording})
+    parts = inner_parts(pure)
+    assert [part.group for part in parts] == ["recording"] * 5
+    assert np.sum([part.out for part in parts], axis=0).tolist() == [1] * n
+    one = replace(pure, labels=(recording == 3).astype(int))
+    with pytest.raises(FormatError, match="a material has one recording; two of each are needed"):
+        inner_parts(one)
+
+
+def test_what_cannot_be_fitted_is_named():
+    """A constant skin, and a window that is too short; nothing else is tried."""
+    still = replace(easy(), samples=np.full_like(easy().samples, 7))
+    with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
+        recipe.fit(still, 1, CLOSED)
+    with pytest.raises(
+        FormatError, match="a window of 12 frames is too short for the network; record at least 16"
+    ):
+        recipe.fit(replace(easy(), samples=easy().samples[:, :12]), 1, CLOSED)

@@ -1,0 +1,255 @@
+"""The spectrum against its definition, in PyTorch and in graphs: what it responds to, what it
+ignores, when there is one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from appliance.sim import skin
+from tests.factories.sweep_sets import easy
+from train.models.methods import Effort
+from train.models.recipe import fit, graph, methods, spectrum
+from train.models.recipe.architectures import ARCHITECTURES, Architecture
+from train.models.recipe.fit import FitRecipe
+from train.models.recipe.network import Compact
+from train.onnx_tools import graph_builder
+
+BARE = ARCHITECTURES["bands"]
+SMALL = Architecture((6, 8, 8), 8, 2)
+ODD = SweepFormat(2, 2, 100.0, 163, "int16")
+FORMS = {
+    "skin": (skin.FORMAT, True),
+    "four frames a period": (SweepFormat(1, 1, 200.0, 450, "float32"), True),
+    "three frames a period": (SweepFormat(3, 3, 150.0, 450, "uint16"), False),
+    "less than two periods a tenth": (SweepFormat(4, 4, 750.0, 299, "uint8"), False),
+    "just two": (SweepFormat(4, 4, 750.0, 300, "uint8"), True),
+    "odd": (ODD, False),
+    "line": (SweepFormat(16, 1, 35.6, 128, "float32"), False),
+    "shortest": (SweepFormat(2, 2, 100.0, 40, "uint8"), False),
+    "three axes": (SweepFormat(3, 2, 750.0, 303, "int16", 3), True),
+}
+"""Forms, and whether the mains are taken away there."""
+
+
+def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
+    """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much
+    noisier than others."""
+    rng = np.random.default_rng(seed)
+    own = rng.standard_normal((n, form.window, *form.shape))
+    x = 90 + 8 * rng.standard_normal((n, form.window, *(1,) * len(form.shape))) + 4 * own
+    return x.astype(form.dtype)
+
+
+def trunk(
+    form: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0
+) -> onnx.ModelProto:
+    """The graph that gives nothing but the spectrum."""
+    return graph.trunk_graph(form, scale, {}, replace(BARE, mains_hz=mains_hz), tenths=tenths)
+
+
+def heard(
+    form: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
+) -> np.ndarray:
+    """What PyTorch's head sees where there is nothing but the spectrum."""
+    with torch.no_grad():
+        model = Compact(form, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
+        return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
+
+
+def turned(x: np.ndarray) -> np.ndarray:
+    """What each series of [n, T, R * C * A] is multiplied with: more than three times the fifth of
+    sixteen is turned down."""
+    step = max(x.shape[1] // 150, 1)
+    noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
+    limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
+    return np.minimum(limit / noise, 1)
+
+
+def defined(
+    form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True
+) -> np.ndarray:
+    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of
+    one axis after the other.
+
+    Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a
+    transform at half bins, the mean of each band.
+    """
+    x, length = counts.reshape(len(counts), form.window, -1).astype(np.float64), form.window // 10
+    each = (x * turned(x) if limited else x).reshape(len(x), form.window, -1, form.axes).mean(2)
+    wave = scale * each.swapaxes(1, 2)[:, :, : 10 * length].reshape(-1, length)
+    turn = 2 * np.pi * 50 / form.rate_hz * np.arange(length)
+    fits = np.stack([np.ones(length), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
+    wave = wave - (fits @ np.linalg.lstsq(fits, wave.T, rcond=None)[0]).T
+    window = np.hanning(length + 2)[1:-1]
+    power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
+    edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
+    bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(
+        len(counts), form.axes, 10, -1
+    )
+    bands = bands.swapaxes(1, 2).reshape(len(counts), 10, -1)
+    return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
+
+
+@pytest.mark.parametrize(("form", "mains"), FORMS.values(), ids=FORMS)
+def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
+    """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth
+    holds two periods."""
+    counts = drawn(form)
+    want = defined(form, counts, mains)
+    rows, whole = (
+        graph_builder.run(trunk(form, tenths=True), counts),
+        graph_builder.run(trunk(form), counts),
+    )
+    assert rows.shape == want.shape == (2, 10, spectrum.count(form))
+    np.testing.assert_allclose(rows, want, atol=2e-3)
+    np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
+    np.testing.assert_allclose(heard(form, counts), whole, atol=1e-3)
+    if mains:
+        assert np.abs(defined(form, counts, False) - want).max() > 0.1
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16"])
+def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
+    """Behind the trunk's own features, in float and in int8; without the limit it would be
+    measured."""
+    form = SweepFormat(4, 4, 750.0, 600, dtype)
+    counts = drawn(form)
+    counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
+    want = defined(form, counts, True)
+    assert turned(counts.reshape(2, 600, 16).astype(float)).min() < 0.8
+    assert np.abs(defined(form, counts, True, limited=False) - want).max() > 0.3
+    np.testing.assert_allclose(heard(form, counts), want[:, -1], atol=2e-3)
+    plain = Compact(form, 3, 0.1, norm=False, architecture=SMALL).eval()
+    weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
+    for ranges in (None, found):
+        for tenths in (False, True):
+            both, alone = (
+                graph_builder.run(
+                    graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), counts
+                )
+                for shape in (SMALL.cut(3, True), SMALL)
+            )
+            np.testing.assert_array_equal(both[..., :-size], alone)
+            np.testing.assert_allclose(
+                both[..., -size:], want if tenths else want[:, -1], atol=2e-3
+            )
+
+
+@pytest.mark.parametrize("mains_hz", [50.0, 60.0])
+@pytest.mark.parametrize(
+    ("rate_hz", "window", "deaf"),
+    [(750.0, 1500, True), (250.0, 500, True), (750.0, 200, False), (150.0, 450, False)],
+)
+def test_the_hum_of_the_mains_changes_nothing(
+    rate_hz: float, window: int, deaf: bool, mains_hz: float
+):
+    """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is
+    measured everywhere. Of a fit for 60 Hz the other way round."""
+    form = SweepFormat(2, 2, rate_hz, window, "float32")
+    counts, rng = drawn(form), np.random.default_rng(1)
+    strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
+    for hz, silent in ((mains_hz, deaf), (110 - mains_hz, False)):
+        hum = strength * np.sin(
+            2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase)
+        )
+        hummed = (counts + hum).astype(np.float32)
+        for ask in (
+            lambda form, x: heard(form, x, mains_hz=mains_hz),
+            lambda form, x: graph_builder.run(trunk(form, tenths=True, mains_hz=mains_hz), x),
+        ):
+            apart = np.abs(ask(form, hummed) - ask(form, counts)).max(-1)
+            assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
+
+
+def test_a_fit_that_names_no_mains_is_as_before_it_could():
+    """50 Hz, in every bit of the graph; another frequency changes waves and nothing else."""
+    usual, fifty, sixty = (
+        graph.trunk_graph(skin.FORMAT, 0.1, {}, shape, tenths=True)
+        for shape in (BARE, replace(BARE, mains_hz=50.0), replace(BARE, mains_hz=60.0))
+    )
+    assert usual.SerializeToString() == fifty.SerializeToString()
+    assert [node.op_type for node in usual.graph.node] == [
+        node.op_type for node in sixty.graph.node
+    ]
+    pairs = zip(usual.graph.initializer, sixty.graph.initializer, strict=True)
+    assert [list(one.dims) for one, other in pairs if one != other] == [
+        [skin.FORMAT.window // 10, 3]
+    ]
+
+
+def test_later_frames_and_offsets_do_not_matter():
+    """Row d is of the first d + 1 tenths alone, to the bit; frames left over at the end are not
+    used; a skin that is loaded more has the same spectrum."""
+    counts = drawn(ODD)
+    held, late = counts.copy(), counts.copy()
+    held[:, 64:], late[:, 160:] = held[:, 63:64], 91
+    a, b, c, d = (
+        graph_builder.run(trunk(ODD, tenths=True), x)
+        for x in (counts, held, late, counts + np.int16(300))
+    )
+    np.testing.assert_array_equal(a[:, :4], b[:, :4])
+    assert (np.abs(a[:, 4:] - b[:, 4:]).max(2) > 1e-3).all()
+    np.testing.assert_array_equal(a, c)
+    np.testing.assert_allclose(a, d, atol=5e-3)
+    np.testing.assert_allclose(heard(ODD, counts), heard(ODD, counts + np.int16(300)), atol=5e-3)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_silence_is_finite(name: str):
+    """No power at all but what is added to each band, whatever the offset."""
+    form, _ = FORMS[name]
+    quiet = np.stack([np.full((form.window, *form.shape), level, form.dtype) for level in (0, 90)])
+    for have in (
+        heard(form, quiet),
+        graph_builder.run(trunk(form), quiet),
+        graph_builder.run(trunk(form, tenths=True), quiet),
+    ):
+        np.testing.assert_allclose(have, np.log(1e-4), atol=1e-3)
+
+
+def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
+    """What the graph makes of a few numbers is one constant when it is loaded; the file stays below
+    10 kB for 180 kB."""
+    model = trunk(skin.FORMAT)
+    assert len(model.SerializeToString()) < 10_000
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath, options.log_severity_level = (
+        str(tmp_path / "optimized.onnx"),
+        3,
+    )
+    onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+    optimized = onnx.load(tmp_path / "optimized.onnx").graph
+    done = Counter(n.op_type for n in optimized.node)
+    assert not {"Range", "Mod", "Cos", "Sin", "Less", "And", "Not"} & set(done)
+    assert [150, 2 * 149] in [list(c.dims) for c in optimized.initializer]
+
+
+def test_a_window_too_short_has_no_spectrum():
+    """Less than four frames a tenth: none is counted, a fit has none, and the size without
+    convolutions refuses with the reason."""
+    short = replace(easy(12), samples=easy(12).samples[:, :39])
+    assert spectrum.count(short.format) == 0
+    made = fit.fit(short, 1, FitRecipe(steps=2))
+    assert (made.architecture.spectrum, made.bands) == (False, 0)
+    assert made.architecture.channels
+    method = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
+    with pytest.raises(
+        FormatError, match="a window of 39 frames is too short for a spectrum; take another size"
+    ):
+        method.train(short, short.samples, 1)
+    enough = replace(easy(12), samples=easy(12).samples[:, :40])
+    assert spectrum.count(enough.format) == 3
+    assert method.train(enough, enough.samples, 1).logits(enough.samples).shape == (36, 3)

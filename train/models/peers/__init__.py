@@ -1,0 +1,1 @@
+"""The methods that the recipe is compared with: the paper's CNN, its baselines, and later ones."""

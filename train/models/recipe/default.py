@@ -1,0 +1,78 @@
+"""The methods of the default recipe. In: an Effort. Out: the METHODS default, default-reattached,
+filter-bank.
+
+Each is what the box runs, the int8 graph; the form "float" is the same before quantization.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.data.sets import Dataset
+from train.models.linear_head import expanded_head
+from train.models.methods import FULL_EFFORT, PACKAGED, Effort, Log, Method, no_log
+from train.models.recipe import recipe
+from train.models.recipe.fitted import CompactModel
+from train.onnx_tools.graph_builder import GraphModel, with_head
+
+Array = NDArray[Any]
+
+
+def train(
+    sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log
+) -> CompactModel:
+    """Choose and fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of
+    `sweeps`.
+
+    Raises FormatError as recipe.fit, and where only one material occurs.
+    """
+    known = replace(sweeps, samples=inputs).select(())
+    fit = recipe.fit(known, seed, settings, log)
+    present = np.unique(sweeps.labels)
+    heads = {
+        name: expanded_head(
+            fit.weights[f"{name}.weight"],
+            fit.weights[f"{name}.bias"],
+            present,
+            len(sweeps.materials),
+        )
+        for name in ("head", "int8")
+    }
+    forms = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
+    return CompactModel(fit, *heads["int8"], fit.about["chosen"], forms=forms)
+
+
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which
+    chooses and trains nothing."""
+    settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
+    return (
+        Method(
+            "default",
+            "the box's default: filters, spectrum and trained stages as held-out groups of the training sweeps ask for",
+            "raw",
+            partial(train, settings=settings),
+            effort=f"{settings.steps} iterations of stages",
+        ),
+        Method(
+            PACKAGED,
+            "as default, but all see augmented copies, as of a skin put back, and filters join stages only where that is better",
+            "raw",
+            partial(train, settings=replace(settings, reattached=True)),
+            effort=f"{settings.steps} iterations of stages",
+        ),
+        Method(
+            "filter-bank",
+            "random zero-sum filters, log mean magnitude and share above a quantile, shrinkage LDA in closed form, int8",
+            "raw",
+            partial(train, settings=recipe.Settings(steps=0, choose=False)),
+        ),
+    )
+
+
+METHODS = methods()

@@ -1,0 +1,141 @@
+"""The distribution of each taxel's counts and of their changes. In: a format, raw counts. Out:
+Levels, and nodes in a trunk.
+
+A filter asks what goes on between neighbouring frames; how often a taxel is how high, and how far
+it moves from one frame to the next, is other evidence (Dempster et al. 2024, QUANT, which sorts to
+find quantiles). Here levels are fixed and frames above them counted, which needs no sorting: a
+share for each taxel, signal and level. Counts are about their mean over the window, so that no
+offset matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from onnx import TensorProto
+
+from appliance.core.types import SweepFormat
+from train.models.recipe import nodes
+from train.models.recipe.architectures import Stage
+from train.models.recipe.nodes import FLOAT, TENTHS
+from train.onnx_tools.graph_builder import GraphBuilder
+
+Array = NDArray[Any]
+SIGNALS = 2
+"""Counts about their mean, and differences between neighbouring frames."""
+MOST_FEATURES = 256
+FEWEST_LEVELS, MOST_LEVELS = 4, 16
+MOST_FRAMES = 256
+"""Frames of a window that are looked at, at most; they are evenly spaced."""
+APART = 1e-3
+"""A level lies in the middle between two values that are this far apart, in deviations: whole
+counts never equal it."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """taxels: int [n], ascending, those that are looked at. levels: float32 [SIGNALS, n, k], of
+    scaled counts."""
+
+    taxels: Array
+    levels: Array
+
+    def __len__(self) -> int:
+        """How many features they give."""
+        return int(self.levels.size)
+
+    def weights(self) -> dict[str, Array]:
+        """As a Fit keeps them."""
+        return {f"distribution.{name}": values for name, values in vars(self).items()}
+
+    @classmethod
+    def of(cls, weights: Mapping[str, Array]) -> Levels:
+        """What `weights` gave. Raises KeyError where it is not there."""
+        return cls(**{name: weights[f"distribution.{name}"] for name in cls.__dataclass_fields__})
+
+
+def fitted(samples: Array, scale: float, rng: np.random.Generator) -> Levels:
+    """Levels at evenly spaced quantiles of raw counts [N, T, R, C, ...] of training sweeps. Of more
+    taxels than MOST_FEATURES allows, random ones are looked at."""
+    n, window = samples.shape[:2]
+    counts = samples.reshape(n, window, -1)
+    taxels = np.sort(rng.permutation(counts.shape[2])[: MOST_FEATURES // (SIGNALS * FEWEST_LEVELS)])
+    x = counts[:, :, taxels].astype(np.float64) * scale
+    number = int(np.clip(MOST_FEATURES // (SIGNALS * len(taxels)), FEWEST_LEVELS, MOST_LEVELS))
+    hop = _looked(window).hop
+    older, newer = x[:, : window - 1 : hop], x[:, 1::hop]
+    seen = older - older.mean(axis=1, keepdims=True), newer - older
+    levels = [
+        [_levels(values[:, :, i].ravel(), number) for i in range(len(taxels))] for values in seen
+    ]
+    return Levels(taxels, np.array(levels, np.float32))
+
+
+def _levels(values: Array, number: int) -> Array:
+    """Quantiles [number] of `values` [n], each moved up to the middle between two of them, or above
+    the largest: a taxel that never moves is at none of its levels."""
+    ordered = np.sort(values)
+    at = np.quantile(ordered, (np.arange(number) + 0.5) / number, method="lower")
+    above = np.searchsorted(ordered, at + max(APART * float(ordered.std()), 1e-12), side="right")
+    levels: Array = (at + np.append(ordered, ordered[-1] + APART)[above]) / 2
+    return levels
+
+
+def _looked(window: int) -> Stage:
+    """The frames that are looked at, each with the next one."""
+    hop = max(window // MOST_FRAMES, 1)
+    return Stage(2, hop, (window - 2) // hop + 1, 2, hop)
+
+
+def pooled(
+    g: GraphBuilder,
+    form: SweepFormat,
+    some: Levels,
+    x: str,
+    step: float,
+    int8: bool,
+    tenths: bool = False,
+) -> str:
+    """Taxels [n, R * C, T], which are scaled counts once they are multiplied by `step`, n being 1
+    or TENTHS -> shares [1, 1 or TENTHS, len(some)]: of each signal, taxel and level. int8: whether
+    frames are counted in integers."""
+    if len(some.taxels) < form.channels:
+        x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
+    looked, taxels = _looked(form.window), len(some.taxels)
+    counts = nodes.known_steps(looked, form.window, tenths)
+    total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=tenths)
+    older, newer = (
+        g(
+            "Slice",
+            x,
+            *(g.constant([n], "int64") for n in (at, form.window - 1 + at, 2, looked.hop)),
+        )
+        for at in (0, 1)
+    )
+    changes, older = (
+        g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older)
+    )
+    if tenths:  # each tenth has means of its own
+        changes = g("Expand", changes, g.constant([TENTHS, looked.steps, taxels], "int64"))
+    about = g(
+        "Sub", older, g("Mul", total(older), nodes.mean_factors(g, 1.0, counts, taxels, tenths))
+    )
+    y = g("Transpose", nodes.side_by_side(g, [about, changes]), perm=[0, 2, 1])
+    # a level is compared with a whole row of frames, which is four times as fast as a frame with a
+    # row of levels
+    levels = some.levels.reshape(SIGNALS * taxels, -1, 1) / step
+    above = g("Greater", g("Reshape", y, g.constant([0, 0, 1, -1], "int64")), g.constant(levels))
+    above = g(
+        "Reshape",
+        g("Cast", above, to=TensorProto.UINT8 if int8 else FLOAT),
+        g.constant([0, len(some), -1], "int64"),
+    )
+    above = total(above, integers=int8, time_last=True)
+    shares = g("Cast", above, to=FLOAT) if int8 else above
+    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, len(some), tenths))
+    return g("Reshape", shares, g.constant([1, TENTHS, -1], "int64")) if tenths else shares

@@ -1,0 +1,242 @@
+"""Training of the compact network. In: a Dataset and a seed. Out: a Fit, which holds the network
+and the sweeps it saw.
+
+The convolutions are trained by gradient descent on augmented sweeps. Then shrinkage LDA in closed
+form replaces the head, once for the network and once for its int8 trunk. Groups that were held out
+decide how many stages the heads see, and give one temperature that makes probabilities honest. No
+random state outside is read or changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import chain, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Generator, Tensor
+
+from appliance.core.errors import FormatError
+from appliance.core.types import SweepFormat
+from appliance.inference.classifier import LEAST_PROBABILITY, softmax
+from train.data.sets import Dataset
+from train.metrics.score import accuracy_figure
+from train.models import training
+from train.models.linear_head import closed_form_head, hold_out
+from train.models.methods import Cost, Log, no_log
+from train.models.networks import Network
+from train.models.recipe import graph, spectrum
+from train.models.recipe.architectures import DEFAULT, Architecture
+from train.models.recipe.augment import Augmentation, augment, default_augmentation
+from train.models.recipe.copies import COPIES, copies
+from train.models.recipe.fitted import Fit
+from train.models.recipe.heads import HeadPart, HeadPlan
+from train.models.recipe.network import Compact
+from train.models.scale import texture_scale
+from train.models.training import Augment, batches, float_batches, learn, one_thread
+from train.onnx_tools.graph_builder import run
+
+Array = NDArray[Any]
+HeadInputs = tuple[tuple[Array, Array], ...]
+"""(features of the training sweeps and their copies, features of the held-out sweeps) of the float
+and the int8 trunk."""
+
+
+@dataclass(frozen=True)
+class FitRecipe(training.TrainingRecipe):
+    """How the compact network is trained.
+
+    augmentation: of the training sweeps, None for `default_augmentation`; it replaces gain and
+    noise. keep_means: see Compact; the convolutions never see the means, the closed-form head does.
+    """
+
+    steps: int = 600
+    noise: float = 0.0
+    gain: float = 0.0
+    augmentation: Augmentation | None = None
+    keep_means: bool = False
+
+    def json(self) -> dict[str, Any]:
+        """What a fit and its bundle's manifest record."""
+        fields = asdict(self)
+        return fields | {"scene": fields.pop("augmentation")}
+
+
+def fit(
+    sweeps: Dataset,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log = no_log,
+    architecture: Architecture = DEFAULT,
+    unfinished: Path | None = None,
+) -> Fit:
+    """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for
+    windows too short."""
+    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, architecture, unfinished)
+
+
+def fit_on(
+    train: Dataset,
+    held: Dataset,
+    by: str,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log = no_log,
+    architecture: Architecture = DEFAULT,
+    unfinished: Path | None = None,
+) -> Fit:
+    """Train on `train`; `held` gives temperature and validation. by: the group that separates the
+    two, for the record. unfinished: see training.learn."""
+    form, bands = train.format, spectrum.count(train.format)
+    if not (architecture.channels or bands):
+        raise FormatError(
+            f"a window of {form.window} frames is too short for a spectrum; take another size"
+        )
+    augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(form.window))
+    recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
+    with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(seed)
+        model, cost = Compact(form, len(train.materials), scale, architecture=architecture), Cost()
+        if architecture.channels:
+            with torch.enable_grad():
+                change = augmenter(form, augmentation)
+                model, cost = learn(
+                    model, train, recipe, seed, log, augment=change, unfinished=unfinished
+                )
+        else:
+            model = model.fused()
+        model.keep_means, model.architecture = (
+            recipe.keep_means,
+            replace(architecture, spectrum=bands > 0),
+        )
+        ranges = model.ranges(train.samples)
+        inputs = _head_inputs(model, ranges, train, held, copies(train, augmentation, seed, COPIES))
+        model, weights = _select_depth(
+            model, inputs, np.tile(train.labels, COPIES + 1), held.labels
+        )
+        logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
+    right = int(np.sum(logits.argmax(1) == held.labels))
+    kept = recipe.json() | {"mains_hz": architecture.mains_hz}
+    about = {
+        "seed": seed,
+        "recipe": kept,
+        "held_out_by": by,
+        "validation": accuracy_figure(right, len(held)),
+    }
+    ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
+    plan = HeadPlan((HeadPart(tuple(range(weights["head.weight"].shape[1])), copies=True),))
+    return Fit(weights, scale, model.architecture, ranges, train, held, about, plan, cost)
+
+
+def train_stages(
+    sweeps: Dataset,
+    scale: float,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log,
+    architecture: Architecture,
+    unfinished: Path | None = None,
+) -> tuple[dict[str, Array], graph.Ranges]:
+    """Stages trained on all of `sweeps`, whose counts are multiplied by `scale`: their weights as
+    graph.trunk_graph takes them, and ranges for int8. unfinished: see training.learn."""
+    assert recipe.augmentation
+    with one_thread(), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        change = augmenter(sweeps.format, recipe.augmentation)
+        model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
+        model, _ = learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
+        weights = {
+            name: values for name, values in model.weights().items() if name.startswith("convs.")
+        }
+        return weights, model.ranges(sweeps.samples)
+
+
+def _head_inputs(
+    model: Compact, ranges: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]
+) -> HeadInputs:
+    """What the heads see of the training sweeps with their copies, and of those held out: (float,
+    int8)."""
+    trunk = graph.trunk_graph(
+        model.form,
+        model.scale,
+        model.weights(),
+        model.architecture,
+        ranges,
+        keep_means=model.keep_means,
+    )
+    trunks: tuple[Callable[[Dataset], Array], ...] = (
+        partial(features, model),
+        lambda sweeps: run(trunk, sweeps.samples),
+    )
+    rows = [[compute(sweeps) for compute in trunks] for sweeps in chain([train], more)]
+    return tuple(
+        (np.concatenate(of_all), compute(held))
+        for of_all, compute in zip(zip(*rows, strict=True), trunks, strict=True)
+    )
+
+
+def _select_depth(
+    model: Compact, inputs: HeadInputs, labels: Array, held_labels: Array
+) -> tuple[Compact, dict[str, Array]]:
+    """The network that the heads see, cut, and all weights of a Fit.
+
+    The heads see the first stages, with the spectrum or without: the choice with the least cross
+    entropy on the held-out sweeps, and among equal ones the smallest. The rest is cut off. Later
+    stages fit the training sweeps too closely, and a head that was fitted to these trusts them too
+    much.
+    """
+    convolved, total = sum(model.architecture.channels), inputs[1][0].shape[1]
+    bands = model.architecture.spectrum * spectrum.count(model.form)
+    candidates = []
+    depths = range(min(model.architecture.fewest, len(model.convs)), len(model.convs) + 1)
+    for depth, with_bands in product(depths, (True, False) if bands else (False,)):
+        if not depth and not with_bands:
+            continue
+        columns = np.r_[
+            : sum(model.architecture.channels[:depth]), convolved : total - bands * (not with_bands)
+        ]
+        heads = [
+            closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in inputs
+        ]
+        weight, bias = heads[1]
+        p = softmax(inputs[1][1][:, columns] @ weight.T + bias)[
+            np.arange(len(held_labels)), held_labels
+        ]
+        candidates.append(
+            (-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, with_bands, heads)
+        )
+    _, depth, with_bands, heads = min(candidates, key=lambda candidate: candidate[0])
+    model = model.cut(depth, with_bands)
+    head_weights = {  # what all materials have in common changes no probability, and costs float32 precision
+        f"{name}.{k}": v - v.mean(axis=0)
+        for name, head in zip(("head", "int8"), heads, strict=True)
+        for k, v in zip(("weight", "bias"), head, strict=True)
+    }
+    model.head.weight.data = torch.from_numpy(head_weights["head.weight"])
+    model.head.bias.data = torch.from_numpy(head_weights["head.bias"])
+    return model, {k: v.numpy() for k, v in model.state_dict().items()} | head_weights
+
+
+def augmenter(form: SweepFormat, augmentation: Augmentation) -> Augment:
+    """`augment` for sweeps of `form`, as the training loop calls it: in PyTorch, seeded by its
+    generator."""
+    rows = form.rows if form.cols > 1 else 1
+
+    def change(x: Tensor, rng: Generator) -> Tensor:
+        seed = int(torch.randint(2**63 - 1, (), generator=rng))
+        return torch.from_numpy(augment(x.numpy(), rows, augmentation, np.random.default_rng(seed)))
+
+    return change
+
+
+@torch.no_grad()
+def features(model: Network, sweeps: Dataset) -> Array:
+    """What the head sees of each sweep, float32 [N, F]."""
+    return np.concatenate(
+        [model.head_input(x).numpy() for x in float_batches(sweeps.samples, batches(len(sweeps)))]
+    )
