@@ -64,17 +64,17 @@ class Expected:
         }
 
     @classmethod
-    def read(cls, fmt: SweepFormat, known: Mapping[str, Any], bundle: str) -> Expected:
+    def read(cls, format: SweepFormat, known: Mapping[str, Any], bundle: str) -> Expected:
         """From what `json` gave; nothing where `known` is empty. Raises KeyError, TypeError,
         ValueError or BundleError."""
         if not known:
-            return cls(fmt, bundle or NO_BUNDLE)
+            return cls(format, bundle or NO_BUNDLE)
         place = typed(ContactPositions, known["place"]) if known["place"] else None
         unloaded = np.array(known["unloaded"], np.float64)
-        if unloaded.shape not in ((), (fmt.rows, fmt.cols)):
+        if unloaded.shape not in ((), (format.rows, format.cols)):
             raise ValueError(f"unloaded counts of {unloaded.shape}")
         return cls(
-            fmt,
+            format,
             bundle or NO_BUNDLE,
             known["contact"],
             place,

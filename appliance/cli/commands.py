@@ -134,10 +134,10 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     with ExitStack() as stack:
         asked = skins.described(args.format) if args.format else None
         devices = open_devices((lambda: asked) if asked else None)
-        fmt = asked or devices.format or _announced(devices.wire(settings), devices)
+        format = asked or devices.format or _announced(devices.wire(settings), devices)
         if args.window is not None:
-            fmt = replace(fmt, window=round(args.window * fmt.rate_hz))
-        _check_length(fmt, settings)
+            format = replace(format, window=round(args.window * format.rate_hz))
+        _check_length(format, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
         # reads the output
         port = (
@@ -147,34 +147,34 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         )
         folder = args.out or Path(settings.store.folder) / "sweeps"
         recording = RecordingSession(
-            folder, fmt, labels, devices.clock, _sentences(port), args.target
+            folder, format, labels, devices.clock, _sentences(port), args.target
         )
         stack.callback(recording.close)
         page = _record_page(
-            args, settings, fmt, devices, recording, lambda command: box.obey(command)
+            args, settings, format, devices, recording, lambda command: box.obey(command)
         )
         log.info(
-            f"record: {fmt}, to {folder}; slide for longer than {fmt.window / fmt.rate_hz:.3g} s"
+            f"record: {format}, to {folder}; slide for longer than {format.window / format.rate_hz:.3g} s"
         )
-        if slow := skin_profile.warning(fmt):
+        if slow := skin_profile.warning(format):
             log.warning(f"record: {slow}")
         facts: Facts = {
             "model": lambda: "none: sweeps are recorded",
             "recorded": lambda: recording.about()["missing"],
             "recording": recording.about,
         }
-        feed = _feed(settings, fmt, devices.source, {"bundle": "", "labels": []}, facts)
+        feed = _feed(settings, format, devices.source, {"bundle": "", "labels": []}, facts)
         box = assembly.recorder(
             settings,
-            fmt,
+            format,
             devices,
             port,
             stack,
-            capture=_capture(args, settings, fmt, stack),
+            capture=_capture(args, settings, format, stack),
             observers=[
                 Notifier(SystemClock()),
                 recording,
-                *_printer(fmt, recording),
+                *_printer(format, recording),
                 *_status(settings, facts),
                 *feed,
                 *page,
@@ -188,19 +188,19 @@ def run_record(args: argparse.Namespace, open_devices: OpenDevices) -> int:
     return 0
 
 
-def _printer(fmt: SweepFormat, recording: RecordingSession) -> list[Observer]:
+def _printer(format: SweepFormat, recording: RecordingSession) -> list[Observer]:
     """What shows each sweep to a person at a terminal."""
     if not sys.stdout.isatty():
         return []
     from appliance.watch.sweep_text import SweepPrinter
 
-    return [SweepPrinter(sys.stdout, fmt.rate_hz, recording.about)]
+    return [SweepPrinter(sys.stdout, format.rate_hz, recording.about)]
 
 
 def _record_page(
     args: argparse.Namespace,
     settings: Config,
-    fmt: SweepFormat,
+    format: SweepFormat,
     devices: Devices,
     recording: RecordingSession,
     obey: Callable[[Command], list[object]],
@@ -214,7 +214,7 @@ def _record_page(
     access = Access.configured(settings.watch, args.web)
     page = RecordPage(
         access,
-        fmt,
+        format,
         devices.source,
         devices.wire(settings).trigger,
         recording.about,
@@ -235,11 +235,11 @@ def _announced(settings: Config, devices: Devices) -> SweepFormat:
         ) from e
 
 
-def _check_length(fmt: SweepFormat, settings: Config) -> None:
+def _check_length(format: SweepFormat, settings: Config) -> None:
     """Raises ConfigError if no sweep could be as long as the window."""
-    if fmt.window * fmt.period_ns > settings.sweep.max_duration_s * 1e9:
+    if format.window * format.period_ns > settings.sweep.max_duration_s * 1e9:
         raise ConfigError(
-            f"a window of {fmt.window / fmt.rate_hz:g} s is longer than any sweep may last "
+            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last "
             f"({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise sweep.max_duration_s"
         )
 
@@ -249,9 +249,9 @@ def _sentences(port: Port | None) -> Callable[[bytes], None]:
 
 
 def _capture(
-    args: argparse.Namespace, settings: Config, fmt: SweepFormat, stack: ExitStack
+    args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
 ) -> CaptureWriter | None:
-    capture = CaptureWriter(args.capture, fmt, skins.profile(settings)) if args.capture else None
+    capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)
     return capture
@@ -305,7 +305,7 @@ def _status(settings: Config, facts: Facts) -> list[Observer]:
 
 
 def _feed(
-    settings: Config, fmt: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
+    settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
 ) -> list[Observer]:
     """What programs that watch the box read, where the settings name a socket; its default is for a
     service, whose folder is there. model: what the feed's first line says of it."""
@@ -318,7 +318,11 @@ def _feed(
     known = {"source": source, "skin": settings.sensor.skin, **model}
     return [
         FeedServer(
-            path, fmt, known, SystemClock(), lambda: {name: fact() for name, fact in facts.items()}
+            path,
+            format,
+            known,
+            SystemClock(),
+            lambda: {name: fact() for name, fact in facts.items()},
         )
     ]
 
@@ -503,14 +507,14 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except BundleError as e:
         log.warning(f"no bundle: {e}")
     try:
-        fmt = devices.format or skins.announced(settings, devices)
+        format = devices.format or skins.announced(settings, devices)
     except SensorError:
         if not current:
             raise
         return Expected.by(current, fingertip)  # the skin is waited for
-    if current and fits(fmt, current.format):
+    if current and fits(format, current.format):
         return Expected.by(current, fingertip)
-    return Expected(fmt, fingertip=fingertip)
+    return Expected(format, fingertip=fingertip)
 
 
 def run_replay(args: argparse.Namespace) -> int:

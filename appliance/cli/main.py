@@ -72,12 +72,12 @@ def _with_devices(
     return run(args, partial(_open_devices, args))
 
 
-def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat] | None) -> Devices:
-    """The real devices, or simulated ones where `--sim` names them; `fmt` gives what the simulated
+def _open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | None) -> Devices:
+    """The real devices, or simulated ones where `--sim` names them; `format` gives what the simulated
     skin has to send."""
     if args.sim:
         return _simulated(
-            args.sim, fmt() if fmt else None, args, load_settings(args), remember=False
+            args.sim, format() if format else None, args, load_settings(args), remember=False
         )
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
@@ -86,7 +86,7 @@ def _open_devices(args: argparse.Namespace, fmt: Callable[[], SweepFormat] | Non
 
 def _simulated(
     name: str,
-    fmt: SweepFormat | None,
+    format: SweepFormat | None,
     args: argparse.Namespace,
     settings: Config,
     *,
@@ -100,16 +100,16 @@ def _simulated(
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     profile = skins.profile(settings)
     if profile.codec == "palpate":
-        acts, source, fmt = script.named(name, fmt, args.seed, spread=spread)
-        return devices.build(fmt, islice(acts, args.sweeps), clock, source, remember=remember)
+        acts, source, format = script.named(name, format, args.seed, spread=spread)
+        return devices.build(format, islice(acts, args.sweeps), clock, source, remember=remember)
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps
 
     seen = sweeps.view(settings.sensor.skin, profile.format)
-    acts, source, fmt = script.named(name, fmt, args.seed, spread=spread, seen=seen)
+    acts, source, format = script.named(name, format, args.seed, spread=spread, seen=seen)
     acts = islice(acts, args.sweeps)
     return terminal.build(
-        settings.sensor.skin, profile, fmt, acts, clock, source, remember=remember
+        settings.sensor.skin, profile, format, acts, clock, source, remember=remember
     )
 
 

@@ -114,8 +114,8 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
     devices = open_devices(None)
     settings = devices.wire(load_settings(args))
-    fmt = devices.format or skins.announced(settings, devices)
-    if slow := skin_profile.warning(fmt):
+    format = devices.format or skins.announced(settings, devices)
+    if slow := skin_profile.warning(format):
         log.warning(f"warning: {slow}")
     stopped = stop_flag()
     with ExitStack() as stack:
@@ -123,9 +123,11 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
         screen = stack.enter_context(
             SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
         )
-        sensor = stack.enter_context(closing(skins.sensor(settings, fmt, devices)))
+        sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
         name = settings.sensor.skin
-        skin_show.run(sensor, fmt, name, devices.source, devices.clock, [screen, *pages], stopped)
+        skin_show.run(
+            sensor, format, name, devices.source, devices.clock, [screen, *pages], stopped
+        )
     return 0
 
 

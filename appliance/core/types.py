@@ -142,10 +142,10 @@ class Frames:
         return len(self.seq)
 
     @classmethod
-    def empty(cls, fmt: SweepFormat) -> Frames:
+    def empty(cls, format: SweepFormat) -> Frames:
         """No frames of this format."""
         none = np.empty(0, np.int64)
-        return cls(none, none, np.empty((0, *fmt.shape), fmt.numpy_type))
+        return cls(none, none, np.empty((0, *format.shape), format.numpy_type))
 
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
@@ -251,12 +251,12 @@ class Verdict:
         )
 
 
-def _record_dtype(fmt: SweepFormat) -> np.dtype[Any]:
-    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", fmt.numpy_type, fmt.shape)])
+def _record_dtype(format: SweepFormat) -> np.dtype[Any]:
+    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", format.numpy_type, format.shape)])
 
 
 def save(
-    path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})
+    path: Path, sweep: Sweep, format: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
     """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it,
     completely or not at all.
@@ -265,7 +265,7 @@ def save(
     sidecar, under names that Sweep does not use. Raises OSError if writing fails, and then leaves
     nothing behind.
     """
-    table = np.zeros(len(sweep.frames), _record_dtype(fmt))
+    table = np.zeros(len(sweep.frames), _record_dtype(format))
     table["t_ns"], table["seq"], table["taxels"] = (
         sweep.frames.t_ns,
         sweep.frames.seq,
@@ -279,7 +279,7 @@ def save(
     content = {
         **about,
         **own,
-        "format": fmt.json(),
+        "format": format.json(),
         "crc32": crc32(packed.getvalue()),
         "schema": SCHEMA,
     }
@@ -311,16 +311,16 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
         if content.get("crc32", crc32(data)) != crc32(data):
             raise FormatError("its bytes are not those that were recorded: the file was altered")
         table = np.load(io.BytesIO(data), allow_pickle=False)
-        fmt = typed(SweepFormat, content.pop("format"))
+        format = typed(SweepFormat, content.pop("format"))
         schema = content.pop("schema")
         status = Status(content.pop("status"))
         if type(schema) is not int or not 1 <= schema <= SCHEMA:
             raise FormatError(
                 f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
             )
-        if table.dtype != _record_dtype(fmt) or table.ndim != 1:
+        if table.dtype != _record_dtype(format) or table.ndim != 1:
             raise FormatError(
-                f"records of {table.dtype} do not fit the format {fmt} of its sidecar"
+                f"records of {table.dtype} do not fit the format {format} of its sidecar"
             )
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
         own = (
@@ -328,7 +328,7 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
             if schema == 1
             else {name: content[name] for name in Sweep.__slots__ if name in content}
         )
-        return typed(Sweep, own | {"status": status, "frames": frames}), fmt
+        return typed(Sweep, own | {"status": status, "frames": frames}), format
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
         raise FormatError(
             f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"

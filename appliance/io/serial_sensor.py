@@ -74,7 +74,7 @@ class SerialSensor(LinkSensor):
         self,
         config: SensorConfig,
         profile: SkinProfile,
-        fmt: SweepFormat,
+        format: SweepFormat,
         clock: Clock,
         tap: TransferObserver | None = None,
         *,
@@ -82,7 +82,11 @@ class SerialSensor(LinkSensor):
         ports: Callable[[], list[PortInfo]] = serial_port.ports,
     ) -> None:
         super().__init__(
-            config, fmt, clock, lambda counters: skin_stream.stream(profile, fmt, counters), tap
+            config,
+            format,
+            clock,
+            lambda counters: skin_stream.stream(profile, format, counters),
+            tap,
         )
         self._profile, self._ports = profile, ports
         self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))

@@ -313,12 +313,12 @@ def with_window(rows: int, cols: int, rate_hz: float, dtype: str, axes: int) -> 
     return SweepFormat(rows, cols, rate_hz, max(1, round(WINDOW_S * rate_hz)), dtype, axes)
 
 
-def warning(fmt: SweepFormat) -> str:
+def warning(format: SweepFormat) -> str:
     """What to expect of a skin that is too slow for textures; "" for one that is fast enough."""
-    if fmt.window >= FEW_FRAMES:
+    if format.window >= FEW_FRAMES:
         return ""
-    finest = ceil(20 * SLIDE_MM_S / fmt.rate_hz) / 10
+    finest = ceil(20 * SLIDE_MM_S / format.rate_hz) / 10
     return (
-        f"{fmt.window} frames in a window, at {fmt.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s textures finer than {finest:g} mm "
+        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s textures finer than {finest:g} mm "
         "cannot be told apart; slide slower, or tell materials apart by stiffness and shape"
     )

@@ -47,14 +47,14 @@ _PARTLY = 0.75
 """Garbage of a quarter of a frame, or of so much more than whole frames, was one frame more."""
 
 
-def stream(profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> FrameStream:
-    """The stream of a profile that sends sweeps of `fmt`."""
+def stream(profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> FrameStream:
+    """The stream of a profile that sends sweeps of `format`."""
     if profile.codec == "palpate":
-        return Stream(fmt, counters)
+        return Stream(format, counters)
     codec = skin_codecs.codec(profile)
     if not profile.lacks:
-        return Stream(fmt, counters, partial(_packets, codec, profile))
-    return CountedStream(profile, fmt, counters)
+        return Stream(format, counters, partial(_packets, codec, profile))
+    return CountedStream(profile, format, counters)
 
 
 def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacked:
@@ -87,8 +87,8 @@ class CountedStream:
     counted, as far as the time that they take tells.
     """
 
-    def __init__(self, profile: SkinProfile, fmt: SweepFormat, counters: SensorCounters) -> None:
-        self._profile, self._format, self._counters = profile, fmt, counters
+    def __init__(self, profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> None:
+        self._profile, self._format, self._counters = profile, format, counters
         self._codec = skin_codecs.codec(profile)
         self._wrap = 1 << 8 * np.dtype(profile.sequence).itemsize if profile.sequence else 0
         self._epoch, self._count, self._skipped = -1, 0, 0

@@ -36,13 +36,13 @@ def profile(settings: Config) -> SkinProfile:
 
 
 def sensor(
-    settings: Config, fmt: SweepFormat, devices: Devices, tap: TransferObserver | None = None
+    settings: Config, format: SweepFormat, devices: Devices, tap: TransferObserver | None = None
 ) -> LinkSensor:
-    """The sensor for the skin of the settings, which has to send sweeps of `fmt`. Raises
+    """The sensor for the skin of the settings, which has to send sweeps of `format`. Raises
     ConfigError."""
     chosen = profile(settings)
     if chosen.codec == "palpate":
-        return UsbSensor(_config(settings, chosen), fmt, devices.clock, devices.backend, tap)
+        return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
     # boxes with a board of PROTOCOL.md do without these modules
     from appliance.io.serial_link import SerialLink
     from appliance.io.serial_sensor import SerialSensor
@@ -50,7 +50,7 @@ def sensor(
     def opened(path: str, baud: int) -> SerialLink:
         return SerialLink(path, baud, devices.clock, wait=devices.wait)
 
-    return SerialSensor(settings.sensor, chosen, fmt, devices.clock, tap, open_port=opened)
+    return SerialSensor(settings.sensor, chosen, format, devices.clock, tap, open_port=opened)
 
 
 def open_board(settings: Config, devices: Devices) -> SkinLink:

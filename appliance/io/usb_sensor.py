@@ -143,13 +143,13 @@ class Stream:
 
     def __init__(
         self,
-        fmt: SweepFormat,
+        format: SweepFormat,
         counters: SensorCounters,
         unpack: Callable[[bytes], packets.Unpacked] = packets.unpack,
     ) -> None:
-        self._format, self._counters, self._unpack = fmt, counters, unpack
-        self._shape, self._dtype = fmt.shape, fmt.numpy_type
-        self._within_ns = np.rint(_COUNT * fmt.period_ns).astype(
+        self._format, self._counters, self._unpack = format, counters, unpack
+        self._shape, self._dtype = format.shape, format.numpy_type
+        self._within_ns = np.rint(_COUNT * format.period_ns).astype(
             np.int64
         )  # time of frame i of a packet after its first
         self._position = packets.StreamPosition(-1)
@@ -258,7 +258,7 @@ class LinkSensor(ABC):
     def __init__(
         self,
         config: SensorConfig,
-        fmt: SweepFormat,
+        format: SweepFormat,
         clock: Clock,
         stream: Callable[[SensorCounters], FrameStream],
         tap: TransferObserver | None = None,
@@ -267,7 +267,7 @@ class LinkSensor(ABC):
         self.trouble: SensorError | None = None
         self.identity: packets.Identity | None = None
         self.counters = SensorCounters()
-        self._config, self._format, self._clock, self._tap = config, fmt, clock, tap
+        self._config, self._format, self._clock, self._tap = config, format, clock, tap
         self._stream = stream(self.counters)
         self._link: SkinLink | None = None
         self._retry_ns = clock.now_ns()
@@ -401,12 +401,12 @@ class UsbSensor(LinkSensor):
     def __init__(
         self,
         config: SensorConfig,
-        fmt: SweepFormat,
+        format: SweepFormat,
         clock: Clock,
         backend: Any = None,
         tap: TransferObserver | None = None,
     ) -> None:
-        super().__init__(config, fmt, clock, lambda counters: Stream(fmt, counters), tap)
+        super().__init__(config, format, clock, lambda counters: Stream(format, counters), tap)
         self._backend = backend
 
     def _open(self) -> tuple[SkinLink, packets.Identity]:

@@ -23,8 +23,8 @@ class BlackBox(Observer):
     An old sweep is removed after the new one was written, on a full disk before.
     """
 
-    def __init__(self, folder: Path, fmt: SweepFormat, most: int) -> None:
-        self._path, self._format, self._most = folder, fmt, most
+    def __init__(self, folder: Path, format: SweepFormat, most: int) -> None:
+        self._path, self._format, self._most = folder, format, most
         self._folder: SweepFolder | None = None
         self._log = TroubleLog(
             "black box: no sweep is kept",

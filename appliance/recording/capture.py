@@ -57,10 +57,10 @@ class CaptureWriter(Observer):
     Raises ConfigError if the file cannot be opened.
     """
 
-    def __init__(self, path: Path, fmt: SweepFormat, profile: SkinProfile = PALPATE) -> None:
+    def __init__(self, path: Path, format: SweepFormat, profile: SkinProfile = PALPATE) -> None:
         # that of PROTOCOL.md is left out, so that captures remain those of earlier versions
         head = json.dumps(
-            fmt.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
+            format.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
         ).encode()
         self._ended = False
         self._log = TroubleLog(

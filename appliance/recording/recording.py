@@ -58,8 +58,8 @@ class SweepFolder:
     from 1. Raises OSError if the folder cannot be made, read or locked.
     """
 
-    def __init__(self, folder: Path, fmt: SweepFormat) -> None:
-        self.folder, self._format = folder, fmt
+    def __init__(self, folder: Path, format: SweepFormat) -> None:
+        self.folder, self._format = folder, format
         _make(folder)
         self._lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -162,20 +162,20 @@ class RecordingSession(Observer):
     def __init__(
         self,
         folder: Path,
-        fmt: SweepFormat,
+        format: SweepFormat,
         labels: Labels,
         clock: Clock,
         say: Callable[[bytes], None],
         target: int = TARGET,
     ) -> None:
         try:
-            self._folder = SweepFolder(folder, fmt)
+            self._folder = SweepFolder(folder, format)
         except OSError as e:
             raise ConfigError(
                 f"--out {folder}: {e.strerror}; name a folder that can be written"
             ) from e
         self._progress = RecordingProgress(target)
-        self._count_earlier(fmt)
+        self._count_earlier(format)
         self._clock, self._say = clock, say
         # (valid from, labels): a command that comes during a sweep does not apply to it
         self._labels = deque([(0, labels)], MOST_CHANGES)
@@ -250,7 +250,7 @@ class RecordingSession(Observer):
             f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}"
         )
 
-    def _count_earlier(self, fmt: SweepFormat) -> None:
+    def _count_earlier(self, format: SweepFormat) -> None:
         """Count the sweeps that the folder holds already. Raises ConfigError for one of another
         form."""
         for number in self._folder.numbers:
@@ -264,10 +264,10 @@ class RecordingSession(Observer):
                 )
             except (FormatError, ConfigError, KeyError, TypeError, ValueError):
                 continue  # not one of ours, or damaged: train names it
-            if form != fmt.json():
+            if form != format.json():
                 self._folder.close()
                 raise ConfigError(
-                    f"{path} holds another form of sweeps than {fmt}, and a model is trained on one form; "
+                    f"{path} holds another form of sweeps than {format}, and a model is trained on one form; "
                     "name another folder with --out"
                 )
             self._count(labels, status)

@@ -31,9 +31,9 @@ class SweepCheck(Observer):
 
     model = ""
 
-    def __init__(self, fmt: SweepFormat, clock: Clock) -> None:
-        self.format, self._clock = fmt, clock
-        self._unloaded = UnloadedTracker(fmt)
+    def __init__(self, format: SweepFormat, clock: Clock) -> None:
+        self.format, self._clock = format, clock
+        self._unloaded = UnloadedTracker(format)
         self._epoch = -1
 
     def frames(self, frames: Frames) -> None:

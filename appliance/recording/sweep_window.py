@@ -44,20 +44,20 @@ class SweepCutter:
     """Cuts windows: holds the frames of a little more than `max_duration_s`, and the sweeps that
     were not answered yet."""
 
-    def __init__(self, fmt: SweepFormat, config: SweepConfig) -> None:
-        self._format = fmt
+    def __init__(self, format: SweepFormat, config: SweepConfig) -> None:
+        self._format = format
         self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
         self._size = (
-            fmt.window
+            format.window
             + 2 * MAX_GAP
-            + int((config.max_duration_s + config.late_ms / 1000 + 1) * fmt.rate_hz)
+            + int((config.max_duration_s + config.late_ms / 1000 + 1) * format.rate_hz)
         )
         # slot = seq % size: a frame is found without searching and stays available until it is
         # overwritten
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
-        self._taxels = np.zeros((self._size, *fmt.shape), fmt.numpy_type)
+        self._taxels = np.zeros((self._size, *format.shape), format.numpy_type)
         self._newest = -1
         self._open: _Open | None = None
         self._closing: list[

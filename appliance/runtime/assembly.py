@@ -78,7 +78,7 @@ def box(
 
 def recorder(
     settings: Config,
-    fmt: SweepFormat,
+    format: SweepFormat,
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
@@ -90,7 +90,7 @@ def recorder(
 ) -> Box:
     """The box that records sweeps of a form and needs no bundle; the class bits stay 0. ordered:
     commands come from elsewhere than the port, too. Other parameters as for `box`."""
-    check = SweepCheck(fmt, devices.clock)
+    check = SweepCheck(format, devices.clock)
     watching = [check, *observers]
     return _assembled(
         devices.wire(settings),
@@ -151,7 +151,7 @@ def _assembled(
 
 def _trigger(
     config: TriggerConfig,
-    fmt: SweepFormat,
+    format: SweepFormat,
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
@@ -170,7 +170,7 @@ def _trigger(
     if config.mode == "key":
         return stack.enter_context(KeyTrigger(standard_input(), devices.clock, log.info))
     if config.mode == "timed":
-        window_s = fmt.window / fmt.rate_hz
+        window_s = format.window / format.rate_hz
         if config.sweep_s < window_s:
             raise ConfigError(
                 f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "

@@ -91,11 +91,11 @@ class KeptSweep:
     @classmethod
     def read(cls, path: Path) -> KeptSweep:
         """The sweep at `path`. Raises FormatError."""
-        sweep, fmt = load(path)
+        sweep, format = load(path)
         about = sidecar(path)
         try:
             tare = (
-                np.broadcast_to(np.asarray(about["tare"], np.float64), fmt.shape)
+                np.broadcast_to(np.asarray(about["tare"], np.float64), format.shape)
                 if "tare" in about
                 else None
             )
@@ -104,7 +104,7 @@ class KeptSweep:
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "time_ns")):
                 raise TypeError("the verdict's fused and time_ns must be whole numbers")
-            return cls(sweep, fmt, touched, rule, tare, about.get("bundle", ""), verdict)
+            return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict)
         except (TypeError, ValueError) as e:
             raise FormatError(
                 f"{path}: its sidecar cannot be used: {e}; take one that was not changed"
@@ -247,20 +247,20 @@ def _with_earlier(path: Path) -> list[KeptSweep]:
     return found
 
 
-def _check(what: str, fmt: SweepFormat, bundle: Bundle) -> None:
-    if fmt != bundle.format:
+def _check(what: str, format: SweepFormat, bundle: Bundle) -> None:
+    if format != bundle.format:
         raise FormatError(
-            f"{what} is of {fmt}, the bundle wants {bundle.format}; name its bundle with --set classifier.bundle=DIR"
+            f"{what} is of {format}, the bundle wants {bundle.format}; name its bundle with --set classifier.bundle=DIR"
         )
 
 
-def _check_length(sweep: Sweep, fmt: SweepFormat) -> None:
+def _check_length(sweep: Sweep, format: SweepFormat) -> None:
     n = len(sweep.frames)
     if sweep.status is Status.OK and not (
-        n == fmt.window if sweep.share == 1 else 0 < n < fmt.window
+        n == format.window if sweep.share == 1 else 0 < n < format.window
     ):
         raise FormatError(
-            f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {fmt}; take one that was not changed"
+            f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {format}; take one that was not changed"
         )
 
 

@@ -95,23 +95,23 @@ def _skin(
 
     Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
     """
-    fmt = skins.announced(settings, devices, wanted)
-    sends = _listened(settings, fmt, devices, spent_ns)
-    if wanted and not fits(fmt, wanted):
+    format = skins.announced(settings, devices, wanted)
+    sends = _listened(settings, format, devices, spent_ns)
+    if wanted and not fits(format, wanted):
         raise SensorMismatch(
             f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train one (palpate record needs none), "
             "or deploy a bundle for this skin"
         )
-    slow = skin_profile.warning(fmt)
+    slow = skin_profile.warning(format)
     return f"{sends}; warning: {slow}" if slow else sends
 
 
 def _listened(
-    settings: Config, fmt: SweepFormat, devices: Devices, spent_ns: Callable[[], int]
+    settings: Config, format: SweepFormat, devices: Devices, spent_ns: Callable[[], int]
 ) -> str:
     """What comes from the skin, and what reading it takes of a core once it streams: imports and
     asking it take longer."""
-    sensor = skins.sensor(settings, fmt, devices)
+    sensor = skins.sensor(settings, format, devices)
     now_ns = devices.clock.now_ns
     until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
     try:
@@ -127,7 +127,7 @@ def _listened(
         who = sensor.identity
         counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
-        form = f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
+        form = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
         lost = (
             f"{counters.lost_frames} lost"
             if sensor.loss_known

@@ -257,7 +257,7 @@ class Reader:
 class FeedServer(Observer):
     """Offers the feed at `path` to at most MOST_READERS programs of the socket's group.
 
-    fmt: of the sweeps. facts: what the first line says beside the format (PROTOCOL.md: source,
+    format: of the sweeps. facts: what the first line says beside the format (PROTOCOL.md: source,
     bundle, labels, skin). clock, more: as for Report. spent_ns: processor time that this thread has
     taken so far.
     """
@@ -265,7 +265,7 @@ class FeedServer(Observer):
     def __init__(
         self,
         path: Path,
-        fmt: SweepFormat,
+        format: SweepFormat,
         facts: Mapping[str, Any],
         clock: Clock,
         more: Callable[[], Mapping[str, Any]] = dict,
@@ -277,7 +277,7 @@ class FeedServer(Observer):
             Report(clock, more),
             spent_ns,
         )
-        self._most_hz = min(MOST_HZ, MOST_VALUES_S / fmt.channels)
+        self._most_hz = min(MOST_HZ, MOST_VALUES_S / format.channels)
         self._hello = encode(
             "hello",
             {
@@ -285,8 +285,8 @@ class FeedServer(Observer):
                 "version": __version__,
                 "pid": os.getpid(),
                 **facts,
-                "format": fmt.json(),
-                "window_s": fmt.window / fmt.rate_hz,
+                "format": format.json(),
+                "window_s": format.window / format.rate_hz,
                 "frames_hz": self._most_hz,
             },
         )

@@ -67,8 +67,8 @@ class UnloadedTracker:
     certain: whether the skin was also touched since then, so that it was not sliding all the time.
     """
 
-    def __init__(self, fmt: SweepFormat) -> None:
-        self._size = max(LEAST_FRAMES, round(BLOCK_S * fmt.rate_hz))
+    def __init__(self, format: SweepFormat) -> None:
+        self._size = max(LEAST_FRAMES, round(BLOCK_S * format.rate_hz))
         self.restart()
 
     def restart(self) -> None:

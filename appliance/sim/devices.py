@@ -64,9 +64,8 @@ class SimDevices(RobotDevices):
             "skin": "palpate",
             "grid": "",
         }
-        sensor = replace(
-            settings.sensor, **ids, rate_hz=0.0, link="acm" if self.backend.acm else "vendor"
-        )  # type: ignore[arg-type]
+        link = "acm" if self.backend.acm else "vendor"
+        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
         return replace(RobotDevices.wire(self, settings), sensor=sensor)
 
 
@@ -87,7 +86,7 @@ def robot_on_lines(
 
 
 def build(
-    fmt: SweepFormat,
+    format: SweepFormat,
     acts: Iterable[rig.Act],
     clock: Clock,
     source: str,
@@ -103,7 +102,7 @@ def build(
     grow.
     """
     robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
-    backend = usb.RigBackend(rig.Board(fmt, robot, clock), clock, acm=acm)
+    backend = usb.RigBackend(rig.Board(format, robot, clock), clock, acm=acm)
     return SimDevices(
-        clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=fmt
+        clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=format
     )

@@ -160,11 +160,11 @@ class Robot:
 
 
 class Film:
-    """The frames of a robot's acts, one after the other, as a skin of the form `fmt` sees them."""
+    """The frames of a robot's acts, one after the other, as a skin of the form `format` sees them."""
 
-    def __init__(self, fmt: SweepFormat, robot: Robot) -> None:
+    def __init__(self, format: SweepFormat, robot: Robot) -> None:
         self._robot = robot
-        self._frames = np.zeros((0, *fmt.shape), fmt.numpy_type)
+        self._frames = np.zeros((0, *format.shape), format.numpy_type)
         self._base = 0  # number of the first frame in _frames
 
     def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
@@ -204,7 +204,7 @@ class Board:
 
     def __init__(
         self,
-        fmt: SweepFormat,
+        format: SweepFormat,
         robot: Robot,
         clock: Clock,
         *,
@@ -217,18 +217,24 @@ class Board:
     ) -> None:
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
         self.skin = packets.SkinFormat(
-            fmt.rows, fmt.cols, fmt.dtype, fmt.rate_hz, fifo_frames, packet_frames, fmt.axes
+            format.rows,
+            format.cols,
+            format.dtype,
+            format.rate_hz,
+            fifo_frames,
+            packet_frames,
+            format.axes,
         )
         self.present = True
         self.running = False
         self._clock, self._latency = clock, latency
         self._rate = 1 + ppm * 1e-6
-        self._period_ns = fmt.period_ns / self._rate
+        self._period_ns = format.period_ns / self._rate
         self._origin_ns = clock.now_ns()
         self._first_seq = first_seq
         self._next = 0  # number of the next frame to send
         self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
-        self._film = Film(fmt, robot)
+        self._film = Film(format, robot)
 
     def frame_ns(self, i: int) -> int:
         """Host time at which frame `i` is taken."""

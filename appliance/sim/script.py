@@ -52,7 +52,7 @@ _NAME_BUNDLE = (
 
 def named(
     name: str,
-    fmt: SweepFormat | None,
+    format: SweepFormat | None,
     seed: int,
     *,
     spread: bool = False,
@@ -61,7 +61,7 @@ def named(
     """The script with this name after `--sim`, the name of the source in sentences, and the format
     of its sweeps.
 
-    fmt: what the bundle wants, None without one. spread: play the sweeps of a set in an order that
+    format: what the bundle wants, None without one. spread: play the sweeps of a set in an order that
     is drawn, the materials in turn. seen: the skin on the finger, None for the simulator's own.
     Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
@@ -72,21 +72,23 @@ def named(
         ]
         if seen:
             able = [(seen.FORMAT, skin.WORLD, seen)]
-        fmt = fmt or able[0][0]
-        fits = [one for one in able if (one[0].skin, one[0].rate_hz) == (fmt.skin, fmt.rate_hz)]
+        format = format or able[0][0]
+        fits = [
+            one for one in able if (one[0].skin, one[0].rate_hz) == (format.skin, format.rate_hz)
+        ]
         if not fits:
             sent = " or ".join(str(form) for form, _, _ in able)
             hint = _NAME_BUNDLE if seen else _NAME_SKIN
-            raise FormatError(f"the simulated skin sends {sent}, {fmt} is wanted; {hint}")
+            raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
         _, world, by = fits[0]
         acts = (
             rests(seed, world, by)
             if name == "rest"
             else tubes(seed, world=world, seen=by, only=only)
         )
-        return acts, "sim", fmt
+        return acts, "sim", format
     if name.startswith(SETS):
-        sweeps = load(Path(name.removeprefix(SETS)), fmt)
+        sweeps = load(Path(name.removeprefix(SETS)), format)
         return (
             play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps))),
             "replay",
@@ -183,12 +185,12 @@ def rests(seed: int, world: skin.World = skin.WORLD, seen: SeenTubes = skin) -> 
         yield Act(frames, off, len(frames) - 1, "wood")
 
 
-def load(path: Path, fmt: SweepFormat | None) -> SweepSet:
-    """The set at `path`. Raises FormatError if it is not of `fmt`."""
+def load(path: Path, format: SweepFormat | None) -> SweepSet:
+    """The set at `path`. Raises FormatError if it is not of `format`."""
     sweeps = load_file(path, SweepSet)
-    if fmt not in (None, sweeps.format):
+    if format not in (None, sweeps.format):
         raise FormatError(
-            f"{path} holds {sweeps.format}, {fmt} is wanted; name its bundle with --set classifier.bundle=DIR"
+            f"{path} holds {sweeps.format}, {format} is wanted; name its bundle with --set classifier.bundle=DIR"
         )
     return sweeps
 

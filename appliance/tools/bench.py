@@ -114,7 +114,7 @@ class _Watch(Observer):
         self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
 
 
-def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set
     has. Computing takes its real time, waiting is skipped.
 
@@ -125,7 +125,7 @@ def _whole_way(fmt: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     clock = rig.SkippingClock()
     watch = _Watch(clock)
     simulated = devices.build(
-        fmt, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
+        format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
     )
     with ExitStack() as stack:
         box, far_end = build(simulated, stack, [watch])

@@ -51,20 +51,20 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
     np.savez(path, **frames)
 
 
-def measure(name: str, fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """The part `name` of NAMES, measured in this process while the acts in `path` are played again
     and again."""
-    return {"memory": _memory, "stream": _stream}[name](fmt, build, path)
+    return {"memory": _memory, "stream": _stream}[name](format, build, path)
 
 
-def _board(fmt: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
+def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
     """Devices that play the acts in `path`, in virtual time where there is no clock."""
     from appliance.sim import devices, rig
 
     with np.load(path, allow_pickle=False) as z:
         acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
     # the acts that a simulator remembers are no part of the box
-    return devices.build(fmt, cycle(acts), clock or rig.VirtualClock(), "sim", remember=False)
+    return devices.build(format, cycle(acts), clock or rig.VirtualClock(), "sim", remember=False)
 
 
 def drain(far_end: int) -> None:
@@ -73,7 +73,7 @@ def drain(far_end: int) -> None:
         os.read(far_end, 65536)
 
 
-def _memory(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+def _memory(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
 
     without_board: less what loading the simulated board and its acts took. What the board takes
@@ -82,7 +82,7 @@ def _memory(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """
     n, rss_mb = MEMORY_SWEEPS, {}
     board = -_rss_mb()
-    simulated = _board(fmt, path)
+    simulated = _board(format, path)
     board += _rss_mb()
     with ExitStack() as stack:
         box, far_end = build(simulated, stack)
@@ -105,10 +105,10 @@ def _rss_mb() -> float:
     return pages * os.sysconf("SC_PAGESIZE") / 2**20
 
 
-def _stream(fmt: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Share of one core while the skin streams in real time, without and with the simulated readout
     board."""
-    simulated = _board(fmt, path, SystemClock())
+    simulated = _board(format, path, SystemClock())
     board_ns = 0
     real_read = simulated.backend.bulk_read
 

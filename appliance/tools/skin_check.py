@@ -169,10 +169,10 @@ def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
     """The format, None where it cannot be used, and the finding."""
     try:
         form = packets.unpack_format(link.request(Request.FORMAT, 64))
-        fmt = _sweep_format(form)
+        format = _sweep_format(form)
     except (SensorMismatch, FormatError) as e:
         return None, PartResult("format", "FAIL", f"{e}; PROTOCOL.md, FORMAT, has its 16 bytes")
-    size = form.packet_frames * form.rows * form.cols * form.axes * fmt.numpy_type.itemsize
+    size = form.packet_frames * form.rows * form.cols * form.axes * format.numpy_type.itemsize
     fifo_s, packet_s = form.fifo_frames / form.rate_hz, form.packet_frames / form.rate_hz
     text = f"{form.rows}x{form.cols} {form.dtype} at {form.rate_hz:g} Hz, FIFO {fifo_s:.2f} s, {form.packet_frames} a packet"
     if not (1 <= form.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):

@@ -66,9 +66,9 @@ def listed(name: str, profile: SkinProfile) -> str:
     return f"{name:<14} {profile.about}; {form}; {lacks}; {measured}"
 
 
-def form_of(fmt: SweepFormat) -> str:
+def form_of(format: SweepFormat) -> str:
     """Shape, type and rate for a person."""
-    return f"{shown(fmt.shape)} {fmt.dtype} at {fmt.rate_hz:g} Hz"
+    return f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
 
 
 def detect(

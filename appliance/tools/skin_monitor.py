@@ -72,13 +72,13 @@ class SkinDisplay(Protocol):
 
 
 class SkinMonitor:
-    """Collects what a skin of format `fmt` sends. All times are those of the frames, so no clock is
+    """Collects what a skin of format `format` sends. All times are those of the frames, so no clock is
     needed."""
 
-    def __init__(self, fmt: SweepFormat) -> None:
-        self._grid = fmt.rows, fmt.cols, fmt.axes
-        self._limits = np.iinfo(fmt.dtype) if fmt.numpy_type.kind in "iu" else None
-        self._span, self._shown = (max(2, round(s * fmt.rate_hz)) for s in (SPAN_S, SHOWN_S))
+    def __init__(self, format: SweepFormat) -> None:
+        self._grid = format.rows, format.cols, format.axes
+        self._limits = np.iinfo(format.dtype) if format.numpy_type.kind in "iu" else None
+        self._span, self._shown = (max(2, round(s * format.rate_hz)) for s in (SPAN_S, SHOWN_S))
         self.reset()
 
     def reset(self) -> None:

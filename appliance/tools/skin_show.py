@@ -14,7 +14,7 @@ from appliance.tools.skin_monitor import LiveView, SkinDisplay, SkinMonitor
 
 def run(
     sensor: Sensor,
-    fmt: SweepFormat,
+    format: SweepFormat,
     name: str,
     source: str,
     clock: Clock,
@@ -22,7 +22,7 @@ def run(
     stopped: Callable[[], bool],
 ) -> None:
     """Show on `displays` what `sensor` sends, until `stopped()`. name: of the skin's profile."""
-    shown_on, monitor, number = tuple(displays), SkinMonitor(fmt), 0
+    shown_on, monitor, number = tuple(displays), SkinMonitor(format), 0
     enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
     while not stopped():
         frames = sensor.read()
@@ -36,10 +36,10 @@ def run(
             view = LiveView(
                 number,
                 source,
-                f"{name} {fmt}",
+                f"{name} {format}",
                 sensor.state,
                 str(sensor.trouble or ""),
-                (fmt.rows, fmt.cols, fmt.axes),
+                (format.rows, format.cols, format.axes),
                 frames=counters.frames,
                 lost=counters.lost_frames if sensor.loss_known else None,
                 **monitor.measured(),

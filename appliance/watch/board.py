@@ -147,10 +147,10 @@ class PageBoard:
     def _take_frame(self, line: Mapping[str, Any]) -> None:
         if not self._tracker:
             return
-        fmt = typed(SweepFormat, dict(self._hello["format"]))
+        format = typed(SweepFormat, dict(self._hello["format"]))
         frame = np.array(line["taxels"], np.float64)  # null, of a float skin, becomes nan
-        if frame.shape != fmt.shape:
-            raise ValueError(f"a frame of {frame.shape} instead of {fmt.shape}")
+        if frame.shape != format.shape:
+            raise ValueError(f"a frame of {frame.shape} instead of {format.shape}")
         self._tracker.put(frame[None])
         now_ns = int(line["time_ns"])
         if not 0 <= now_ns - self._view_ns < VIEW_NS:

@@ -120,7 +120,7 @@ def _ended(_: Command) -> list[object]:
 class RecordPage(Observer):
     """The page of a recording at `access`; it is served while this is entered.
 
-    fmt: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps.
+    format: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps.
     about: see RecordingSession.about. obey: carries out what the page orders, in the loop's thread.
     clock: the host's real one. Raises ConfigError where the address cannot be used.
     """
@@ -128,7 +128,7 @@ class RecordPage(Observer):
     def __init__(
         self,
         access: Access,
-        fmt: SweepFormat,
+        format: SweepFormat,
         source: str,
         trigger: TriggerConfig,
         about: Callable[[], Mapping[str, Any]],
@@ -136,8 +136,8 @@ class RecordPage(Observer):
         clock: Clock,
     ) -> None:
         self._about, self._obey, self._clock = about, obey, clock
-        self._tracker = ContactTracker(Expected(fmt), source)
-        self._rate_hz = fmt.rate_hz
+        self._tracker = ContactTracker(Expected(format), source)
+        self._rate_hz = format.rate_hz
         self._commands = (
             *LABELS,
             "NEXT",
@@ -146,7 +146,7 @@ class RecordPage(Observer):
         )
         self._known = {
             "source": source,
-            "form": str(fmt),
+            "form": str(format),
             "trigger": trigger_words(trigger),
             "commands": self._commands,
         }

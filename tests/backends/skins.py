@@ -36,19 +36,21 @@ class Nowhere:
 
 def board(what: Skin, clock: Clock) -> rig.Board:
     """A board that answers as `what` and sends numbered frames of that form."""
-    fmt = SweepFormat(what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes)
-    act = rig.Act(numbered(_LENGTH, fmt), 10**9, 10**9 + 1, "")
+    format = SweepFormat(
+        what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes
+    )
+    act = rig.Act(numbered(_LENGTH, format), 10**9, 10**9 + 1, "")
     robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
     made = rig.Board(
-        fmt, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz)
+        format, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz)
     )
     made.identity = replace(made.identity, protocol=what.protocol)
     return made
 
 
-def counts(seq: NDArray[np.int64], fmt: SweepFormat) -> NDArray[Any]:
+def counts(seq: NDArray[np.int64], format: SweepFormat) -> NDArray[Any]:
     """Raw counts that frames of these unwrapped numbers [n] must hold: [n, R, C]."""
-    return numbered(_PERIOD, fmt)[(seq & ((1 << EPOCH_BITS) - 1)) % _PERIOD]
+    return numbered(_PERIOD, format)[(seq & ((1 << EPOCH_BITS) - 1)) % _PERIOD]
 
 
 def garbler() -> Callable[[bytes], bytes]:

@@ -211,17 +211,17 @@ class FullLoad:
     def _side(self, stack: ExitStack, skin: str, path: Path, full: bool) -> LoadedSide:
         """One box, started."""
         name = f"{skin}-{'full' if full else 'bare'}"
-        fmt, counts, link = (
+        format, counts, link = (
             bundle.load(path).format,
             self._folder / f"{name}.jsonl",
             self._folder / f"{name}.tty",
         )
         folder = stack.enter_context(disk(self._disks / name)) if full else self._folder / name
-        player = stack.enter_context(load.playing(skin, fmt.rate_hz, link))
+        player = stack.enter_context(load.playing(skin, format.rate_hz, link))
         stack.callback(player.kill)
-        reading = self._reading(load.sets(skin, fmt, link))
+        reading = self._reading(load.sets(skin, format, link))
         chosen = [
-            *load.sets(skin, fmt, link),
+            *load.sets(skin, format, link),
             f"classifier.bundle={path}",
             "classifier.allow_unsigned=true",
             f"serial.state_s={STATE_S}",
@@ -239,7 +239,7 @@ class FullLoad:
         box = SkinBox([*self._before, *map(str, inside)], chosen)
         stack.callback(box.close)
         box.launch(*(["--shadow", str(path)] if full else []))
-        return LoadedSide(skin, str(fmt), full, box, player, reading, counts, folder)
+        return LoadedSide(skin, str(format), full, box, player, reading, counts, folder)
 
     def _reading(self, chosen: Sequence[str]) -> float:
         """The share of a core that `palpate check` says reading a skin takes, the median of

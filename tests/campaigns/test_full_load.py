@@ -202,8 +202,8 @@ def test_one_skin_under_full_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     times = {"SETTLE_S": 3.0, "FULL_S": 4.0, "DEAF_S": 28.0, "REST_S": 4.0, "LOOK_S": 1.0}
     for name, seconds in times.items():
         monkeypatch.setattr(full_load, name, seconds)
-    fmt = SweepFormat(16, 32, 100.0, 20, "uint8")
-    bundle = toy_bundle.put(tmp_path / "bundle", toy_bundle.files(fmt=fmt))
+    format = SweepFormat(16, 32, 100.0, 20, "uint8")
+    bundle = toy_bundle.put(tmp_path / "bundle", toy_bundle.files(format=format))
     found = full_load.measure({"flexitac": bundle}, 0.1, 1, (), tmp_path / "disks")
     bare, full = found["boxes"]
     assert (bare["full"], full["full"]) == (False, True)

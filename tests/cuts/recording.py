@@ -53,17 +53,17 @@ def record(way: str, folder: Path, session: str) -> None:
 
 
 def recording(
-    folder: Path, fmt: SweepFormat, session: str, say: Callable[[bytes], None]
+    folder: Path, format: SweepFormat, session: str, say: Callable[[bytes], None]
 ) -> RecordingSession:
     """The observer of the box that records sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return RecordingSession(folder, fmt, labels, SystemClock(), say)
+    return RecordingSession(folder, format, labels, SystemClock(), say)
 
 
-def taken(number: int, fmt: SweepFormat) -> tuple[Sweep, Verdict]:
+def taken(number: int, format: SweepFormat) -> tuple[Sweep, Verdict]:
     """A sweep and its answer."""
-    n = fmt.window
-    digits = np.full((n, *fmt.shape), number, fmt.numpy_type)
+    n = format.window
+    digits = np.full((n, *format.shape), number, format.numpy_type)
     sweep = Sweep(number, 0, n, Status.OK, Frames(np.arange(n), np.arange(n), digits))
     return sweep, Verdict(
         number, n, Status.OK, "steel", 0.9, 0.8, np.array([0.9, 0.1]), 1, 0, 0, "0" * 8
@@ -108,7 +108,7 @@ WAYS: dict[str, Callable[[Files], None]] = {
 that."""
 
 
-def judge(fmt: SweepFormat, found: Found) -> list[str]:
+def judge(format: SweepFormat, found: Found) -> list[str]:
     """What is wrong with the sweeps of this form that were found, and with what the next run makes
     of them."""
     folder = found.folder / KEPT
@@ -122,7 +122,7 @@ def judge(fmt: SweepFormat, found: Found) -> list[str]:
         for name, which in gone.items()
         if there.get(name) == which
     ]
-    return wrong or _goes_on(folder, fmt)
+    return wrong or _goes_on(folder, format)
 
 
 def read(folder: Path) -> tuple[list[str], dict[str, str]]:
@@ -155,12 +155,12 @@ def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
     return owed, gone
 
 
-def _goes_on(folder: Path, fmt: SweepFormat) -> list[str]:
+def _goes_on(folder: Path, format: SweepFormat) -> list[str]:
     """What the next run does wrong in the folder."""
     before = {path: path.read_bytes() for path in folder.glob("*.npy")}
-    running = recording(folder, fmt, "later", lambda line: None)
+    running = recording(folder, format, "later", lambda line: None)
     for number in (1, 2):
-        running.sweep(*taken(number, fmt), {})
+        running.sweep(*taken(number, format), {})
     running.close()
     wrong, there = read(folder)
     if not {"later 1", "later 2"} <= set(there.values()):
@@ -190,13 +190,13 @@ def palpate() -> CutScene:
 
 
 def _sessions(
-    title: str, fmt: SweepFormat, words: Callable[[Path, str], list[str | Path]]
+    title: str, format: SweepFormat, words: Callable[[Path, str], list[str | Path]]
 ) -> CutScene:
     def session(name: str) -> SceneStep:
         return SceneStep(name, lambda folder: [sys.executable, "-m", *words(folder / KEPT, name)])
 
     return CutScene(
-        title, lambda folder: None, (session("first"), session("second")), partial(judge, fmt)
+        title, lambda folder: None, (session("first"), session("second")), partial(judge, format)
     )
 
 

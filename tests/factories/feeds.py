@@ -55,15 +55,15 @@ OK = Verdict(
 )
 
 
-def frames(n: int = 6, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> Frames:
+def frames(n: int = 6, format: SweepFormat = skin.FORMAT, first: int = 0) -> Frames:
     """Numbered frames."""
     at = np.arange(first, first + n)
-    return Frames(at * 1000, at, numbered(n, fmt, first))
+    return Frames(at * 1000, at, numbered(n, format, first))
 
 
-def cut(fmt: SweepFormat = skin.FORMAT) -> Sweep:
+def cut(format: SweepFormat = skin.FORMAT) -> Sweep:
     """A sweep with a window."""
-    return Sweep(7, 5, 6, Status.OK, frames(fmt.window, fmt))
+    return Sweep(7, 5, 6, Status.OK, frames(format.window, format))
 
 
 class FeedPeer:
@@ -97,7 +97,7 @@ class FeedPeer:
 class Offered:
     """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets."""
 
-    def __init__(self, path: Path, fmt: SweepFormat = skin.FORMAT, **facts: Any) -> None:
+    def __init__(self, path: Path, format: SweepFormat = skin.FORMAT, **facts: Any) -> None:
         self.path, self.clock = path, rig.VirtualClock()
         known = {
             "source": "usb",
@@ -106,7 +106,7 @@ class Offered:
             "skin": "palpate",
         }
         self.cost_ns = self._spent_ns = 0
-        self.feed = FeedServer(path, fmt, known, self.clock, lambda: facts, self._spent)
+        self.feed = FeedServer(path, format, known, self.clock, lambda: facts, self._spent)
 
     def turns(
         self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND

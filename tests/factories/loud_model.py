@@ -31,13 +31,13 @@ def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
     )
 
 
-def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
+def loudness(format: SweepFormat = FORM) -> onnx.ModelProto:
     """A graph that tells the two apart: a convolution that takes differences, its mean size, a
     threshold."""
-    g, taxels = GraphBuilder(), form.rows * form.cols
+    g, taxels = GraphBuilder(), format.rows * format.cols
     x = g(
         "Cast",
-        g("Reshape", "sweep", g.constant([1, form.window, taxels], "int64")),
+        g("Reshape", "sweep", g.constant([1, format.window, taxels], "int64")),
         to=TensorProto.FLOAT,
     )
     x = g("Transpose", x, perm=[0, 2, 1])
@@ -46,7 +46,7 @@ def loudness(form: SweepFormat = FORM) -> onnx.ModelProto:
     x = g("Relu", g("Conv", x, g.constant(taps), g.constant(np.zeros(3)), strides=[1]))
     x = g("ReduceMean", x, axes=[2], keepdims=0)
     g("Gemm", x, g.constant([[-1, 1]] * 3), g.constant([45, -45]), output="logits")
-    return g.model(form, "logits", 2)
+    return g.model(format, "logits", 2)
 
 
 @dataclass

@@ -12,15 +12,21 @@ FORMAT = SweepFormat(2, 3, 50.0, 8, "int16")
 
 
 def record(
-    path: Path, material: str = "a", status: Status = Status.OK, fmt: SweepFormat = FORMAT, **more
+    path: Path,
+    material: str = "a",
+    status: Status = Status.OK,
+    format: SweepFormat = FORMAT,
+    **more,
 ) -> None:
     """A recording as the box keeps it; its raw counts go up from its id."""
-    n = more.pop("frames", fmt.window)
-    taxels = (more.setdefault("id", 1) + np.arange(n * 6)).reshape(n, 2, 3).astype(fmt.numpy_type)
+    n = more.pop("frames", format.window)
+    taxels = (
+        (more.setdefault("id", 1) + np.arange(n * 6)).reshape(n, 2, 3).astype(format.numpy_type)
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     frames = Frames(np.arange(n), np.arange(n), taxels)
     save(
         path,
         Sweep(start_ns=0, stop_ns=1, status=status, frames=frames, material=material, **more),
-        fmt,
+        format,
     )

@@ -21,24 +21,24 @@ SECOND = 1_000_000_000
 SETTLE_S = 0.02
 
 
-def numbered(n: int, fmt: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
+def numbered(n: int, format: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
     """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the
     axis."""
-    grid = np.arange(fmt.channels).reshape(1, *fmt.shape)
-    return ((np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(fmt.shape)) + grid).astype(
-        fmt.numpy_type
-    )
+    grid = np.arange(format.channels).reshape(1, *format.shape)
+    return (
+        (np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(format.shape)) + grid
+    ).astype(format.numpy_type)
 
 
 def idle_devices(
-    seconds: float = 3600, fmt: SweepFormat = skin.FORMAT, **board
+    seconds: float = 3600, format: SweepFormat = skin.FORMAT, **board
 ) -> devices.SimDevices:
     """Simulated devices whose skin sends numbered frames and whose robot does nothing."""
-    n = min(round(seconds * fmt.rate_hz), 60_000)
-    acts = [rig.Act(numbered(n, fmt), 10**9, 10**9 + 1, "")]
-    simulated = devices.build(fmt, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
+    n = min(round(seconds * format.rate_hz), 60_000)
+    acts = [rig.Act(numbered(n, format), 10**9, 10**9 + 1, "")]
+    simulated = devices.build(format, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
     simulated.backend.board = rig.Board(
-        fmt, simulated.robot, simulated.clock, **{"packet_frames": 4} | board
+        format, simulated.robot, simulated.clock, **{"packet_frames": 4} | board
     )
     return simulated
 

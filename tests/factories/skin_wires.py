@@ -44,9 +44,9 @@ def profile(name: str) -> SkinProfile:
 
 def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
     """Raw counts of frame `i`: [R, C] or [R, C, A], different in every frame and taxel."""
-    fmt = p.format
-    shift = (np.arange(fmt.channels).reshape(fmt.shape) * 7 + i * 13) % 199
-    return (shift / 8 if fmt.dtype == "float32" else shift).astype(fmt.numpy_type)
+    format = p.format
+    shift = (np.arange(format.channels).reshape(format.shape) * 7 + i * 13) % 199
+    return (shift / 8 if format.dtype == "float32" else shift).astype(format.numpy_type)
 
 
 def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
@@ -232,7 +232,7 @@ class WiredSkin:
     def __init__(
         self,
         name: str,
-        fmt: SweepFormat | None = None,
+        format: SweepFormat | None = None,
         *,
         rate: float = 1.0,
         clock: VirtualClock | None = None,
@@ -240,7 +240,7 @@ class WiredSkin:
         **settings: object,
     ) -> None:
         self.name, self.profile, self.clock = name, profile(name), clock or VirtualClock()
-        self.format = fmt or self.profile.format
+        self.format = format or self.profile.format
         period_ns = self.profile.format.period_ns / rate
         self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
         config = SensorConfig(skin=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]

@@ -34,31 +34,33 @@ LIMITS = Thresholds(contact=10, full_scale=32767, unsure=0.5)
 OUTPUTS = ("logits", "embedding")
 
 
-def window(z1: float, z2: float, fmt: SweepFormat = FORMAT) -> np.ndarray:
+def window(z1: float, z2: float, format: SweepFormat = FORMAT) -> np.ndarray:
     """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves.
     Shear is a tenth of it."""
-    level = np.full((fmt.rows, fmt.cols), 100.0)
+    level = np.full((format.rows, format.cols), 100.0)
     level[0, :2] += 10 * z1, 10 * z2
-    ripple = np.where(np.arange(fmt.window) % 2, 1, -1)[:, None, None]
+    ripple = np.where(np.arange(format.window) % 2, 1, -1)[:, None, None]
     normal = level + ripple
-    shear = [0.1 * level + 2 * ripple] * (fmt.axes - 1)
+    shear = [0.1 * level + 2 * ripple] * (format.axes - 1)
     return (
-        np.rint(np.stack([*shear, normal], axis=-1)).reshape(-1, *fmt.shape).astype(fmt.numpy_type)
+        np.rint(np.stack([*shear, normal], axis=-1))
+        .reshape(-1, *format.shape)
+        .astype(format.numpy_type)
     )
 
 
 def sweep(
-    z1: float, z2: float, number: int = 1, object: int = 0, fmt: SweepFormat = FORMAT
+    z1: float, z2: float, number: int = 1, object: int = 0, format: SweepFormat = FORMAT
 ) -> Sweep:
     """A good sweep with this embedding."""
-    n = np.arange(fmt.window)
-    return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, fmt)), object=object)
+    n = np.arange(format.window)
+    return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, format)), object=object)
 
 
 def model(
     outputs: Sequence[str] = OUTPUTS,
     steps: int = 3,
-    fmt: SweepFormat = FORMAT,
+    format: SweepFormat = FORMAT,
     scale: float = 0.1,
     labels: int = 3,
 ) -> bytes:
@@ -66,9 +68,9 @@ def model(
     of the logits."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
-    values = fmt.rows * fmt.cols * fmt.axes
+    values = format.rows * format.cols * format.axes
     pick = np.zeros((values, 2), np.float32)
-    pick[fmt.axes - 1, 0] = pick[2 * fmt.axes - 1, 1] = scale
+    pick[format.axes - 1, 0] = pick[2 * format.axes - 1, 1] = scale
     bias = -(MEANS[:labels] ** 2).sum(1) / 2
     constants = {
         "axes": np.array([1]),
@@ -93,11 +95,11 @@ def model(
     for name in set(outputs) - shapes.keys():
         nodes.append(node("Identity", ["logits"], [name]))
     value = onnx.helper.make_tensor_value_info
-    kind = onnx.helper.np_dtype_to_tensor_dtype(fmt.numpy_type)
+    kind = onnx.helper.np_dtype_to_tensor_dtype(format.numpy_type)
     graph = onnx.helper.make_graph(
         nodes,
         "toy",
-        [value("sweep", kind, [1, fmt.window, *fmt.shape])],
+        [value("sweep", kind, [1, format.window, *format.shape])],
         [value(name, 1, shapes.get(name, [1, labels])) for name in outputs],
         [array(values, name) for name, values in constants.items()],
     )
@@ -151,7 +153,7 @@ def files(
     known: Known | None = KNOWN,
     early: Early | None = None,
     outputs: Sequence[str] = OUTPUTS,
-    fmt: SweepFormat = FORMAT,
+    format: SweepFormat = FORMAT,
     arrays: dict[str, np.ndarray] | None = None,
     moved: Moved | None = None,
     place: ContactPositions | None = None,
@@ -159,12 +161,12 @@ def files(
 ) -> dict[str, bytes]:
     """The files of a toy bundle by name."""
     arrays = means() if arrays is None else arrays
-    at = np.stack([window(2.5, 0.5, fmt), window(0.5, 3.5, fmt)])
+    at = np.stack([window(2.5, 0.5, format), window(0.5, 3.5, format)])
     z = np.zeros((2, arrays["means"].shape[1]), np.float32)
     z[:, :2] = [[2.5, 0.5], [0.5, 3.5]]
     logits = (z @ arrays["means"].T + arrays["bias"]) / KNOWN.temperature
     content = {
-        bundle.MODEL: model(outputs, fmt=fmt, **graph),
+        bundle.MODEL: model(outputs, format=format, **graph),
         bundle.GOLDEN: npz(samples=at, logits=logits),
     }
     if known:
@@ -172,7 +174,7 @@ def files(
     manifest = Manifest(
         "toy",
         "1",
-        fmt,
+        format,
         "raw",
         tuple("abcdef"[: logits.shape[1]]),
         LIMITS,

@@ -9,11 +9,11 @@ from train.onnx_tools.graph_builder import TENSOR, GraphBuilder
 FORM = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
-def trunk(form: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
+def trunk(format: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
     """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths,
     `tenths` [1, 10, F]."""
-    g, taxels, length = GraphBuilder(), form.rows * form.cols, form.window // 10
-    x = g("Cast", g("Reshape", "sweep", g.constant([form.window, taxels], "int64")), to=1)
+    g, taxels, length = GraphBuilder(), format.rows * format.cols, format.window // 10
+    x = g("Cast", g("Reshape", "sweep", g.constant([format.window, taxels], "int64")), to=1)
     x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
     x = g(
         "ReduceMean",
@@ -26,7 +26,7 @@ def trunk(form: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
     x = x if tenths else g("Slice", x, g.constant([9], "int64"), g.constant([10], "int64"))
     g("Reshape", x, g.constant(shape, "int64"), output=name)
     given = onnx.helper.make_tensor_value_info(
-        "sweep", TENSOR[form.dtype], [1, form.window, form.rows, form.cols]
+        "sweep", TENSOR[format.dtype], [1, format.window, format.rows, format.cols]
     )
     out = onnx.helper.make_tensor_value_info(name, 1, shape)
     graph = onnx.helper.make_graph(g.nodes, "toy", [given], [out], g.constants)

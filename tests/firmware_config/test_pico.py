@@ -80,13 +80,15 @@ def check_all_there(frames: Frames) -> None:
         {"ROWS": 3, "COLS": 5, "RATE_HZ": 100, "HARD_TIMER": False, "TRIGGER_PIN": 15},
     ],
 )
-def test_the_box_reads_it(form: dict[str, Any]) -> None:
+def test_the_box_reads_it(format: dict[str, Any]) -> None:
     """Identity, format and frames with each taxel at its place, through multiplexers that the
     firmware switches."""
     given = {
-        name.lower(): form[name] for name in ("ROWS", "COLS", "RATE_HZ", "DTYPE") if name in form
+        name.lower(): format[name]
+        for name in ("ROWS", "COLS", "RATE_HZ", "DTYPE")
+        if name in format
     }
-    with pico.plugged_in(**form) as port, PortReader(port, **given) as reader:
+    with pico.plugged_in(**format) as port, PortReader(port, **given) as reader:
         check_all_there(reader.frames(100))
         who, counters = reader.sensor.identity, reader.sensor.counters
         assert who == packets.Identity(1, (1, 0, 0), "palpate-pico", "e6614c311b4c7a2e")
@@ -177,7 +179,7 @@ def test_a_reader_that_stops() -> None:
     all had been read."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
         link = BoardLink(port, 115200, SystemClock())
-        form = packets.unpack_format(ask(link, packets.Request.FORMAT))
+        format = packets.unpack_format(ask(link, packets.Request.FORMAT))
         link.request(packets.Request.START, 0)
         # 205 kB a second: some 70 kB fit the kernel's buffers, 0.25 s the FIFO
         time.sleep(2)
@@ -200,7 +202,7 @@ def test_a_reader_that_stops() -> None:
     taken = np.concatenate([p.taxels for p in kept])
     frames = Frames(np.zeros(len(taken), np.int64), np.arange(len(taken)), taken)
     assert (np.diff(scans(frames)) % 97 == 1).all(), "behind the gap all is there, a FIFO of frames"
-    assert form.fifo_frames >= 100
+    assert format.fifo_frames >= 100
 
 
 def test_stop_ends_the_stream() -> None:

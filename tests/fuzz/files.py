@@ -150,24 +150,24 @@ def recording(data: bytes, folder: Path) -> None:
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)
     try:
-        got, fmt = types.load(folder / "sweep.npy")
+        got, format = types.load(folder / "sweep.npy")
     except FormatError as e:
         message = one_line(e)
         assert "sweep.npy" in message
         return
     n = len(got.frames.t_ns)
     assert got.frames.seq.shape == got.frames.t_ns.shape == (n,)
-    assert got.frames.taxels.shape == (n, *fmt.shape)
-    assert np.zeros(fmt.shape).size * fmt.period_ns > 0
+    assert got.frames.taxels.shape == (n, *format.shape)
+    assert np.zeros(format.shape).size * format.period_ns > 0
     for number in (got.id, got.start_ns, got.stop_ns, got.lost, got.complete_ns, got.object):
         assert type(number) is int, f"{number!r} is no whole number"
     for text in (got.material, got.position, got.session):
         assert type(text) is str
         assert text.isprintable(), f"{text!r} cannot be shown"
     assert isinstance(got.share, (int, float))
-    types.save(folder / "again.npy", got, fmt)
+    types.save(folder / "again.npy", got, format)
     again, form = types.load(folder / "again.npy")
-    assert form == fmt
+    assert form == format
     assert again.frames.taxels.tobytes() == got.frames.taxels.tobytes()
     assert dataclasses.replace(again, frames=got.frames) == got
 

@@ -65,9 +65,9 @@ def unpack() -> list[bytes]:
     ]
     axes = packets.pack(7, 9, np.arange(54, dtype=np.float32).reshape(2, 3, 3, 3))
     who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
-    form = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
+    format = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
     replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(
-        packets.Request.FORMAT, form
+        packets.Request.FORMAT, format
     )
     restarted = packets.pack(900_000, 5, frames[:1]) + packets.pack(0, 6, frames[1:2])
     swapped = sent[0] + sent[2] + sent[1] + sent[1]
@@ -82,7 +82,7 @@ def unpack() -> list[bytes]:
         replies,
         newer + sent[0],
         who,
-        form,
+        format,
         broken,
         *others,
         axes,
@@ -164,14 +164,14 @@ def recording() -> list[bytes]:
         SweepFormat(1, 1, 35.61, 4, "uint8"),
         SweepFormat(2, 1, 9.0, 4, "int16", 3),
     )
-    for fmt in skins:
-        taxels = np.arange(4 * fmt.channels).reshape(4, *fmt.shape).astype(fmt.numpy_type)
+    for format in skins:
+        taxels = np.arange(4 * format.channels).reshape(4, *format.shape).astype(format.numpy_type)
         sweep = Sweep(
             1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a"
         )
         with TemporaryDirectory() as folder:
             path = Path(folder) / "sweep.npy"
-            save(path, sweep, fmt)
+            save(path, sweep, format)
             found.append(path.with_suffix(".json").read_bytes() + path.read_bytes())
     return found
 

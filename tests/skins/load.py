@@ -66,10 +66,10 @@ class Sliding:
     """A finger that slides without end: the middle of a simulated sweep, again and again, with
     numbers in two taxels."""
 
-    def __init__(self, name: str, profile: SkinProfile, fmt: SweepFormat) -> None:
+    def __init__(self, name: str, profile: SkinProfile, format: SweepFormat) -> None:
         self._profile = profile
-        act = next(iter(script.tubes(SEED, 1, seen=sweeps.view(name, fmt))))
-        margin = round(fmt.rate_hz * LEAD_S / 2)
+        act = next(iter(script.tubes(SEED, 1, seen=sweeps.view(name, format))))
+        margin = round(format.rate_hz * LEAD_S / 2)
         self._frames = act.frames[act.start + margin : act.stop - margin].copy()
 
     def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
@@ -172,13 +172,13 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
     }
 
 
-def sets(name: str, fmt: SweepFormat, link: Path) -> list[str]:
+def sets(name: str, format: SweepFormat, link: Path) -> list[str]:
     """Settings of a box with this skin and no lines."""
-    sweep_s = fmt.window / fmt.rate_hz + LEAD_S
+    sweep_s = format.window / format.rate_hz + LEAD_S
     chosen = {
         "sensor.skin": name,
         "sensor.port": link,
-        "sensor.rate_hz": fmt.rate_hz,
+        "sensor.rate_hz": format.rate_hz,
         "trigger.mode": "timed",
         "trigger.sweep_s": sweep_s,
         "trigger.every_s": sweep_s + PAUSE_S,

@@ -48,12 +48,12 @@ def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
     """
     profile = skin_profile.load(name, [PROFILES])
     profile = replace(profile, rows=rows or profile.rows, cols=cols or profile.cols)
-    fmt, rng = profile.format, np.random.default_rng(sum(name.encode()))
-    if fmt.dtype == "float32":
+    format, rng = profile.format, np.random.default_rng(sum(name.encode()))
+    if format.dtype == "float32":
         values = (
-            rng.integers(-4000, 4000, (n, *fmt.shape)) / 4
+            rng.integers(-4000, 4000, (n, *format.shape)) / 4
         )  # what two digits after the point can hold
     else:
-        most = 0xF9FF if name == "xela-can" else np.iinfo(fmt.dtype).max
-        values = rng.integers(0, most + 1, (n, *fmt.shape))
-    return Subject(name, profile, values.astype(fmt.numpy_type))
+        most = 0xF9FF if name == "xela-can" else np.iinfo(format.dtype).max
+        values = rng.integers(0, most + 1, (n, *format.shape))
+    return Subject(name, profile, values.astype(format.numpy_type))

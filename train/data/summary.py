@@ -122,11 +122,11 @@ def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Name
 def description(sweeps: Dataset, names: Names) -> list[str]:
     """The contents of a set: sweeps and their form, materials, recordings, groups and what is
     confounded."""
-    fmt = sweeps.format
+    format = sweeps.format
     _, _, per_recording = sweeps.counts_by("recording")
     least, most = (windows := per_recording.sum(axis=1)).min(), windows.max()
     lines = [
-        f"{sweeps.source}: {len(sweeps)} sweeps of {fmt.window / fmt.rate_hz:.3g} s; {fmt}; digest {sets.digest(sweeps)}",
+        f"{sweeps.source}: {len(sweeps)} sweeps of {format.window / format.rate_hz:.3g} s; {format}; digest {sets.digest(sweeps)}",
         f"  recordings: {len(windows)}, of {least if least == most else f'{least} to {most}'} each",
     ]
     if several := np.count_nonzero((per_recording > 0).sum(axis=1) > 1):

@@ -85,11 +85,11 @@ def _kept(x: Array, taxels: tuple[int, ...]) -> Array:
     n, frames, grid_rows, cols, *axes = x.shape
     row, col = np.divmod(np.array(sorted(taxels)), cols)
     rows, columns = np.unique(row), np.unique(col)
-    form = (
+    format = (
         (len(rows), len(columns)) if len(rows) * len(columns) == len(taxels) else (len(taxels), 1)
     )
     kept = x.reshape(n, frames, grid_rows * cols, *axes)[:, :, sorted(taxels)]
-    return np.ascontiguousarray(kept).reshape(n, frames, *form, *axes)
+    return np.ascontiguousarray(kept).reshape(n, frames, *format, *axes)
 
 
 def _coarse(x: Array, bits: int) -> Array:
@@ -121,8 +121,8 @@ def order(sweeps: Dataset) -> list[int]:
     and with RIDGE in W, the scatter within materials. Removing one taxel from the inverse is a step
     in closed form, so that nothing is trained.
     """
-    form, powers = sweeps.format, _powers(sweeps.samples)  # [N, M, BANDS]
-    n, taxels, bands = len(powers), form.rows * form.cols, form.axes * BANDS
+    format, powers = sweeps.format, _powers(sweeps.samples)  # [N, M, BANDS]
+    n, taxels, bands = len(powers), format.rows * format.cols, format.axes * BANDS
     x = powers.reshape(n, -1)
     x = (x - x.mean(0)) / np.maximum(x.std(0), 1e-9)
     within, between = x.copy(), np.zeros((x.shape[1],) * 2)

@@ -66,16 +66,22 @@ class SimulatedScene:
         slide.
         """
         world = world or self.physics
-        form, rest = world.format, round(REST_S * world.format.rate_hz)
-        late = np.rint(np.broadcast_to(late_ms, len(self.places)) * form.rate_hz / 1000).astype(int)
-        drawn = np.empty((len(self.places), form.window, *form.shape), form.numpy_type)
+        format, rest = world.format, round(REST_S * world.format.rate_hz)
+        late = np.rint(np.broadcast_to(late_ms, len(self.places)) * format.rate_hz / 1000).astype(
+            int
+        )
+        drawn = np.empty((len(self.places), format.window, *format.shape), format.numpy_type)
         for i, (material, at, seed) in enumerate(
             zip(self.materials, self.places, self.worlds, strict=True)
         ):
             rng = np.random.default_rng([seed, i, *b"stress"])
-            length_s = {"rest_s": REST_S, "slide_s": form.window / form.rate_hz, "after_s": REST_S}
+            length_s = {
+                "rest_s": REST_S,
+                "slide_s": format.window / format.rate_hz,
+                "after_s": REST_S,
+            }
             whole = skin.sweep(material, place(at), rng, world, **length_s)
-            drawn[i] = whole[rest + late[i] :][: form.window]
+            drawn[i] = whole[rest + late[i] :][: format.window]
         return drawn
 
 

@@ -293,11 +293,11 @@ def box_answers(bundle: Bundle) -> dict[str, str]:
 def answer(bundle: Bundle, taxels: Array) -> Verdict:
     """The box's verdict on frames [n, R, C] that arrive from the START to the STOP edge of one
     sweep."""
-    form, n, clock = bundle.format, np.arange(len(taxels)), VirtualClock()
+    format, n, clock = bundle.format, np.arange(len(taxels)), VirtualClock()
     first_ns = clock.now_ns()
-    cutter = SweepCutter(form, SweepConfig())
-    t_ns = first_ns + np.rint(n * form.period_ns).astype(np.int64)
-    end_ns = first_ns + round(len(taxels) * form.period_ns) + 1
+    cutter = SweepCutter(format, SweepConfig())
+    t_ns = first_ns + np.rint(n * format.period_ns).astype(np.int64)
+    end_ns = first_ns + round(len(taxels) * format.period_ns) + 1
     clock.sleep_until(end_ns + 10 * SweepConfig().late_ms * 1_000_000)
     cutter.put(Frames(t_ns, n, taxels), end_ns)
     cutter.trigger([Edge(EdgeKind.START, first_ns), Edge(EdgeKind.STOP, end_ns)], True, end_ns)
@@ -359,16 +359,16 @@ def _curve(parts: list[Json], totals: Array) -> Json:
     return curve | {"falls": falls(curve)}
 
 
-def _uninformative(form: SweepFormat, top: float) -> dict[str, Array]:
+def _uninformative(format: SweepFormat, top: float) -> dict[str, Array]:
     """Windows [T, R, C] or [T, R, C, A] without information, one of a single frame. top: the
     highest count where their type sets none."""
-    level = np.full((form.window, *form.shape), top / 2).astype(form.numpy_type)
-    whole = form.numpy_type.kind != "f"
+    level = np.full((format.window, *format.shape), top / 2).astype(format.numpy_type)
+    whole = format.numpy_type.kind != "f"
     found = {
         "silent": 0 * level,
         "constant": level,
         "one-frame": level[:1],
-        "saturated": np.full_like(level, np.iinfo(form.numpy_type).max if whole else top),
+        "saturated": np.full_like(level, np.iinfo(format.numpy_type).max if whole else top),
     }
     for name, value in () if whole else (("nan", np.nan), ("inf", np.inf)):
         found[name] = level.copy()

@@ -31,8 +31,11 @@ def answers(
 ) -> Iterator[tuple[int, Verdict]]:
     """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of
     a recording count as sweeps of one object."""
-    form = sweeps.format
-    t_ns, seq = (np.arange(form.window) * form.period_ns).astype(np.int64), np.arange(form.window)
+    format = sweeps.format
+    t_ns, seq = (
+        (np.arange(format.window) * format.period_ns).astype(np.int64),
+        np.arange(format.window),
+    )
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
     for i in np.argsort(recording, kind="stable").tolist():
         frames = Frames(t_ns, seq, sweeps.samples[i])

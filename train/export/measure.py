@@ -168,9 +168,9 @@ def _classifier(folder: Path) -> Call:
     from appliance.inference.classifier import Classifier
 
     classifier = Classifier(bundle.load(folder), SystemClock())
-    form = classifier.bundle.format
-    seq = np.arange(form.window)
-    t_ns = (seq * form.period_ns).astype(np.int64)
+    format = classifier.bundle.format
+    seq = np.arange(format.window)
+    t_ns = (seq * format.period_ns).astype(np.int64)
 
     def answer(counts: Array) -> Any:
         return classifier(Sweep(0, 0, int(t_ns[-1]), Status.OK, Frames(t_ns, seq, counts)))

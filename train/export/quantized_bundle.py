@@ -175,15 +175,15 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
     """
     if source.is_dir():
         loaded = bundle.load(source)
-        form, materials = loaded.format, loaded.manifest.labels
+        format, materials = loaded.format, loaded.manifest.labels
         model, reference, kind = onnx.load_from_string(loaded.model), None, loaded.manifest.input
     else:
         made = Fit.load(source)
-        form, materials, kind = made.train.format, made.train.materials, "raw"
+        format, materials, kind = made.train.format, made.train.materials, "raw"
         reference, model = graphs(made)
-    if (form, materials) != (sweeps.format, sweeps.materials):
+    if (format, materials) != (sweeps.format, sweeps.materials):
         raise FormatError(
-            f"{source.name} is of {form} and {', '.join(materials)}; {sweeps.source} of {sweeps.format} and "
+            f"{source.name} is of {format} and {', '.join(materials)}; {sweeps.source} of {sweeps.format} and "
             f"{', '.join(sweeps.materials)}: name a set of the same kind"
         )
     found = parity.measure(
@@ -205,22 +205,22 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
     from train.models.recipe.network import Compact  # here, as what follows: it imports PyTorch
 
-    rng, form, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
-    counts = rng.integers(0, 256, (4, form.window, *form.shape), np.uint8)
+    rng, format, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
+    counts = rng.integers(0, 256, (4, format.window, *format.shape), np.uint8)
     sweeps = Dataset(
-        counts, np.arange(4) % classes, skin.MATERIALS, form.rate_hz, {}, "random counts"
+        counts, np.arange(4) % classes, skin.MATERIALS, format.rate_hz, {}, "random counts"
     )
     trunk = recipe.fixed_trunk(sweeps, seed)
-    stages = Compact(form, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
+    stages = Compact(format, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
     filters = Bank.of(trunk.weights)
     filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
     architecture = replace(recipe.STAGES, pools=2, distribution=True, spectrum=True)
     small = graph.trunk_graph(
-        form, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
+        format, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
     )
     size = small.graph.output[0].type.tensor_type.shape.dim[1].dim_value
     small = with_head(small, rng.standard_normal((classes, size)), np.zeros(classes))
-    paper = quantize(random_paper_cnn(form, classes, rng), counts, INT8_NODES)
+    paper = quantize(random_paper_cnn(format, classes, rng), counts, INT8_NODES)
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "fp32.onnx", folder / "paper_int8.onnx"
     for path, model in zip(paths, (small, paper), strict=True):

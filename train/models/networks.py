@@ -32,9 +32,9 @@ class Network(nn.Module, ABC):
 
     head: nn.Linear
 
-    def __init__(self, form: SweepFormat, scale: float, offset: float | None = None) -> None:
+    def __init__(self, format: SweepFormat, scale: float, offset: float | None = None) -> None:
         super().__init__()
-        self.form, self.scale, self.offset, self.dropout = form, scale, offset, 0.0
+        self.format, self.scale, self.offset, self.dropout = format, scale, offset, 0.0
 
     def prepare(self, counts: Tensor) -> Tensor:
         """Raw counts [B, T, R, C] -> float32 [B, R * C, T] of about 1."""

@@ -95,7 +95,7 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
     return prod(shape(node.input[1])) if node.op_type == "CDist" else 0
 
 
-def feature_macs(kind: str, form: SweepFormat) -> int:
+def feature_macs(kind: str, format: SweepFormat) -> int:
     """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n
     real numbers.
 
@@ -112,7 +112,7 @@ def feature_macs(kind: str, form: SweepFormat) -> int:
         return power(x, frames)
 
     rng = np.random.default_rng(0)  # no transform may be computed for a silent sweep
-    counts = rng.integers(0, 100, (form.window, *form.shape)).astype(form.numpy_type)
+    counts = rng.integers(0, 100, (format.window, *format.shape)).astype(format.numpy_type)
     with mock.patch.object(time_series, "power", counted):
-        kinds.compute(kind, counts, form.rate_hz)
+        kinds.compute(kind, counts, format.rate_hz)
     return sum(transforms)

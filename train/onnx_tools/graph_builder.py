@@ -50,11 +50,11 @@ class GraphBuilder:
         self.nodes.append(helper.make_node(op, inputs, [output], name=output, **attributes))
         return output
 
-    def model(self, form: SweepFormat, output: str, *size: int) -> onnx.ModelProto:
+    def model(self, format: SweepFormat, output: str, *size: int) -> onnx.ModelProto:
         """The finished, checked model: `sweep` [1, T, R, C] or [1, T, R, C, A] -> `output` float32
         [1, *size]."""
         sweep = helper.make_tensor_value_info(
-            "sweep", TENSOR[form.dtype], [1, form.window, *form.shape]
+            "sweep", TENSOR[format.dtype], [1, format.window, *format.shape]
         )
         out = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, *size])
         graph = helper.make_graph(self.nodes, "palpate", [sweep], [out], self.constants)
@@ -68,25 +68,27 @@ class GraphBuilder:
         return model
 
 
-def centred(g: GraphBuilder, form: SweepFormat) -> tuple[str, str]:
+def centred(g: GraphBuilder, format: SweepFormat) -> tuple[str, str]:
     """Nodes that subtract the mean of each taxel and axis: `sweep` -> ([1, R * C * A, T], sums over
     time [1, R * C * A]), float32.
 
     Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and
     exactly for whole counts, in whatever order a processor adds them.
     """
-    taxels = form.channels
+    taxels = format.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
-    ones = g("ConstantOfShape", g.constant([form.window, 1], "int64"), value=one)
+    ones = g("ConstantOfShape", g.constant([format.window, 1], "int64"), value=one)
     x = g(
         "Cast",
-        g("Reshape", "sweep", g.constant([form.window, taxels], "int64")),
+        g("Reshape", "sweep", g.constant([format.window, taxels], "int64")),
         to=TensorProto.FLOAT,
     )
     sums = g("Gemm", ones, x, transA=1)
-    x = g("Gemm", ones, sums, x, alpha=-1 / form.window)
+    x = g("Gemm", ones, sums, x, alpha=-1 / format.window)
     return g(
-        "Transpose", g("Reshape", x, g.constant([1, form.window, taxels], "int64")), perm=[0, 2, 1]
+        "Transpose",
+        g("Reshape", x, g.constant([1, format.window, taxels], "int64")),
+        perm=[0, 2, 1],
     ), sums
 
 

@@ -253,10 +253,10 @@ def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
     return list(zip(starts, np.split(taxels, sweep.gaps + 1), strict=True))
 
 
-def _about_spectrum(form: SweepFormat, still: int) -> str:
+def _about_spectrum(format: SweepFormat, still: int) -> str:
     """What the caption says of a spectrum; still: taxels that are not in it."""
     rounding = (
-        "" if form.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
+        "" if format.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
     )
     left_out = f"; without {still} that stand still" if still else ""
     return f"raw counts per √Hz over Hz: the taxels' mean power; light: their range{rounding}{left_out}"
@@ -355,20 +355,23 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels{each}"
 
 
-def _spectrum(axes: Axes, taxels: Array, form: SweepFormat) -> None:
+def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
     """Mean power of all taxels and their range as amplitudes per root hertz, with the noise of
     rounding. taxels: [T, n]."""
     hz, power = welch(
-        taxels, form.rate_hz, nperseg=min(len(taxels), max(LONGEST, round(form.rate_hz))), axis=0
+        taxels,
+        format.rate_hz,
+        nperseg=min(len(taxels), max(LONGEST, round(format.rate_hz))),
+        axis=0,
     )
     hz, power = hz[1:], np.maximum(power[1:], 1e-12 * power.max())
     low, mean, high = (np.sqrt(of(axis=1)) for of in (power.min, power.mean, power.max))
     axes.fill_between(hz, low, high, color=ACCENT, alpha=0.15, linewidth=0)
     axes.plot(hz, mean, color=ACCENT, linewidth=1.1)
     axes.set(xscale="log", yscale="log", xlim=(hz[0], hz[-1]))
-    if form.numpy_type.kind != "f":
+    if format.numpy_type.kind != "f":
         axes.axhline(
-            np.sqrt(1 / 6 / form.rate_hz), color=BLACK, linewidth=0.8, linestyle=(0, (2, 2))
+            np.sqrt(1 / 6 / format.rate_hz), color=BLACK, linewidth=0.8, linestyle=(0, (2, 2))
         )
     axes.grid(color=FAINT, linewidth=0.6)
     for axis, (first, last) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):

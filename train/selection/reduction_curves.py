@@ -164,8 +164,8 @@ def _bits(trials: Trials) -> Iterator[Step]:
 def _taxels(trials: Trials) -> Iterator[Step]:
     """Numbers of taxels that are powers of two. Which taxels is found again without each part, as
     it is part of the test."""
-    form = trials.sweeps.format
-    count = form.rows * form.cols
+    format = trials.sweeps.format
+    count = format.rows * format.cols
     orders = [transforms.order(trials.sweeps.take(~part.out)) for part in trials.parts]
     overall = transforms.order(trials.sweeps)
     n = 2 ** ((count - 1).bit_length() - 1) if count > 1 else 0

@@ -61,14 +61,14 @@ class Reel:
 def build(
     name: str,
     profile: SkinProfile,
-    fmt: SweepFormat,
+    format: SweepFormat,
     acts: Iterable[rig.Act],
     clock: Clock,
     source: str,
     *,
     remember: bool = True,
 ) -> PlayedDevices:
-    """Devices on which a robot plays `acts`, sweeps of `fmt`, with the skin of this profile.
+    """Devices on which a robot plays `acts`, sweeps of `format`, with the skin of this profile.
     source, remember: see `sim.devices.build`.
 
     Raises ConfigError for a skin that has no emulator.
@@ -76,8 +76,8 @@ def build(
     playing = PlayerClock(clock)
     robot, lines = robot_on_lines(acts, playing, remember=remember)
     folder = tempfile.TemporaryDirectory()
-    reel = Reel(rig.Film(fmt, robot), profile)
-    player = Player(wire(name, fmt.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
+    reel = Reel(rig.Film(format, robot), profile)
+    player = Player(wire(name, format.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
     playing.player = player
     return PlayedDevices(
         clock=playing,
@@ -85,7 +85,7 @@ def build(
         source=source,
         robot=robot,
         wait=playing.wait_readable,
-        format=fmt,
+        format=format,
         name=name,
         player=player,
         folder=folder,

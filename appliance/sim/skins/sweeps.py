@@ -109,13 +109,13 @@ def _at(values: Array, at: Array) -> Array:
     return between
 
 
-def view(name: str, fmt: SweepFormat) -> SkinView:
-    """The simulated finger with the skin of the profile `name`, which has the form `fmt`.
+def view(name: str, format: SweepFormat) -> SkinView:
+    """The simulated finger with the skin of the profile `name`, which has the form `format`.
 
     Raises FormatError for two axes or more than three.
     """
-    if fmt.axes not in (1, 3):
+    if format.axes not in (1, 3):
         raise FormatError(
-            f"the simulated finger is felt with 1 or 3 axes, not {fmt.axes}; use another profile"
+            f"the simulated finger is felt with 1 or 3 axes, not {format.axes}; use another profile"
         )
-    return SkinView(fmt, SCALES.get(name, Scale()))
+    return SkinView(format, SCALES.get(name, Scale()))

@@ -225,19 +225,19 @@ def test_align_with_what_is_simulated(
 
 def test_another_skin_shape(model: Bundle):
     """A skin of 2 x 3 taxels with floating-point counts, some of which are NaN."""
-    fmt = replace(model.format, rows=2, cols=3, dtype="float32")
+    format = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
         model,
         manifest=replace(
             model.manifest,
-            format=fmt,
+            format=format,
             place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0)),
         ),
     )
     load = np.zeros((3000, 2, 3), np.float32)
     load[1000:, :, 1:] = 60.0
     load[:, 0, 0] = np.nan
-    simulated = devices.build(fmt, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
+    simulated = devices.build(format, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
     seen = views_of(simulated, other)(3)
     assert seen[-1].message == "2.0 mm too far towards column 3"
     assert seen[-1].load[0][0] == 0

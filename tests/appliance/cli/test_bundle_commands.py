@@ -71,19 +71,21 @@ def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config
 
 def test_a_bundle_for_another_skin_is_refused_with_both_formats():
     """One for the same skin with another window is taken, and any where the skin is not known."""
-    fmt = RUNNING.format
+    format = RUNNING.format
     other = replace(
         RUNNING,
-        manifest=replace(RUNNING.manifest, format=replace(fmt, rows=5, cols=3, rate_hz=100.0)),
+        manifest=replace(RUNNING.manifest, format=replace(format, rows=5, cols=3, rate_hz=100.0)),
     )
     with pytest.raises(
         BundleError,
         match=r"is for a skin of 5x3 uint8 at 100 Hz.*the one that streams has 4x4 uint8",
     ):
-        bundle_commands.suits(other, fmt)
+        bundle_commands.suits(other, format)
     bundle_commands.suits(other, None)
-    shorter = replace(RUNNING, manifest=replace(RUNNING.manifest, format=replace(fmt, window=750)))
-    bundle_commands.suits(shorter, fmt)
+    shorter = replace(
+        RUNNING, manifest=replace(RUNNING.manifest, format=replace(format, window=750))
+    )
+    bundle_commands.suits(shorter, format)
 
 
 @deliveries.NEEDED

@@ -118,9 +118,9 @@ def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.Captur
 def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
     """Real devices are played by the simulator, unknown to the command."""
 
-    def played(args: argparse.Namespace, fmt: Callable[[], SweepFormat]) -> Devices:
+    def played(args: argparse.Namespace, format: Callable[[], SweepFormat]) -> Devices:
         args.virtual = True
-        return cli._simulated("skin:wood", fmt(), args, load_settings(args), remember=False)
+        return cli._simulated("skin:wood", format(), args, load_settings(args), remember=False)
 
     monkeypatch.setattr(cli, "_open_devices", played)
 

@@ -34,9 +34,9 @@ def test_a_format_with_axes():
     assert list(plain.json()) == ["rows", "cols", "rate_hz", "window", "dtype"]
     assert list(PILLARS.json()) == [*plain.json(), "axes"]
     assert PILLARS.skin != plain.skin
-    for fmt in (plain, PILLARS):
-        assert typed(SweepFormat, json.loads(json.dumps(fmt.json()))) == fmt
-        assert Frames.empty(fmt).taxels.shape == (0, *fmt.shape)
+    for format in (plain, PILLARS):
+        assert typed(SweepFormat, json.loads(json.dumps(format.json()))) == format
+        assert Frames.empty(format).taxels.shape == (0, *format.shape)
 
 
 @pytest.mark.parametrize("axes", [0, 9, -1])
@@ -53,8 +53,8 @@ def test_a_recording_with_axes_comes_back(tmp_path: Path):
     taxels = np.arange(5 * 27, dtype="<f4").reshape(5, 3, 3, 3)
     sweep = Sweep(1, 0, 9, Status.OK, Frames(np.arange(5), np.arange(5), taxels))
     save(tmp_path / "s.npy", sweep, PILLARS)
-    again, fmt = load(tmp_path / "s.npy")
-    assert fmt == PILLARS
+    again, format = load(tmp_path / "s.npy")
+    assert format == PILLARS
     np.testing.assert_array_equal(again.frames.taxels, taxels)
     sidecar = tmp_path / "s.json"
     sidecar.write_text(sidecar.read_text().replace('"axes": 3', '"axes": 2'))
@@ -64,10 +64,10 @@ def test_a_recording_with_axes_comes_back(tmp_path: Path):
 
 def test_a_recording_from_before_there_were_axes(tmp_path: Path):
     """It is read, and written again byte for byte."""
-    sweep, fmt = load(ONE_AXIS / "sweep.npy")
-    assert (fmt, sweep.frames.taxels.shape) == (toy_bundle.FORMAT, (20, 2, 2))
+    sweep, format = load(ONE_AXIS / "sweep.npy")
+    assert (format, sweep.frames.taxels.shape) == (toy_bundle.FORMAT, (20, 2, 2))
     about = json.loads((ONE_AXIS / "sweep.json").read_text())
-    save(tmp_path / "sweep.npy", sweep, fmt, {"verdict": about["verdict"]})
+    save(tmp_path / "sweep.npy", sweep, format, {"verdict": about["verdict"]})
     for name in ("sweep.npy", "sweep.json"):
         assert (tmp_path / name).read_bytes() == (ONE_AXIS / name).read_bytes()
 

@@ -113,10 +113,10 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
-    again, fmt = types.load(path)
+    again, format = types.load(path)
     told = types.sidecar(path)
     assert (told["verdict"]["label"], told["candidate"]["label"]) == ("a", "b")
-    assert fmt == toy_bundle.FORMAT
+    assert format == toy_bundle.FORMAT
     for name, run in (("verdict", pair.current), ("candidate", pair.shadow._classifier)):
         assert run(again).scores.tolist() == told[name]["scores"]
     written = pair.written()

@@ -254,16 +254,16 @@ def test_golden_sweeps_of_another_format(tmp_path: Path):
 def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
     """Every number of every type comes back as it was, also where changes wrap; smooth sweeps take
     less room."""
-    fmt = SweepFormat(2, 3, 100.0, 50, dtype, axes)
+    format = SweepFormat(2, 3, 100.0, 50, dtype, axes)
     rng = np.random.default_rng(1)
-    any_bits = rng.integers(0, 256, (2, 50, *fmt.shape, fmt.numpy_type.itemsize), np.uint8)
-    samples = any_bits.view(fmt.numpy_type)[..., 0]
-    samples[0] = np.cumsum(rng.integers(-2, 3, samples[0].shape), axis=0).astype(fmt.numpy_type)
+    any_bits = rng.integers(0, 256, (2, 50, *format.shape, format.numpy_type.itemsize), np.uint8)
+    samples = any_bits.view(format.numpy_type)[..., 0]
+    samples[0] = np.cumsum(rng.integers(-2, 3, samples[0].shape), axis=0).astype(format.numpy_type)
     logits = rng.normal(size=(2, 4)).astype(np.float32)
-    manifest = SimpleNamespace(format=fmt, labels=("a", "b", "c", "d"))
+    manifest = SimpleNamespace(format=format, labels=("a", "b", "c", "d"))
     got, answers = bundle._golden(bundle.golden_file(samples, logits), manifest)
     assert got.tobytes() == samples.tobytes()
-    assert got.dtype == fmt.numpy_type
+    assert got.dtype == format.numpy_type
     assert answers.tolist() == logits.tolist()
     smooth = np.repeat(samples[:1], 2, axis=0)
     plain = io.BytesIO()
@@ -542,14 +542,14 @@ def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
 def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
     """Huge float32 counts overflow the network: no label, no NaN, and the object's other sweeps are
     unaffected."""
-    fmt = replace(toy_bundle.FORMAT, dtype="float32")
-    made = toy_bundle.files(fmt=fmt, outputs=("logits",), known=None)
+    format = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.files(format=format, outputs=("logits",), known=None)
     limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
     made[bundle.MANIFEST] = replace(
         bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits
     ).json()
     it = Classifier(bundle.load(toy_bundle.put(tmp_path / "toy", made)), VirtualClock())
-    far = toy_bundle.sweep(0, 0, object=1, fmt=fmt)
+    far = toy_bundle.sweep(0, 0, object=1, format=format)
     far.frames.taxels[::2, 0, :] = 2e38
     with np.errstate(invalid="ignore"):
         v = it(far)
@@ -559,7 +559,7 @@ def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
         0,
         "the model gives no number",
     )
-    assert it(toy_bundle.sweep(0, 0, object=1, fmt=fmt)).fused == 1
+    assert it(toy_bundle.sweep(0, 0, object=1, format=format)).fused == 1
 
 
 def borderline(**more) -> tuple[Sweep, float]:

@@ -571,8 +571,8 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
     box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
     (verdict,) = all_of(box)
     save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
-    sweep, fmt = load(tmp_path / "sweep-000001.npy")
-    assert (fmt, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
+    sweep, format = load(tmp_path / "sweep-000001.npy")
+    assert (format, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
     assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
     again = Decider(Classifier(toy(), rig.VirtualClock()))(sweep)
     assert again is not None

@@ -69,13 +69,13 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
 
 def test_a_label_for_a_skin_with_axes(tmp_path: Path):
     """As with one axis; sweeps without the axes are refused, naming the format."""
-    old = toy_bundle.load(tmp_path / "old", fmt=toy_bundle.THREE_AXES)
-    sweeps = np.stack([toy_bundle.window(*z, fmt=toy_bundle.THREE_AXES) for z in FELT])
+    old = toy_bundle.load(tmp_path / "old", format=toy_bundle.THREE_AXES)
+    sweeps = np.stack([toy_bundle.window(*z, format=toy_bundle.THREE_AXES) for z in FELT])
     new = enrolment.enrol(old, "felt", sweeps)
-    files = enrolment.files(toy_bundle.files(fmt=toy_bundle.THREE_AXES), new, None)
+    files = enrolment.files(toy_bundle.files(format=toy_bundle.THREE_AXES), new, None)
     enrolment.write(files, tmp_path / "new", False)
     it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
-    assert it(toy_bundle.sweep(7, 8, fmt=toy_bundle.THREE_AXES)).label == "felt"
+    assert it(toy_bundle.sweep(7, 8, format=toy_bundle.THREE_AXES)).label == "felt"
     for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
         with pytest.raises(
             FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"
@@ -275,8 +275,8 @@ def test_sweeps_of_another_form(old: Bundle, sweeps: np.ndarray):
 
 def test_sweeps_that_give_no_number(tmp_path: Path):
     """A mean that is NaN would make every later answer invalid."""
-    fmt = replace(toy_bundle.FORMAT, dtype="float32")
-    made = toy_bundle.load(tmp_path / "f", fmt=fmt)
+    format = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.load(tmp_path / "f", format=format)
     with pytest.raises(FormatError, match="no number"):
         enrolment.enrol(made, "felt", np.full((1, 20, 2, 2), 3e38, np.float32))
 

@@ -148,9 +148,9 @@ def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
     """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand
     or go back: no refusal."""
     rng = np.random.default_rng(8)
-    fmt = SweepFormat(4, 4, rate_hz, 1500, "uint8")
-    simulated = idle_devices(60, fmt, packet_frames=packet_frames)
-    sensor = UsbSensor(SensorConfig(silence_ms=2000), fmt, simulated.clock, simulated.backend)
+    format = SweepFormat(4, 4, rate_hz, 1500, "uint8")
+    simulated = idle_devices(60, format, packet_frames=packet_frames)
+    sensor = UsbSensor(SensorConfig(silence_ms=2000), format, simulated.clock, simulated.backend)
     alter(
         simulated,
         lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000),

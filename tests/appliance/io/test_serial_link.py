@@ -57,9 +57,9 @@ def board() -> Iterator[SerialBoard]:
         yield SerialBoard(skins.board(Skin(), CLOCK), stack)
 
 
-def sensor_on(board: SerialBoard, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
+def sensor_on(board: SerialBoard, format: SweepFormat = FMT, **settings) -> UsbSensor:
     """The driver on the board's port."""
-    return UsbSensor(SensorConfig(port=str(board.path), **FAST | settings), fmt, CLOCK)
+    return UsbSensor(SensorConfig(port=str(board.path), **FAST | settings), format, CLOCK)
 
 
 def read_until(sensor: UsbSensor, done: Callable[[int], bool]) -> Frames:

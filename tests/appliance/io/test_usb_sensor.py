@@ -19,10 +19,12 @@ from tests.factories.simulated_box import SECOND, idle_devices, numbered
 FMT = skin.FORMAT
 
 
-def sensor_on(simulated: SimDevices, fmt: SweepFormat = FMT, **settings) -> UsbSensor:
+def sensor_on(simulated: SimDevices, format: SweepFormat = FMT, **settings) -> UsbSensor:
     """The real driver on the simulated bus."""
     link = "acm" if simulated.backend.acm else "vendor"
-    return UsbSensor(SensorConfig(link=link, **settings), fmt, simulated.clock, simulated.backend)
+    return UsbSensor(
+        SensorConfig(link=link, **settings), format, simulated.clock, simulated.backend
+    )
 
 
 def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> Frames:
@@ -264,7 +266,7 @@ def test_a_skin_with_three_axes(acm: bool):
     """All axes of every frame arrive in their places; a box for one axis refuses the board, and the
     other way round."""
     pillars = SweepFormat(3, 3, 1000.0, 2000, "float32", 3)
-    simulated = idle_devices(fmt=pillars, acm=acm)
+    simulated = idle_devices(format=pillars, acm=acm)
     sensor = sensor_on(simulated, pillars)
     frames = read_for(sensor, simulated, 1)
     assert (len(frames) > 900, sensor.counters.lost_frames) == (True, 0)
@@ -278,7 +280,7 @@ def test_a_skin_with_three_axes(acm: bool):
 
 def test_frames_with_other_axes_than_announced():
     """A board that announces one axis and sends three: mismatch, naming both."""
-    simulated = idle_devices(fmt=replace(FMT, axes=3))
+    simulated = idle_devices(format=replace(FMT, axes=3))
     simulated.backend.board.skin = replace(simulated.backend.board.skin, axes=1)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -347,9 +349,9 @@ def test_acm_board_that_answers_a_byte_at_a_time():
 
 def test_another_format_is_not_other_code():
     """16x1 int16 at 35.61 Hz over the same wire."""
-    fmt = SweepFormat(16, 1, 35.61, 128, "int16")
-    simulated = idle_devices(600, fmt)
-    sensor = sensor_on(simulated, fmt)
+    format = SweepFormat(16, 1, 35.61, 128, "int16")
+    simulated = idle_devices(600, format)
+    sensor = sensor_on(simulated, format)
     frames = read_for(sensor, simulated, 20)
     assert frames.taxels.dtype == np.int16
     assert frames.taxels.shape[1:] == (16, 1)

@@ -92,10 +92,10 @@ def test_a_full_disk_drops_the_oldest_first(
     black = box(tmp_path)
     limit = [2]
 
-    def tight(path: Path, sweep: Sweep, fmt: SweepFormat, about: Mapping[str, object]) -> None:
+    def tight(path: Path, sweep: Sweep, format: SweepFormat, about: Mapping[str, object]) -> None:
         if len(list(tmp_path.glob("*.npy"))) >= limit[0]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        save(path, sweep, fmt, about)
+        save(path, sweep, format, about)
 
     save = recording.save
     monkeypatch.setattr(recording, "save", tight)

@@ -217,8 +217,8 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
     box.until(lambda: simulated.finished(box.box.answered))
     (sweep,) = box.kept
     save(tmp_path / "s.npy", sweep, skin.FORMAT)
-    again, fmt = load(tmp_path / "s.npy")
-    assert fmt == skin.FORMAT
+    again, format = load(tmp_path / "s.npy")
+    assert format == skin.FORMAT
     assert (again.id, again.status, again.start_ns, again.stop_ns) == (
         sweep.id,
         sweep.status,

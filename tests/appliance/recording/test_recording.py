@@ -152,8 +152,8 @@ def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: P
     assert (about["run"], about["lost"]) == (0, 0)
     assert not about.keys() & {"bundle", "tare", "rule"}
     assert (about["material"], about["position"], about["session"]) == ("wood", "3", "monday")
-    again, fmt = load(tmp_path / "sweep-000001.npy")
-    assert fmt == skin.FORMAT
+    again, format = load(tmp_path / "sweep-000001.npy")
+    assert format == skin.FORMAT
     assert again.frames.taxels.tobytes() == box.kept[0].frames.taxels.tobytes()
 
 
@@ -527,7 +527,7 @@ def test_a_disk_that_is_full_costs_no_answer(
 ):
     """On the whole box: each sweep is answered, each REC says full, no frame is lost."""
 
-    def full(path: Path, sweep: Sweep, fmt: object, about: Mapping[str, object]) -> None:
+    def full(path: Path, sweep: Sweep, format: object, about: Mapping[str, object]) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(recording, "save", full)

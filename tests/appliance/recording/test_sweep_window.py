@@ -22,13 +22,13 @@ def t_ns(frame: float) -> int:
 
 
 def frames(
-    first: int, n: int, drop: tuple[int, ...] = (), epoch: int = 0, fmt: SweepFormat = FMT
+    first: int, n: int, drop: tuple[int, ...] = (), epoch: int = 0, format: SweepFormat = FMT
 ) -> Frames:
     """Frames `first` to `first + n` without those in `drop`."""
     seq = np.array([i for i in range(first, first + n) if i not in drop])
-    taxels = numbered(first + n, fmt)[seq]
+    taxels = numbered(first + n, format)[seq]
     return Frames(
-        10 * SECOND + np.rint(seq * fmt.period_ns).astype(np.int64),
+        10 * SECOND + np.rint(seq * format.period_ns).astype(np.int64),
         seq + (epoch << EPOCH_BITS),
         taxels,
     )
@@ -37,8 +37,8 @@ def frames(
 class Bench:
     """A SweepCutter with its own time."""
 
-    def __init__(self, fmt: SweepFormat = FMT, **settings) -> None:
-        self.recorder = SweepCutter(fmt, SweepConfig(**settings))
+    def __init__(self, format: SweepFormat = FMT, **settings) -> None:
+        self.recorder = SweepCutter(format, SweepConfig(**settings))
         self.now = 10 * SECOND
 
     def put(self, some: Frames) -> None:
@@ -90,9 +90,9 @@ def test_window_lies_in_the_middle_to_the_frame(start: int, length: int, offset:
 
 def test_odd_window():
     """A window of an odd number of frames has one frame in its middle."""
-    fmt = SweepFormat(4, 4, 750.0, 101, "uint8")
-    bench = Bench(fmt)
-    bench.put(frames(0, 400, fmt=fmt))
+    format = SweepFormat(4, 4, 750.0, 101, "uint8")
+    bench = Bench(format)
+    bench.put(frames(0, 400, format=format))
     bench.edge(EdgeKind.START, 100)
     bench.edge(EdgeKind.STOP, 300)
     (sweep,) = bench.done()
@@ -102,9 +102,9 @@ def test_odd_window():
 
 def test_every_axis_is_interpolated():
     """A missing frame of a skin with three axes lies between its neighbours on each of them."""
-    fmt = SweepFormat(2, 2, 750.0, 100, "int16", 3)
-    bench = Bench(fmt)
-    whole = frames(0, 400, fmt=fmt)
+    format = SweepFormat(2, 2, 750.0, 100, "int16", 3)
+    bench = Bench(format)
+    whole = frames(0, 400, format=format)
     whole.taxels[:] = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10]) + np.arange(
         4
     ).reshape(2, 2, 1)
@@ -378,12 +378,12 @@ def test_an_open_sweep_so_far(packet: int):
 
 def test_steps_of_a_window_that_does_not_divide():
     """Ten frames in three steps: 3, 5 and 8 of them, so that no head lacks a frame of its step."""
-    fmt = SweepFormat(4, 4, 750.0, 10, "uint8")
-    bench = Bench(fmt, lead_ms=0)
+    format = SweepFormat(4, 4, 750.0, 10, "uint8")
+    bench = Bench(format, lead_ms=0)
     bench.edge(EdgeKind.START, 0)
-    bench.put(frames(0, 7, fmt=fmt))
+    bench.put(frames(0, 7, format=format))
     assert [len(s.frames) for s in steps_of(bench, 3)] == [3, 5]
-    bench.put(frames(7, 1, fmt=fmt))
+    bench.put(frames(7, 1, format=format))
     assert [len(s.frames) for s in steps_of(bench, 3)] == [8]
 
 

@@ -35,7 +35,7 @@ def act(z1: float, z2: float, label: str) -> rig.Act:
 def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path: Path, capsys):
     """Labels are right; kept sweeps hold all axes and replay bit for bit; the capture gives the
     same sentences."""
-    model = toy_bundle.load(tmp_path / "bundle", fmt=FMT)
+    model = toy_bundle.load(tmp_path / "bundle", format=FMT)
     stuck = act(0, 0, "stuck")
     stuck.frames[OFF:-OFF, 1, 0, 0] = 5
     acts = [act(0.4, 0.2, "a"), act(5.7, 0.1, "b"), stuck, act(0.3, 6.2, "c")]
@@ -54,8 +54,8 @@ def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path
         ("ok", "c"),
     ]
     assert verdicts[2].detail == "taxel 2.1 axis 1"
-    sweep, fmt = load(sorted((tmp_path / "kept").rglob("*.npy"))[1])
-    assert (fmt, sweep.frames.taxels.shape) == (FMT, (20, 2, 2, 3))
+    sweep, format = load(sorted((tmp_path / "kept").rglob("*.npy"))[1])
+    assert (format, sweep.frames.taxels.shape) == (FMT, (20, 2, 2, 3))
     np.testing.assert_array_equal(
         np.ptp(sweep.frames.taxels, axis=0), np.tile([4, 4, 2], (2, 2, 1))
     )

@@ -16,8 +16,8 @@ from appliance.sim import devices, rig, script
 def skin_of(share: float) -> selftest.CheckResult:
     """The check of the simulated skin on a board whose processor it takes by `share` once it
     streams, and wholly before."""
-    acts, source, fmt = script.named("skin", None, 1, spread=False)
-    built = devices.build(fmt, acts, rig.VirtualClock(), source)
+    acts, source, format = script.named("skin", None, 1, spread=False)
+    built = devices.build(format, acts, rig.VirtualClock(), source)
     results = selftest.check(
         built.wire(config.load(None)),
         lambda: bundle.load(bundle.DEFAULT),

@@ -46,7 +46,7 @@ def on_a_matrix(
         rate_hz=750.0,
     )
     wired.port.frames = lambda i: b"\xaa\x55" + bytes((k + i) % 97 for k in range(16))
-    monkeypatch.setattr(skins, "sensor", lambda settings, fmt, devices, tap: wired.sensor)
+    monkeypatch.setattr(skins, "sensor", lambda settings, format, devices, tap: wired.sensor)
     return rigged(simulated, capture=capture, **more), wired
 
 

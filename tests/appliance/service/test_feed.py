@@ -170,14 +170,14 @@ def test_without_a_new_frame_none_is_repeated(offered: Offered) -> None:
 def test_of_a_large_skin_fewer_frames_are_offered(tmp_path: Path) -> None:
     """Text of 10,000 counts a second at most: 32x32 taxels at 9.8 frames a second, whatever was
     asked for."""
-    fmt = SweepFormat(32, 32, 100.0, 200, "uint16")
-    offered = Offered(tmp_path / "feed.sock", fmt)
+    format = SweepFormat(32, 32, 100.0, 200, "uint16")
+    offered = Offered(tmp_path / "feed.sock", format)
     peer = offered.peer()
     assert peer.lines()[0]["frames_hz"] == pytest.approx(9.765625)
     peer.ask('{"frames": 20}')
     found = 0
     for _ in range(1000):
-        offered.feed.frames(frames(1, fmt))
+        offered.feed.frames(frames(1, format))
         offered.turns(step_s=0.01)
         found += kinds(peer.lines()).count("frame")
     assert found == pytest.approx(97.65625, abs=1)
@@ -312,13 +312,13 @@ def test_readers_that_never_read_hold_one_large_window(large: Offered) -> None:
 
 def test_a_window_that_is_too_large_is_counted(tmp_path: Path) -> None:
     """Over 640 kB: the reader is told of one line that it has lost."""
-    fmt = SweepFormat(32, 32, 100.0, 250, "uint16")
-    offered = Offered(tmp_path / "feed.sock", fmt)
+    format = SweepFormat(32, 32, 100.0, 250, "uint16")
+    offered = Offered(tmp_path / "feed.sock", format)
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     offered.turns(2)
     peer.lines()
-    offered.feed.sweep(cut(fmt), OK, {})
+    offered.feed.sweep(cut(format), OK, {})
     offered.turns(2)
     assert peer.lines() == [{"type": "lost", "lines": 1}]
     offered.feed.stopping()
@@ -326,12 +326,12 @@ def test_a_window_that_is_too_large_is_counted(tmp_path: Path) -> None:
 
 def test_counts_that_are_no_numbers_become_null(tmp_path: Path) -> None:
     """A float skin with a broken taxel: the line is JSON all the same."""
-    fmt = SweepFormat(1, 3, 100.0, 200, "float32", 3)
-    offered = Offered(tmp_path / "feed.sock", fmt)
+    format = SweepFormat(1, 3, 100.0, 200, "float32", 3)
+    offered = Offered(tmp_path / "feed.sock", format)
     peer = offered.peer()
     peer.ask('{"frames": 20}')
     offered.turns(5)
-    one = frames(1, fmt)
+    one = frames(1, format)
     one.taxels[0, 0, 1] = (np.nan, np.inf, 0.5)
     offered.feed.frames(one)
     offered.turns(10)

@@ -19,9 +19,9 @@ def skin(
     return np.rint(np.random.default_rng(seed).normal(level, noise, (n, *shape))).astype(np.uint16)
 
 
-def tracked(*parts: np.ndarray, fmt: SweepFormat = FORMAT, packet: int = 7) -> UnloadedTracker:
+def tracked(*parts: np.ndarray, format: SweepFormat = FORMAT, packet: int = 7) -> UnloadedTracker:
     """A tracker that has seen these frames, packet by packet."""
-    tracker = UnloadedTracker(fmt)
+    tracker = UnloadedTracker(format)
     frames = np.concatenate(parts)
     for at in range(0, len(frames), packet):
         tracker.put(frames[at : at + packet])
@@ -81,7 +81,7 @@ def test_broken_taxels_do_not_count():
     frames[:, 1, 1] *= np.linspace(0, 2, len(frames))
     assert UnloadedSkin.measured(frames).contact == pytest.approx(whole, rel=0.1)
     tracker = tracked(
-        frames, skin(800, 40).astype(np.float32), fmt=SweepFormat(4, 4, 100.0, 200, "float32")
+        frames, skin(800, 40).astype(np.float32), format=SweepFormat(4, 4, 100.0, 200, "float32")
     )
     assert tracker.certain
 
@@ -90,7 +90,7 @@ def test_several_axes_are_judged_by_the_normal_one():
     """Shear that moves without a load along the normal is no touch."""
     frames = skin(500, 3, 400, shape=(4, 4, 3))
     frames[200:, ..., :2] += 400
-    fmt = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
-    assert not tracked(frames, fmt=fmt).certain
+    format = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
+    assert not tracked(frames, format=format).certain
     frames[200:, ..., 2] += 400
-    assert tracked(frames, fmt=fmt).certain
+    assert tracked(frames, format=format).certain

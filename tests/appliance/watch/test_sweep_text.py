@@ -29,13 +29,13 @@ def plain(text: str) -> str:
     return re.sub(r"\033\[[0-9;]*m", "", text)
 
 
-def tone(hz: float, fmt: SweepFormat = skin.FORMAT) -> np.ndarray:
+def tone(hz: float, format: SweepFormat = skin.FORMAT) -> np.ndarray:
     """A window [T, R, C] or [T, R, C, A] in which all taxels swing, the louder the later."""
-    t = np.arange(fmt.window) / fmt.rate_hz
+    t = np.arange(format.window) / format.rate_hz
     wave = 100 + 40 * t / t[-1] * (1 + np.sin(2 * np.pi * hz * t))
     return np.broadcast_to(
-        wave.reshape(-1, *(1,) * len(fmt.shape)), (fmt.window, *fmt.shape)
-    ).astype(fmt.numpy_type)
+        wave.reshape(-1, *(1,) * len(format.shape)), (format.window, *format.shape)
+    ).astype(format.numpy_type)
 
 
 @pytest.mark.parametrize(("hz", "row"), [(10, 5), (100, 4), (340, 0)])
@@ -62,7 +62,7 @@ def test_the_signal_rises_where_the_load_does() -> None:
 
 @pytest.mark.parametrize("width", [80, 40, 12])
 @pytest.mark.parametrize(
-    "fmt",
+    "format",
     [
         skin.FORMAT,
         SweepFormat(3, 3, 100, 200, "float32", 3),
@@ -73,14 +73,16 @@ def test_the_signal_rises_where_the_load_does() -> None:
     ],
     ids=str,
 )
-def test_every_form_fits(fmt: SweepFormat, width: int) -> None:
+def test_every_form_fits(format: SweepFormat, width: int) -> None:
     """No line is wider than the terminal; where a rate is too low for a spectrogram the reason
     stands there."""
-    taxels = tone(3, fmt) if fmt.window > 1 else np.ones((1, *fmt.shape), fmt.numpy_type)
-    lines = picture(taxels, fmt.rate_hz, width, colours=True)
+    taxels = (
+        tone(3, format) if format.window > 1 else np.ones((1, *format.shape), format.numpy_type)
+    )
+    lines = picture(taxels, format.rate_hz, width, colours=True)
     assert max(len(plain(line)) for line in lines) <= max(width, NAME + 2)
     if width == 80:
-        assert ("no spectrogram" in "".join(lines)) == (fmt.rate_hz < 20 or fmt.window == 1)
+        assert ("no spectrogram" in "".join(lines)) == (format.rate_hz < 20 or format.window == 1)
 
 
 def test_a_silent_window_and_broken_counts_are_pictures_too() -> None:

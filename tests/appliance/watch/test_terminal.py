@@ -27,9 +27,9 @@ from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND
 
 
-def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list[dict[str, Any]]:
+def lines_of(folder: Path, format: SweepFormat = skin.FORMAT, **facts: str) -> list[dict[str, Any]]:
     """What a reader gets of a box that streams, answers twice and is swept again."""
-    offered = Offered(folder / "feed.sock", fmt, **facts)
+    offered = Offered(folder / "feed.sock", format, **facts)
     peer = offered.peer()
     peer.ask('{"frames": 20, "sweeps": true}')
     offered.turns(2)
@@ -37,10 +37,10 @@ def lines_of(folder: Path, fmt: SweepFormat = skin.FORMAT, **facts: str) -> list
         OK,
         replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), moved=""),
     ):
-        offered.feed.frames(frames(1, fmt, first=int(verdict.sweep) * 5))
+        offered.feed.frames(frames(1, format, first=int(verdict.sweep) * 5))
         offered.feed.answered(verdict)
         offered.turns(4)
-    offered.feed.sweep(cut(fmt), OK, {})
+    offered.feed.sweep(cut(format), OK, {})
     offered.turns(4)
     lines = peer.lines()
     for _ in range(20):  # a large window is sent in several turns, before what comes after it
@@ -89,7 +89,7 @@ def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(80, 24), (40, 12), (132, 50), (20, 8)])
 @pytest.mark.parametrize(
-    "fmt",
+    "format",
     [
         skin.FORMAT,
         SweepFormat(16, 16, 100, 200, "uint16"),
@@ -99,11 +99,11 @@ def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("colours", [True, False])
 def test_it_fits_any_terminal(
-    tmp_path: Path, size: tuple[int, int], fmt: SweepFormat, colours: bool
+    tmp_path: Path, size: tuple[int, int], format: SweepFormat, colours: bool
 ) -> None:
     """No line is wider, no picture higher; the state, the skin and the last verdict are in it where
     it is 80x24."""
-    state = state_of(lines_of(tmp_path, fmt, trial="7 of 20 sweeps", shadow="x" * 200))
+    state = state_of(lines_of(tmp_path, format, trial="7 of 20 sweeps", shadow="x" * 200))
     raw = picture(state, 5 * SECOND, *size, colours=colours)
     assert len(raw) <= size[1]
     assert max(len(plain(line)) for line in raw) <= size[0]

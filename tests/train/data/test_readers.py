@@ -386,7 +386,7 @@ def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
         ({"object": "cup"}, "2.npy: .*object = 'cup' is not of type int"),
         ({"frames": 7}, "2.npy: 7 frames of 2x3 int16 at 50 Hz, window 8; others have"),
         (
-            {"fmt": SweepFormat(2, 3, 100.0, 8, "int16")},
+            {"format": SweepFormat(2, 3, 100.0, 8, "int16")},
             "2.npy: 8 frames of 2x3 int16 at 100 Hz, window 8; others have 2x3",
         ),
     ],
@@ -493,17 +493,17 @@ def test_a_file_that_may_not_be_read_is_named(
 def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
     """Recordings by name whose unloaded skin read so much, None where it was not noted; what was
     pressed on it, [8, 2, 3]."""
-    fmt, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
+    format, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():
-        n = np.arange(fmt.window)
-        taxels = (pressed + (300 if level is None else level)).astype(fmt.numpy_type)
+        n = np.arange(format.window)
+        taxels = (pressed + (300 if level is None else level)).astype(format.numpy_type)
         sweep = Sweep(1, 0, 1, Status.OK, Frames(n, n, taxels), material=name[0])
         rest = level is not None and {
             "level": np.full((2, 3), level).tolist(),
             "noise": np.full((2, 3), 0.5).tolist(),
         }
-        save(folder / f"{name}.npy", sweep, fmt, {"unloaded": rest or None})
+        save(folder / f"{name}.npy", sweep, format, {"unloaded": rest or None})
     return pressed
 
 

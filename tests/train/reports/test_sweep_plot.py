@@ -33,17 +33,25 @@ ABOUT = {
 
 
 def sweep(
-    path: Path, fmt: SweepFormat, about: dict | None = None, seq: np.ndarray | None = None, **more
+    path: Path,
+    format: SweepFormat,
+    about: dict | None = None,
+    seq: np.ndarray | None = None,
+    **more,
 ) -> str:
     """A recording of noise, a second after its start edge; its last taxel is silent."""
-    seq = np.arange(fmt.window) if seq is None else seq
-    taxels = np.random.default_rng(0).integers(0, 99, (len(seq), *fmt.shape)).astype(fmt.numpy_type)
+    seq = np.arange(format.window) if seq is None else seq
+    taxels = (
+        np.random.default_rng(0)
+        .integers(0, 99, (len(seq), *format.shape))
+        .astype(format.numpy_type)
+    )
     taxels[:, -1, -1] = 0
-    t_ns = (1e9 + seq * fmt.period_ns).astype(np.int64)
+    t_ns = (1e9 + seq * format.period_ns).astype(np.int64)
     made = Sweep(
         7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more
     )
-    save(path, made, fmt, about or {})
+    save(path, made, format, about or {})
     return str(path)
 
 
@@ -60,8 +68,8 @@ def drawn(path: Path, *more, **also) -> str:
 @pytest.fixture
 def small(tmp_path: Path) -> str:
     """A picture of the paper's skin with all that a sidecar knows."""
-    fmt = SweepFormat(4, 4, 750.0, 1500, "uint8")
-    return drawn(tmp_path / "sweep-000017.npy", fmt, ABOUT, position="3", session="mon", lost=2)
+    format = SweepFormat(4, 4, 750.0, 1500, "uint8")
+    return drawn(tmp_path / "sweep-000017.npy", format, ABOUT, position="3", session="mon", lost=2)
 
 
 def test_the_picture_says_what_is_known(small: str):
@@ -120,8 +128,8 @@ def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
 def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
     """Well-formed, titled, drawn twice the same, in plain colours, its pixels in itself, no text
     beyond its edges."""
-    fmt = SweepFormat(12, 12, 50.0, 40, "float32")
-    for svg in (small, drawn(tmp_path / "big.npy", fmt)):
+    format = SweepFormat(12, 12, 50.0, 40, "float32")
+    for svg in (small, drawn(tmp_path / "big.npy", format)):
         root = ElementTree.fromstring(svg)
         assert root.find(f"{SVG}title").text == "one sweep: cork" + (
             ", position 3, session mon" if svg is small else ""
@@ -153,7 +161,7 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
             )
             assert -1 <= ends[0] < ends[1] + 1e-9 <= width + 1, node.text
             assert 0 < float(node.get("y")) <= height, node.text
-    assert drawn(tmp_path / "big.npy", fmt) == svg
+    assert drawn(tmp_path / "big.npy", format) == svg
 
 
 def test_every_peak_is_in_the_line():
@@ -172,10 +180,10 @@ def test_every_peak_is_in_the_line():
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of
     twice the bin's noise width."""
-    fmt = SweepFormat(1, 1, 750.0, 1500, "float32")
+    format = SweepFormat(1, 1, 750.0, 1500, "float32")
     tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
     axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
-    sweep_plot._spectrum(axes, tone, fmt)
+    sweep_plot._spectrum(axes, tone, format)
     hz, density = axes.lines[0].get_data()
     assert hz[0] == 1
     assert hz[-1] == 375
@@ -214,33 +222,33 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
 def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int]):
     """A line for each axis, the normal one dark; a larger skin is an image of all. A tare of
     another shape is refused."""
-    fmt = SweepFormat(*grid, 100.0, 100, "int16", 3)
-    shown = words(drawn(tmp_path / "a.npy", fmt, {"tare": np.ones(fmt.shape).tolist()}))
+    format = SweepFormat(*grid, 100.0, 100, "int16", 3)
+    shown = words(drawn(tmp_path / "a.npy", format, {"tare": np.ones(format.shape).tolist()}))
     small = max(grid) <= 8
     wanted = (
         "; 3 axes, the normal one dark" if small else "in each row its 2 taxels, of each its 3 axes"
     )
     assert wanted in shown
     assert f"{grid[0]}x{grid[1]}x3 int16 at 100 Hz, window 100" in shown
-    seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt))
+    seen = sweep_plot.load(sweep(tmp_path / "b.npy", format))
     figure = sweep_plot.Figure((5, 5))
     if small:
         sweep_plot._skin(figure, seen, seen.taxels.reshape(100, -1).astype(float))
         assert [len(axes.lines) for axes in figure.axes] == [3] * 6
         np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), seen.taxels[:, 0, 1, 2])
     with pytest.raises(FormatError, match=f"no {grid[0]} x {grid[1]} x 3 numbers"):
-        sweep_plot.load(sweep(tmp_path / "c.npy", fmt, {"tare": np.ones(grid).tolist()}))
+        sweep_plot.load(sweep(tmp_path / "c.npy", format, {"tare": np.ones(grid).tolist()}))
 
 
 @pytest.mark.parametrize("count", [0, 255])
 def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
     """Nothing moves: no frequency has power, no axis is without length."""
-    fmt = SweepFormat(2, 2, 100.0, 300, "uint8")
+    format = SweepFormat(2, 2, 100.0, 300, "uint8")
     still = np.full((300, 2, 2), count, np.uint8)
     save(
         tmp_path / "a.npy",
         Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)),
-        fmt,
+        format,
     )
     shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
     assert "no material" in shown
@@ -254,9 +262,9 @@ def test_missing_frames_are_marked(
 ):
     """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the
     longest run without one."""
-    fmt = SweepFormat(*grid, 100.0, 400, "uint8")
-    whole = drawn(tmp_path / "a.npy", fmt)
-    seen = sweep_plot.load(sweep(tmp_path / "b.npy", fmt, seq=np.r_[0:300, 350:400]))
+    format = SweepFormat(*grid, 100.0, 400, "uint8")
+    whole = drawn(tmp_path / "a.npy", format)
+    seen = sweep_plot.load(sweep(tmp_path / "b.npy", format, seq=np.r_[0:300, 350:400]))
     assert list(seen.gaps) == [299]
     axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
     seen.span(axes)
@@ -276,9 +284,9 @@ def test_missing_frames_are_marked(
 def test_texts_are_shown_as_they_are(tmp_path: Path):
     """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be
     shown is a �."""
-    fmt = SweepFormat(1, 1, 50.0, 9, "uint8")
-    assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", fmt, material="$a_b$ <&>"))
-    first = words(drawn(tmp_path / "a.npy", fmt, material="x" * 300)).split("\n")[0]
+    format = SweepFormat(1, 1, 50.0, 9, "uint8")
+    assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", format, material="$a_b$ <&>"))
+    first = words(drawn(tmp_path / "a.npy", format, material="x" * 300)).split("\n")[0]
     assert (len(first), first[-1]) == (80, "…")
     s = easy(2)
     object.__setattr__(s, "materials", ("a\x01b", "c", "d"))

@@ -39,11 +39,11 @@ class DepthwiseSeparable(Network):
     """DS-CNN over time; the taxels are the channels of its first convolution. Zero padding keeps
     sizes in the blocks."""
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
-        super().__init__(form, scale)
-        self.stride = max(form.window // STEPS, 1)
-        kernel = min(max(FIRST_TAPS, 2 * self.stride), form.window)
-        layers = [nn.Conv1d(form.channels, CHANNELS, kernel, self.stride)]
+    def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(format, scale)
+        self.stride = max(format.window // STEPS, 1)
+        kernel = min(max(FIRST_TAPS, 2 * self.stride), format.window)
+        layers = [nn.Conv1d(format.channels, CHANNELS, kernel, self.stride)]
         for _ in range(BLOCKS):
             layers.append(nn.Conv1d(CHANNELS, CHANNELS, TAPS, padding=TAPS // 2, groups=CHANNELS))
             layers.append(nn.Conv1d(CHANNELS, CHANNELS, 1))
@@ -67,7 +67,7 @@ class DepthwiseSeparable(Network):
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
         g = GraphBuilder()
-        x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        x = g("Mul", centred(g, self.format)[0], g.constant(self.scale))
         for conv, norm in self._convolutions():
             one = fuse_conv_bn_eval(conv.eval(), norm.eval())
             pads = [int(one.padding[0])] * 2
@@ -82,13 +82,13 @@ class DepthwiseSeparable(Network):
             x = g("Relu", x)
         mean = g("ReduceMean", x, axes=[2], keepdims=0)
         g("Gemm", mean, *layer_constants(g, self.head), transB=1, output="logits")
-        return g.model(self.form, "logits", self.head.out_features)
+        return g.model(self.format, "logits", self.head.out_features)
 
 
-def build(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> Network:
     """The network with random weights; each taxel's mean is subtracted, as in the compact
     network."""
-    return DepthwiseSeparable(form, classes, texture_scale(samples))
+    return DepthwiseSeparable(format, classes, texture_scale(samples))
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:

@@ -58,14 +58,14 @@ class SpectralNetwork(Network):
     centre: Tensor
     spread: Tensor
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
-        super().__init__(form, scale)
-        length = transform_length(form.window)
-        self.missing, self.hop, self.bins = max(length - form.window, 0), length // 2, length // 2
+    def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(format, scale)
+        length = transform_length(format.window)
+        self.missing, self.hop, self.bins = max(length - format.window, 0), length // 2, length // 2
         angle = 2 * np.pi * np.arange(1, self.bins + 1)[:, None] * np.arange(length) / length
         hann = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
         waves = np.concatenate([np.cos(angle), np.sin(angle)]) * hann / np.linalg.norm(hann)
-        size = form.channels * (self.bins + 3)
+        size = format.channels * (self.bins + 3)
         self.register_buffer("waves", torch.from_numpy(waves[:, None].astype(np.float32)))
         self.register_buffer("centre", torch.zeros(size))
         self.register_buffer("spread", torch.ones(size))
@@ -102,8 +102,8 @@ class SpectralNetwork(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]."""
-        g, taxels = GraphBuilder(), self.form.channels
-        x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        g, taxels = GraphBuilder(), self.format.channels
+        x = g("Mul", centred(g, self.format)[0], g.constant(self.scale))
         square = g("Mul", x, x)
         variance = g("Add", g("ReduceMean", square, axes=[2], keepdims=0), g.constant(FLOOR))
         root = g("Sqrt", variance)
@@ -111,11 +111,11 @@ class SpectralNetwork(Network):
         fourth = g("ReduceMean", g("Mul", square, square), axes=[2], keepdims=0)
         skewness = g("Div", third, g("Mul", variance, root))
         kurtosis = g("Sub", g("Div", fourth, g("Mul", variance, variance)), g.constant(3.0))
-        rows = g("Reshape", x, g.constant([taxels, 1, self.form.window], "int64"))
+        rows = g("Reshape", x, g.constant([taxels, 1, self.format.window], "int64"))
         parts = g(
             "Conv", rows, g.constant(self.waves.numpy()), strides=[self.hop], pads=[0, self.missing]
         )
-        frames = (self.form.window + self.missing - 2 * self.bins) // self.hop + 1
+        frames = (self.format.window + self.missing - 2 * self.bins) // self.hop + 1
         parts = g(
             "Reshape", g("Mul", parts, parts), g.constant([taxels, 2, self.bins, frames], "int64")
         )
@@ -132,13 +132,13 @@ class SpectralNetwork(Network):
         for layer in (self.first, self.second):
             x = g("Relu", g("Gemm", x, *layer_constants(g, layer), transB=1))
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
-        return g.model(self.form, "logits", self.head.out_features)
+        return g.model(self.format, "logits", self.head.out_features)
 
 
-def build(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> Network:
     """The network with random weights and the features of `samples` standardised; each taxel's mean
     is subtracted."""
-    network = SpectralNetwork(form, classes, texture_scale(samples))
+    network = SpectralNetwork(format, classes, texture_scale(samples))
     network.standardise(samples)
     return network
 

@@ -102,10 +102,10 @@ def separable(channels: int, taps: int, stride: int = 1, dilation: int = 1) -> n
 class Lite(Network):
     """LITE, in its multivariate form where there are several taxels."""
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
-        super().__init__(form, scale)
-        taxels, stride = form.channels, max(form.window // STEPS, 1)
-        self.steps = -(-form.window // stride)
+    def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(format, scale)
+        taxels, stride = format.channels, max(format.window // STEPS, 1)
+        self.steps = -(-format.window // stride)
         self.learnt = nn.ModuleList(separable(taxels, taps, stride) for taps in FIRST_TAPS)
         filters = [*map(rise_and_fall, DETECTORS), *map(peak, DETECTORS[1:])]
         self.detectors = nn.ModuleList(fixed(one, taxels, stride) for one in filters)
@@ -132,8 +132,8 @@ class Lite(Network):
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; batch norms are folded into the convolutions before
         them where they can be."""
-        g, frames = GraphBuilder(), self.form.window
-        sweep = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        g, frames = GraphBuilder(), self.format.window
+        sweep = g("Mul", centred(g, self.format)[0], g.constant(self.scale))
         parts = [g("Relu", _convolved(g, sweep, layer, frames)) for layer in self.learnt]
         for conv, norm in zip(self.detectors, self.norms, strict=True):
             found = g("Relu", _convolved(g, sweep, conv, frames))
@@ -143,7 +143,7 @@ class Lite(Network):
             x = g("Relu", _convolved(g, x, layer, self.steps))
         mean = g("ReduceMean", x, axes=[2], keepdims=0)
         g("Gemm", mean, *layer_constants(g, self.head), transB=1, output="logits")
-        return g.model(self.form, "logits", self.head.out_features)
+        return g.model(self.format, "logits", self.head.out_features)
 
 
 def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
@@ -187,10 +187,10 @@ def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
     return g("Add", g("Mul", x, g.constant(columns[0])), g.constant(columns[1]))
 
 
-def build(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> Network:
     """The network with random weights; each taxel's mean is subtracted, as in the compact
     network."""
-    return Lite(form, classes, texture_scale(samples))
+    return Lite(format, classes, texture_scale(samples))
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:

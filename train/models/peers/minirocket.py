@@ -80,7 +80,7 @@ def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
     return found
 
 
-def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:
+def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:
     """The fitted transform as a graph: `sweep` -> `features` float32 [1, F], each the share of
     frames above a bias.
 
@@ -90,11 +90,11 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
     window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
-    g, size, at = GraphBuilder(), form.channels, 0
+    g, size, at = GraphBuilder(), format.channels, 0
     chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
     x = g(
         "Cast",
-        g("Reshape", "sweep", g.constant([1, form.window, size], "int64")),
+        g("Reshape", "sweep", g.constant([1, format.window, size], "int64")),
         to=TensorProto.FLOAT,
     )
     x, parts = g("Transpose", x, perm=[0, 2, 1]), []
@@ -123,7 +123,7 @@ def transform(form: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelPro
             )
         parts.append(g("Flatten", g("Concat", *halves, axis=2)))
     g("Concat", *parts, axis=1, output="features")
-    return g.model(form, "features", len(biases))
+    return g.model(format, "features", len(biases))
 
 
 def _ridge(features: Array, labels: Array) -> tuple[Array, Array]:

@@ -97,14 +97,14 @@ class ImageNetwork(Network):
 
     def __init__(
         self,
-        form: SweepFormat,
+        format: SweepFormat,
         classes: int,
         scale: float,
         offset: float | None,
         layers: ImageLayers,
     ) -> None:
-        super().__init__(form, scale, offset)
-        self.layers, steps, taxels = layers, form.window, form.channels
+        super().__init__(format, scale, offset)
+        self.layers, steps, taxels = layers, format.window, format.channels
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
         for before, after, by in zip(
             (1, *layers.channels), layers.channels, layers.strides, strict=False
@@ -137,10 +137,10 @@ class ImageNetwork(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
-        g, form, classes = GraphBuilder(), self.form, self.head.out_features
-        steps, taxels, pool = form.window, form.channels, self.layers.pool
+        g, format, classes = GraphBuilder(), self.format, self.head.out_features
+        steps, taxels, pool = format.window, format.channels, self.layers.pool
         if self.offset is None:
-            x = g("Transpose", centred(g, form)[0], perm=[0, 2, 1])
+            x = g("Transpose", centred(g, format)[0], perm=[0, 2, 1])
         else:
             x = g("Sub", g("Cast", "sweep", to=TensorProto.FLOAT), g.constant(self.offset))
         x = g(
@@ -164,11 +164,11 @@ class ImageNetwork(Network):
             steps = ceil(steps / pool)
         x = g("Relu", g("Gemm", g("Flatten", x), *layer_constants(g, self.dense), transB=1))
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
-        return g.model(form, "logits", classes)
+        return g.model(format, "logits", classes)
 
 
 def build_paper_cnn(
-    form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
+    format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
 ) -> Network:
     """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`, since
     no scale is printed.
@@ -177,33 +177,35 @@ def build_paper_cnn(
     """
     mean = float(samples.mean(dtype=np.float64))
     scale = float(1 / max(samples.std(dtype=np.float64), 1e-6))
-    return ImageNetwork(form, classes, scale, mean, layers)
+    return ImageNetwork(format, classes, scale, mean, layers)
 
 
 def build_centred(
-    form: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
+    format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
 ) -> Network:
     """The paper's CNN behind a layer that subtracts each taxel's mean, as in the compact
     network."""
-    return ImageNetwork(form, classes, texture_scale(samples), None, layers)
+    return ImageNetwork(format, classes, texture_scale(samples), None, layers)
 
 
-def build_tactnet2(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> Network:
     """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted, as in the
     compact network.
 
     Dropout is off at test time, on the box and here: the mean field of the published Monte Carlo
     dropout, so that the same sweep always gets the same answer.
     """
-    return ImageNetwork(form, classes, texture_scale(samples), None, TACTNET2)
+    return ImageNetwork(format, classes, texture_scale(samples), None, TACTNET2)
 
 
-def random_paper_cnn(form: SweepFormat, classes: int, rng: np.random.Generator) -> onnx.ModelProto:
+def random_paper_cnn(
+    format: SweepFormat, classes: int, rng: np.random.Generator
+) -> onnx.ModelProto:
     """The graph of the paper's CNN with random weights: a reference model for time and memory, not
     for accuracy."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        return ImageNetwork(form, classes, 1 / 255, 0.0, PAPER).graph()
+        return ImageNetwork(format, classes, 1 / 255, 0.0, PAPER).graph()
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:

@@ -33,11 +33,11 @@ class Recurrent(Network):
     length.
     """
 
-    def __init__(self, form: SweepFormat, classes: int, scale: float) -> None:
-        super().__init__(form, scale)
-        self.stride = max(form.window // PATCHES, 1)
-        kernel = min(max(2 * self.stride, MIN_PATCH), form.window)
-        self.patches = nn.Conv1d(form.channels, STATE, kernel, self.stride)
+    def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
+        super().__init__(format, scale)
+        self.stride = max(format.window // PATCHES, 1)
+        kernel = min(max(2 * self.stride, MIN_PATCH), format.window)
+        self.patches = nn.Conv1d(format.channels, STATE, kernel, self.stride)
         self.unit = nn.GRU(STATE, STATE)
         self.head = nn.Linear(STATE, classes)
 
@@ -49,7 +49,7 @@ class Recurrent(Network):
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]."""
         g = GraphBuilder()
-        x = g("Mul", centred(g, self.form)[0], g.constant(self.scale))
+        x = g("Mul", centred(g, self.format)[0], g.constant(self.scale))
         x = g("Relu", g("Conv", x, *layer_constants(g, self.patches), strides=[self.stride]))
         gates = dict(self.unit.named_parameters())
         from_input, from_state = (
@@ -68,7 +68,7 @@ class Recurrent(Network):
         )
         x = g("Reshape", g("ReduceMean", x, axes=[0]), g.constant([1, STATE], "int64"))
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
-        return g.model(self.form, "logits", self.head.out_features)
+        return g.model(self.format, "logits", self.head.out_features)
 
 
 def _onnx_gate_order(gates: Tensor) -> Array:
@@ -77,10 +77,10 @@ def _onnx_gate_order(gates: Tensor) -> Array:
     return np.concatenate([update, reset, new])
 
 
-def build_recurrent(form: SweepFormat, classes: int, samples: Array) -> Network:
+def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> Network:
     """The network with random weights; each taxel's mean is subtracted, as in the compact
     network."""
-    return Recurrent(form, classes, texture_scale(samples))
+    return Recurrent(format, classes, texture_scale(samples))
 
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:

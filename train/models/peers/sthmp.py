@@ -55,16 +55,16 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
     Raises FormatError where a window is too short, or `sweeps` are too few.
     """
-    form = sweeps.require_materials().format
-    if form.window < MIN_WINDOW:
+    format = sweeps.require_materials().format
+    if format.window < MIN_WINDOW:
         raise FormatError(
-            f"a window of {form.window} frames is too short for st-hmp; record at least {MIN_WINDOW}"
+            f"a window of {format.window} frames is too short for st-hmp; record at least {MIN_WINDOW}"
         )
     rng = np.random.default_rng(seed)
     patches = sample_patches(inputs, rng)
     scale = 1 / max(float(np.sqrt(np.mean(patches**2))), 1e-6)
     atoms = learn_dictionary(patches * scale, rng)
-    return train_linear_head(pooled(form, atoms, scale), _svm, sweeps, inputs, seed)
+    return train_linear_head(pooled(format, atoms, scale), _svm, sweeps, inputs, seed)
 
 
 def sample_patches(inputs: Array, rng: np.random.Generator) -> Array:
@@ -114,28 +114,30 @@ def encode(patches: Array, atoms: Array) -> Array:
     """Codes float32 [n, ATOMS] of patches [n, frames, r, c], by the nodes that the box runs, in one
     long sweep."""
     n, frames, rows, cols = patches.shape
-    g, form = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
+    g, format = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
     g(
         "Reshape",
-        _codes(g, form, atoms, frames, 1.0),
+        _codes(g, format, atoms, frames, 1.0),
         g.constant([1, -1], "int64"),
         output="features",
     )
     sweep = patches.reshape(1, n * frames, rows, cols).astype(np.float32)
-    return run(g.model(form, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
+    return run(g.model(format, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
 
 
-def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
+def pooled(format: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
     """`sweep` -> `features` float32 [1, F]: the largest codes of each cell of the pyramids, above
     zero and below.
 
     atoms: [ATOMS, frames, r, c * A]. scale: from raw counts to the scale of the patches that the
     atoms were learned from.
     """
-    g, steps = GraphBuilder(), (form.window - atoms.shape[1]) // STEP + 1
-    rows, cols = form.rows - atoms.shape[2] + 1, form.cols - atoms.shape[3] // form.axes + 1
+    g, steps = GraphBuilder(), (format.window - atoms.shape[1]) // STEP + 1
+    rows, cols = format.rows - atoms.shape[2] + 1, format.cols - atoms.shape[3] // format.axes + 1
     codes = g(
-        "Reshape", _codes(g, form, atoms, STEP, scale), g.constant([steps, rows, cols, -1], "int64")
+        "Reshape",
+        _codes(g, format, atoms, STEP, scale),
+        g.constant([steps, rows, cols, -1], "int64"),
     )
     both = g("Concat", codes, g("Neg", codes), axis=3)
     times = [part for level in LEVELS if level <= steps for part in _parts(steps, level)]
@@ -152,7 +154,7 @@ def pooled(form: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
     above = g("Relu", g("Concat", *cells, axis=0))
     length = g("Sqrt", g("Add", g("ReduceSumSquare", above, axes=[1]), g.constant(CONTRAST)))
     g("Reshape", g("Div", above, length), g.constant([1, -1], "int64"), output="features")
-    return g.model(form, "features", len(cells) * 2 * len(atoms))
+    return g.model(format, "features", len(cells) * 2 * len(atoms))
 
 
 def _parts(n: int, parts: int) -> list[tuple[int, int]]:
@@ -166,7 +168,7 @@ def _cut(g: GraphBuilder, x: str, axis: int, part: tuple[int, int]) -> str:
     return g("Slice", x, *(g.constant([n], "int64") for n in (*part, axis)))
 
 
-def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: float) -> str:
+def _codes(g: GraphBuilder, format: SweepFormat, atoms: Array, step: int, scale: float) -> str:
     """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by
     time, row, column.
 
@@ -175,9 +177,9 @@ def _codes(g: GraphBuilder, form: SweepFormat, atoms: Array, step: int, scale: f
     other (batch OMP; Rubinstein et al. 2008).
     """
     flat = atoms.reshape(len(atoms), -1)
-    shape = [1, 1, form.window, form.rows, form.cols * form.axes]
+    shape = [1, 1, format.window, format.rows, format.cols * format.axes]
     x = g("Cast", g("Reshape", "sweep", g.constant(shape, "int64")), to=TensorProto.FLOAT)
-    products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, form.axes])
+    products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, format.axes])
     left = g(
         "Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0]
     )

@@ -115,11 +115,11 @@ class Architecture:
         """
         return self._planned_stages(window)[0].stride > 1
 
-    def cost(self, form: SweepFormat, classes: int) -> Cost:
+    def cost(self, format: SweepFormat, classes: int) -> Cost:
         """Of convolutions and head, as they are in the graph."""
         head = sum(self.channels) * classes
-        weights, macs, inputs = head + classes, head, form.channels
-        for stage, outputs in zip(self.stages(form.window), self.channels, strict=True):
+        weights, macs, inputs = head + classes, head, format.channels
+        for stage, outputs in zip(self.stages(format.window), self.channels, strict=True):
             taps = inputs * stage.kernel * outputs
             weights, macs, inputs = weights + taps + outputs, macs + taps * stage.steps, outputs
         return Cost(weights, macs)

@@ -84,23 +84,23 @@ class Bank:
         return cls(**{name: weights[f"bank.{name}"] for name in cls.__dataclass_fields__})
 
 
-def count(form: SweepFormat) -> int:
+def count(format: SweepFormat) -> int:
     """Filters of one kind for `form`."""
-    return int(np.clip(MOST_TAPS // (form.channels * TAPS), LEAST_FILTERS, MOST_FILTERS))
+    return int(np.clip(MOST_TAPS // (format.channels * TAPS), LEAST_FILTERS, MOST_FILTERS))
 
 
-def draw(form: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> Bank:
+def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> Bank:
     """`count` filters of each kind (free or not), the dilations that fit into the window in turn;
     their taps have unit norm.
 
     Raises FormatError where the window is shorter than a filter.
     """
-    fitting = [d for d in DILATIONS if (TAPS - 1) * d < form.window]
+    fitting = [d for d in DILATIONS if (TAPS - 1) * d < format.window]
     if not fitting:
         raise FormatError(
-            f"a window of {form.window} frames is too short for a filter; record at least {TAPS}"
+            f"a window of {format.window} frames is too short for a filter; record at least {TAPS}"
         )
-    taxels, filters = form.channels, count(form)
+    taxels, filters = format.channels, count(format)
     free = np.repeat(kinds, filters)
     across = np.rint(SPREAD * rng.standard_normal((len(free), taxels))).clip(-LARGEST, LARGEST)
     across[across == 0] = 1
@@ -155,12 +155,12 @@ def fitted(drawn: Bank, seen: Sequence[Array], rng: np.random.Generator) -> Bank
     )
 
 
-def stage(form: SweepFormat, dilation: int) -> Stage:
+def stage(format: SweepFormat, dilation: int) -> Stage:
     """The responses of a filter of this dilation."""
-    macs = count(form) * form.channels * TAPS * form.window
-    stride = max(1, form.window // MOST_STEPS, -(-macs // MOST_MACS))
+    macs = count(format) * format.channels * TAPS * format.window
+    stride = max(1, format.window // MOST_STEPS, -(-macs // MOST_MACS))
     reach = (TAPS - 1) * dilation + 1
-    return Stage(TAPS, stride, (form.window - reach) // stride + 1, reach, stride)
+    return Stage(TAPS, stride, (format.window - reach) // stride + 1, reach, stride)
 
 
 def groups(bank: Bank) -> list[tuple[Array, int]]:
@@ -181,7 +181,7 @@ class Pooling:
 
 
 def responses(
-    g: GraphBuilder, form: SweepFormat, bank: Bank, x: str, step: float, int8: bool
+    g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, int8: bool
 ) -> tuple[str, list[Stage]]:
     """Taxels [n, R * C, T] in units of `step` -> responses [n, steps, filters], with the Stage of
     each of `groups`.
@@ -189,7 +189,7 @@ def responses(
     Long filters give fewer responses than short ones; zeros behind the window give them as many,
     which mean nothing. In int8 a response is a byte, 0 being MIDDLE and 1 the largest.
     """
-    found, stages = [], [stage(form, dilation) for _, dilation in groups(bank)]
+    found, stages = [], [stage(format, dilation) for _, dilation in groups(bank)]
     shortest = min(shape.reach for shape in stages)
     for (numbers, dilation), shape in zip(groups(bank), stages, strict=True):
         taps, behind = _taps(g, bank.take(numbers), step, int8), [0, shape.reach - shortest]
@@ -217,12 +217,12 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
 
 
 def pooled(
-    g: GraphBuilder, form: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
+    g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
 ) -> list[str]:
     """Taxels as for `responses` -> log mean magnitudes [1, 1 or TENTHS, F], and where shares are
     wanted, those above the thresholds in the same shape."""
-    y, stages = responses(g, form, bank, x, step, how.int8)
-    counts = np.array([nodes.known_steps(shape, form.window, how.tenths) for shape in stages]).T
+    y, stages = responses(g, format, bank, x, step, how.int8)
+    counts = np.array([nodes.known_steps(shape, format.window, how.tenths) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
 
     def mean(z: str) -> str:

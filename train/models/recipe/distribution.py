@@ -94,7 +94,7 @@ def _looked(window: int) -> Stage:
 
 def pooled(
     g: GraphBuilder,
-    form: SweepFormat,
+    format: SweepFormat,
     some: Levels,
     x: str,
     step: float,
@@ -104,16 +104,16 @@ def pooled(
     """Taxels [n, R * C, T], which are scaled counts once they are multiplied by `step`, n being 1
     or TENTHS -> shares [1, 1 or TENTHS, len(some)]: of each signal, taxel and level. int8: whether
     frames are counted in integers."""
-    if len(some.taxels) < form.channels:
+    if len(some.taxels) < format.channels:
         x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
-    looked, taxels = _looked(form.window), len(some.taxels)
-    counts = nodes.known_steps(looked, form.window, tenths)
+    looked, taxels = _looked(format.window), len(some.taxels)
+    counts = nodes.known_steps(looked, format.window, tenths)
     total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=tenths)
     older, newer = (
         g(
             "Slice",
             x,
-            *(g.constant([n], "int64") for n in (at, form.window - 1 + at, 2, looked.hop)),
+            *(g.constant([n], "int64") for n in (at, format.window - 1 + at, 2, looked.hop)),
         )
         for at in (0, 1)
     )

@@ -92,19 +92,22 @@ def fit_on(
 ) -> Fit:
     """Train on `train`; `held` gives temperature and validation. by: the group that separates the
     two, for the record. unfinished: see training.learn."""
-    form, bands = train.format, spectrum.count(train.format)
+    format, bands = train.format, spectrum.count(train.format)
     if not (architecture.channels or bands):
         raise FormatError(
-            f"a window of {form.window} frames is too short for a spectrum; take another size"
+            f"a window of {format.window} frames is too short for a spectrum; take another size"
         )
-    augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(form.window))
+    augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(format.window))
     recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(seed)
-        model, cost = Compact(form, len(train.materials), scale, architecture=architecture), Cost()
+        model, cost = (
+            Compact(format, len(train.materials), scale, architecture=architecture),
+            Cost(),
+        )
         if architecture.channels:
             with torch.enable_grad():
-                change = augmenter(form, augmentation)
+                change = augmenter(format, augmentation)
                 model, cost = learn(
                     model, train, recipe, seed, log, augment=change, unfinished=unfinished
                 )
@@ -162,7 +165,7 @@ def _head_inputs(
     """What the heads see of the training sweeps with their copies, and of those held out: (float,
     int8)."""
     trunk = graph.trunk_graph(
-        model.form,
+        model.format,
         model.scale,
         model.weights(),
         model.architecture,
@@ -191,7 +194,7 @@ def _select_depth(
     much.
     """
     convolved, total = sum(model.architecture.channels), inputs[1][0].shape[1]
-    bands = model.architecture.spectrum * spectrum.count(model.form)
+    bands = model.architecture.spectrum * spectrum.count(model.format)
     candidates = []
     depths = range(min(model.architecture.fewest, len(model.convs)), len(model.convs) + 1)
     for depth, with_bands in product(depths, (True, False) if bands else (False,)):
@@ -222,10 +225,10 @@ def _select_depth(
     return model, {k: v.numpy() for k, v in model.state_dict().items()} | head_weights
 
 
-def augmenter(form: SweepFormat, augmentation: Augmentation) -> Augment:
+def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
     """`augment` for sweeps of `form`, as the training loop calls it: in PyTorch, seeded by its
     generator."""
-    rows = form.rows if form.cols > 1 else 1
+    rows = format.rows if format.cols > 1 else 1
 
     def change(x: Tensor, rng: Generator) -> Tensor:
         seed = int(torch.randint(2**63 - 1, (), generator=rng))

@@ -77,8 +77,8 @@ class Fit:
         from train.models.recipe.network import Compact
 
         with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and overwritten
-            form, classes = self.train.format, len(self.train.materials)
-            model = Compact(form, classes, self.scale, False, self.keep_means, self.architecture)
+            format, classes = self.train.format, len(self.train.materials)
+            model = Compact(format, classes, self.scale, False, self.keep_means, self.architecture)
         state = {
             k: torch.from_numpy(v) for k, v in self.weights.items() if not k.startswith("int8.")
         }
@@ -88,9 +88,9 @@ class Fit:
     def trunk(self, int8: bool = True, tenths: bool = False) -> onnx.ModelProto:
         """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see
         graph.trunk_graph."""
-        ranges, form = self.ranges if int8 else None, self.train.format
+        ranges, format = self.ranges if int8 else None, self.train.format
         return graph.trunk_graph(
-            form, self.scale, self.weights, self.architecture, ranges, tenths, self.keep_means
+            format, self.scale, self.weights, self.architecture, ranges, tenths, self.keep_means
         )
 
     def in_float(self) -> Fit:

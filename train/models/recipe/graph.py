@@ -61,7 +61,7 @@ def level_frames(window: int, architecture: Architecture) -> int:
 
 
 def trunk_graph(
-    form: SweepFormat,
+    format: SweepFormat,
     scale: float,
     weights: Mapping[str, Array],
     architecture: Architecture,
@@ -79,21 +79,21 @@ def trunk_graph(
     the last features, in float.
     """
     g, parts = GraphBuilder(), []
-    raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
-    attenuation = _attenuation(g, raw, form)
+    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
+    attenuation = _attenuation(g, raw, format)
     own = (
-        ranges if form.dtype == "uint8" else None
+        ranges if format.dtype == "uint8" else None
     )  # a byte does not hold wider counts, see decision 11
     prepared = cache(
-        lambda some: _prepared(g, form, scale, architecture, raw, attenuation, some, tenths)
+        lambda some: _prepared(g, format, scale, architecture, raw, attenuation, some, tenths)
     )
     if architecture.channels:
-        parts.append(_log_means(g, form, architecture, weights, prepared(ranges), ranges, tenths))
+        parts.append(_log_means(g, format, architecture, weights, prepared(ranges), ranges, tenths))
     if architecture.pools:
-        rowwise = tenths and not architecture.zero_sum(form.window)
+        rowwise = tenths and not architecture.zero_sum(format.window)
         asked = bank.Pooling(own is not None, architecture.pools > 1, tenths, rowwise)
         parts += bank.pooled(
-            g, form, bank.Bank.of(weights), prepared(own).x, prepared(own).step, asked
+            g, format, bank.Bank.of(weights), prepared(own).x, prepared(own).step, asked
         )
     if architecture.distribution:
         taxels = prepared(own)
@@ -105,27 +105,27 @@ def trunk_graph(
             else taxels.x
         )
         some = distribution.Levels.of(weights)
-        parts.append(distribution.pooled(g, form, some, x, taxels.step, own is not None, tenths))
+        parts.append(distribution.pooled(g, format, some, x, taxels.step, own is not None, tenths))
     if keep_means:
-        counts = nodes.known_steps(nodes.frames(form.window), form.window, tenths)
+        counts = nodes.known_steps(nodes.frames(format.window), format.window, tenths)
         parts.append(
-            g("Mul", _levels(g, g("Cast", raw, to=FLOAT), form, counts), g.constant(scale))
+            g("Mul", _levels(g, g("Cast", raw, to=FLOAT), format, counts), g.constant(scale))
         )
     if architecture.spectrum:
         parts.append(
-            spectrum.nodes(g, raw, attenuation, form, scale, architecture.mains_hz, tenths)
+            spectrum.nodes(g, raw, attenuation, format, scale, architecture.mains_hz, tenths)
         )
-    size = max(part.stop for part in layout(form, weights, architecture, keep_means).values())
+    size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
     features = nodes.side_by_side(g, parts)
     shape = [1, TENTHS, size] if tenths else [1, size]
     output = g(
         "Reshape", features, g.constant(shape, "int64"), output="tenths" if tenths else "features"
     )
-    return g.model(form, output, *shape[1:])
+    return g.model(format, output, *shape[1:])
 
 
 def layout(
-    form: SweepFormat,
+    format: SweepFormat,
     weights: Mapping[str, Array],
     architecture: Architecture,
     keep_means: bool = False,
@@ -138,8 +138,8 @@ def layout(
         "sizes": filters,
         "shares": filters * (architecture.pools > 1),
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
-        "means": keep_means * form.channels,
-        "bands": architecture.spectrum * spectrum.count(form),
+        "means": keep_means * format.channels,
+        "bands": architecture.spectrum * spectrum.count(format),
     }
     ends = np.cumsum(list(counts.values())).tolist()
     return {
@@ -149,7 +149,7 @@ def layout(
 
 def _log_means(
     g: GraphBuilder,
-    form: SweepFormat,
+    format: SweepFormat,
     architecture: Architecture,
     weights: Mapping[str, Array],
     taxels: Prepared,
@@ -157,9 +157,9 @@ def _log_means(
     tenths: bool,
 ) -> str:
     """The stages: log mean responses [1, 1 or TENTHS, sum of channels]."""
-    zero_sum, sums, factors = architecture.zero_sum(form.window), [], []
+    zero_sum, sums, factors = architecture.zero_sum(format.window), [], []
     rowwise, x, step = tenths and not zero_sum, taxels.x, taxels.step
-    stages, channels = architecture.stages(form.window), architecture.channels
+    stages, channels = architecture.stages(format.window), architecture.channels
     for i, (stage, size) in enumerate(zip(stages, channels, strict=True)):
         w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
         if ranges is None:
@@ -180,7 +180,7 @@ def _log_means(
                 i < len(channels) - 1
             ):  # after the last stage nothing would use it, and onnxruntime would still run it
                 x = nodes.counts_of(g, response, step)
-        counts = nodes.known_steps(stage, form.window, tenths)
+        counts = nodes.known_steps(stage, format.window, tenths)
         over_time = g("Transpose", response, perm=[0, 2, 1])
         sums.append(nodes.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise))
         factors.append(nodes.mean_factors(g, step, counts, size, rowwise))
@@ -192,7 +192,7 @@ def _log_means(
 
 def _prepared(
     g: GraphBuilder,
-    form: SweepFormat,
+    format: SweepFormat,
     scale: float,
     architecture: Architecture,
     raw: str,
@@ -207,18 +207,18 @@ def _prepared(
     that is the mean of the whole window, and tenths are wanted, each tenth has a level and a row of
     its own: [TENTHS, R * C, T].
     """
-    zero_sum = architecture.zero_sum(form.window)
-    if form.dtype == "uint8" and zero_sum and ranges:
-        return _rounded(g, _attenuated_bytes(g, raw, attenuation, form, scale), scale, 0)
+    zero_sum = architecture.zero_sum(format.window)
+    if format.dtype == "uint8" and zero_sum and ranges:
+        return _rounded(g, _attenuated_bytes(g, raw, attenuation, format, scale), scale, 0)
     x = g("Cast", raw, to=FLOAT)
-    if form.dtype == "uint8" and zero_sum:
+    if format.dtype == "uint8" and zero_sum:
         return Prepared(g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale)
     rowwise = tenths and not zero_sum
-    frames = [level_frames(form.window, architecture)]
+    frames = [level_frames(format.window, architecture)]
     counts = (
-        nodes.known_steps(nodes.frames(form.window), form.window, tenths) if rowwise else frames
+        nodes.known_steps(nodes.frames(format.window), format.window, tenths) if rowwise else frames
     )
-    x = g("Sub", x, _levels(g, x, form, counts, rowwise))
+    x = g("Sub", x, _levels(g, x, format, counts, rowwise))
     x = g("Mul", x, g("Mul", attenuation, g.constant(scale)))
     if ranges is None:
         return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
@@ -230,17 +230,17 @@ def _rounded(g: GraphBuilder, rounded: str, step: float, zero: int) -> Prepared:
     return Prepared(nodes.channels_first(g, rounded, step, zero), step, rounded, zero)
 
 
-def _attenuation(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
+def _attenuation(g: GraphBuilder, raw: str, format: SweepFormat) -> str:
     """Raw counts [1, T, R * C] -> the factor of each taxel [1, 1, R * C]; see
     architectures.NoiseLimit."""
-    step, ranked = NOISE_LIMIT.step(form.window), NOISE_LIMIT.rank(form.channels) + 1
+    step, ranked = NOISE_LIMIT.step(format.window), NOISE_LIMIT.rank(format.channels) + 1
     older, newer = (
         g(
             "Cast",
             g(
                 "Slice",
                 raw,
-                *(g.constant([n], "int64") for n in (at, form.window - 1 + at, 1, step)),
+                *(g.constant([n], "int64") for n in (at, format.window - 1 + at, 1, step)),
             ),
             to=FLOAT,
         )
@@ -260,39 +260,39 @@ def _attenuation(g: GraphBuilder, raw: str, form: SweepFormat) -> str:
 
 
 def _attenuated_bytes(
-    g: GraphBuilder, raw: str, attenuation: str, form: SweepFormat, scale: float
+    g: GraphBuilder, raw: str, attenuation: str, format: SweepFormat, scale: float
 ) -> str:
     """Bytes [1, T, R * C] times `attenuation` [1, 1, R * C], as bytes; exact where that is 1."""
     quantized = nodes.quantized(g, attenuation, 1 / 255)
-    expanded = g("Expand", quantized, g.constant([1, form.window, form.channels], "int64"))
+    expanded = g("Expand", quantized, g.constant([1, format.window, format.channels], "int64"))
     product = g("Mul", nodes.counts_of(g, raw, scale), nodes.counts_of(g, expanded, 1 / 255))
     return nodes.quantized(g, product, scale)
 
 
 def _levels(
-    g: GraphBuilder, x: str, form: SweepFormat, counts: list[int], rowwise: bool = False
+    g: GraphBuilder, x: str, format: SweepFormat, counts: list[int], rowwise: bool = False
 ) -> str:
     """Raw counts [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C] or,
     rowwise, with a row each."""
-    taxels = form.channels
-    sums = nodes.sums(g, x, form.window, counts, rowwise=rowwise)
+    taxels = format.channels
+    sums = nodes.sums(g, x, format.window, counts, rowwise=rowwise)
     return g("Mul", sums, nodes.mean_factors(g, 1.0, counts, taxels, rowwise))
 
 
 def bank_responses(
-    form: SweepFormat, scale: float, architecture: Architecture, filters: bank.Bank
+    format: SweepFormat, scale: float, architecture: Architecture, filters: bank.Bank
 ) -> Iterator[tuple[Array, onnx.ModelProto]]:
     """For each of bank.groups the numbers of its filters and the float model that gives their
     responses, float32 [1, steps, filters]."""
     for numbers, _ in bank.groups(filters):
         g = GraphBuilder()
-        raw = g("Reshape", "sweep", g.constant([1, form.window, form.channels], "int64"))
+        raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
         taxels = _prepared(
-            g, form, scale, architecture, raw, _attenuation(g, raw, form), None, False
+            g, format, scale, architecture, raw, _attenuation(g, raw, format), None, False
         )
-        y, (stage,) = bank.responses(g, form, filters.take(numbers), taxels.x, taxels.step, False)
+        y, (stage,) = bank.responses(g, format, filters.take(numbers), taxels.x, taxels.step, False)
         g("Identity", y, output="responses")
-        yield numbers, g.model(form, "responses", stage.steps, len(numbers))
+        yield numbers, g.model(format, "responses", stage.steps, len(numbers))
 
 
 def count_range(samples: Array, architecture: Architecture) -> float:

@@ -64,14 +64,14 @@ def limit_noise(x: Tensor) -> Tensor:
     return torch.where((noise > limit) & (limit > 0), x * (limit / noise), x)
 
 
-def band_powers(x: Tensor, form: SweepFormat, mains_hz: float) -> Tensor:
+def band_powers(x: Tensor, format: SweepFormat, mains_hz: float) -> Tensor:
     """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis
     first."""
-    length = form.window // spectrum.SEGMENTS
+    length = format.window // spectrum.SEGMENTS
     waves, averaging = (
-        torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(form, mains_hz))
+        torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(format, mains_hz))
     )
-    mean = x.unflatten(1, (-1, form.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
+    mean = x.unflatten(1, (-1, format.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
     cut = mean.unflatten(2, (spectrum.SEGMENTS, length))
     return torch.log(((cut @ waves).square() @ averaging).mean(2) + spectrum.QUIET).flatten(1)
 
@@ -89,25 +89,28 @@ class Compact(Network):
 
     def __init__(
         self,
-        form: SweepFormat,
+        format: SweepFormat,
         classes: int,
         scale: float,
         norm: bool = True,
         keep_means: bool = False,
         architecture: Architecture = DEFAULT,
     ) -> None:
-        super().__init__(form, scale)
+        super().__init__(format, scale)
         self.keep_means, self.architecture = keep_means, architecture
-        stages, inputs = architecture.stages(form.window), (form.channels, *architecture.channels)
+        stages, inputs = (
+            architecture.stages(format.window),
+            (format.channels, *architecture.channels),
+        )
         self.convs = nn.ModuleList(
             nn.Conv1d(before, after, stage.kernel, stage.stride)
             for before, after, stage in zip(inputs, architecture.channels, stages, strict=False)
         )
-        if architecture.channels and architecture.zero_sum(form.window):
+        if architecture.channels and architecture.zero_sum(format.window):
             first = stages[0]
-            periods = first.kernel * architecture.mains_hz / form.rate_hz
+            periods = first.kernel * architecture.mains_hz / format.rate_hz
             mains = (
-                architecture.mains_hz / form.rate_hz
+                architecture.mains_hz / format.rate_hz
                 if norm and 1 <= periods <= first.kernel / 4
                 else 0.0
             )
@@ -115,7 +118,7 @@ class Compact(Network):
         self.norms = nn.ModuleList(
             nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels
         )
-        bands = architecture.spectrum * spectrum.count(form)
+        bands = architecture.spectrum * spectrum.count(format)
         self.head = nn.Linear(sum(architecture.channels) + keep_means * inputs[0] + bands, classes)
 
     def responses(self, prepared: Tensor) -> list[Tensor]:
@@ -141,13 +144,15 @@ class Compact(Network):
         if self.keep_means:
             parts.append(counts.flatten(2).float().mean(1) * self.scale)
         if self.architecture.spectrum:
-            parts.append(band_powers(limit_noise(prepared), self.form, self.architecture.mains_hz))
+            parts.append(
+                band_powers(limit_noise(prepared), self.format, self.architecture.mains_hz)
+            )
         return torch.cat(parts, 1)
 
     def fused(self) -> Compact:
         """The same network for inference, its batch norms folded into the convolutions."""
         plain = Compact(
-            self.form,
+            self.format,
             self.head.out_features,
             self.scale,
             norm=False,
@@ -168,7 +173,7 @@ class Compact(Network):
         not fitted yet."""
         architecture = self.architecture.cut(depth, spectrum)
         less = Compact(
-            self.form, self.head.out_features, self.scale, False, self.keep_means, architecture
+            self.format, self.head.out_features, self.scale, False, self.keep_means, architecture
         )
         less.convs.load_state_dict(self.convs[:depth].state_dict())
         return less.eval()
@@ -192,7 +197,7 @@ class Compact(Network):
         """`sweep` -> `logits` float32 [1, K]; of a fused network."""
         weights = self.weights()
         trunk = trunk_graph(
-            self.form, self.scale, weights, self.architecture, keep_means=self.keep_means
+            self.format, self.scale, weights, self.architecture, keep_means=self.keep_means
         )
         return with_head(trunk, weights["head.weight"], weights["head.bias"])
 
@@ -201,7 +206,7 @@ class Compact(Network):
         """The ranges for int8, found on some of the training sweeps [N, T, R, C]; of a fused
         network."""
         some = calibration_sweeps(samples)
-        window = level_frames(self.form.window, self.architecture)
+        window = level_frames(self.format.window, self.architecture)
         level = some[:, :window].mean(axis=1, keepdims=True, dtype=np.float64)
         values: list[list[Array]] = [[np.abs(some - level).ravel()], *([] for _ in self.convs)]
         for counts in float_batches(some, batches(len(some), 32)):

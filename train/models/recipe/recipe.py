@@ -164,7 +164,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     Raises FormatError where the window is shorter than a filter, or every taxel of every sweep is
     constant.
     """
-    form, rng = sweeps.format, np.random.default_rng(seed)
+    format, rng = sweeps.format, np.random.default_rng(seed)
     some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
     if not np.ptp(sweeps.samples, axis=1).any():
         raise FormatError(
@@ -172,12 +172,12 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         )
     scale = texture_scale(sweeps.samples)
     architecture = replace(
-        FIXED, spectrum=spectrum.count(form) > 0, pools=2, distribution=True, mains_hz=mains_hz
+        FIXED, spectrum=spectrum.count(format) > 0, pools=2, distribution=True, mains_hz=mains_hz
     )
-    kinds = (False,) if architecture.zero_sum(form.window) else (False, True)
-    drawn = bank.draw(form, rng, kinds)
+    kinds = (False,) if architecture.zero_sum(format.window) else (False, True)
+    drawn = bank.draw(format, rng, kinds)
     seen: list[Array] = [np.empty(0)] * len(drawn)
-    for numbers, model in graph.bank_responses(form, scale, architecture, drawn):
+    for numbers, model in graph.bank_responses(format, scale, architecture, drawn):
         for number, values in zip(numbers, run(model, some).swapaxes(0, 2), strict=True):
             seen[number] = values.ravel()
     ranges = graph.Ranges(graph.count_range(some, architecture), ())

@@ -33,18 +33,18 @@ MIN_SEGMENT = 4
 """Frames of the shortest tenth that has a spectrum."""
 
 
-def count(form: SweepFormat) -> int:
+def count(format: SweepFormat) -> int:
     """How many bands of all axes there are; 0 where a tenth of the window has fewer frames than
     MIN_SEGMENT."""
-    length = form.window // SEGMENTS
-    return form.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
+    length = format.window // SEGMENTS
+    return format.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
 
 
 def nodes(
     g: GraphBuilder,
     raw: str,
     attenuation: str,
-    form: SweepFormat,
+    format: SweepFormat,
     scale: float,
     mains_hz: float,
     tenths: bool,
@@ -55,13 +55,15 @@ def nodes(
     One row for the whole window; with `tenths` one for each of the first tenth, the first two
     tenths, and so on.
     """
-    length, axes, taxels = form.window // SEGMENTS, form.axes, form.rows * form.cols
+    length, axes, taxels = format.window // SEGMENTS, format.axes, format.rows * format.cols
     mean = scale / taxels * (np.tile(np.eye(axes), (taxels, 1)) if axes > 1 else 1)  # [M, A]
     share = g(
-        "Mul", g("Reshape", attenuation, g.constant([form.channels, 1], "int64")), g.constant(mean)
+        "Mul",
+        g("Reshape", attenuation, g.constant([format.channels, 1], "int64")),
+        g.constant(mean),
     )
     x = g("MatMul", g("Cast", raw, to=TensorProto.FLOAT), share)
-    if form.window % SEGMENTS:
+    if format.window % SEGMENTS:
         x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * SEGMENTS, 1)))
     if axes > 1:
         x = g(
@@ -70,10 +72,10 @@ def nodes(
             perm=[0, 2, 1],
         )
     x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
-    x = g("MatMul", x, _wave_nodes(g, length, mains(form, mains_hz)))
+    x = g("MatMul", x, _wave_nodes(g, length, mains(format, mains_hz)))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
-        power = g("Reshape", power, g.constant([SEGMENTS, count(form)], "int64"))
+        power = g("Reshape", power, g.constant([SEGMENTS, count(format)], "int64"))
     if tenths:
         power = g(
             "MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power
@@ -81,7 +83,7 @@ def nodes(
     else:
         power = g("ReduceMean", power, axes=[0])
     power = g("Log", g("Add", power, g.constant(QUIET)))
-    return g("Reshape", power, g.constant([1, SEGMENTS if tenths else 1, count(form)], "int64"))
+    return g("Reshape", power, g.constant([1, SEGMENTS if tenths else 1, count(format)], "int64"))
 
 
 def _edges(length: int) -> Array:
@@ -94,11 +96,11 @@ def _edges(length: int) -> Array:
     return np.unique(np.rint(np.geomspace(2, length + 1, BANDS + 1)).astype(int))
 
 
-def mains(form: SweepFormat, mains_hz: float) -> float:
+def mains(format: SweepFormat, mains_hz: float) -> float:
     """Periods of mains of this frequency per frame; 0 where a segment holds less than two, or the
     hum is too fast to be told apart."""
-    periods = mains_hz / form.rate_hz
-    return periods if periods * (form.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
+    periods = mains_hz / format.rate_hz
+    return periods if periods * (format.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
 
 
 def _unwanted(length: int, mains: float) -> Array:

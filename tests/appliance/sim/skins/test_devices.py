@@ -46,11 +46,11 @@ def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
     profile = skins.profile(settings(name))
     acts = islice(script.tubes(SEED, seen=sweeps.view(name, profile.format), only="wood"), SWEEPS)
     for path, act in zip(sorted(tmp_path.glob("*.npy")), acts, strict=True):
-        sweep, fmt = types.load(path)
-        assert fmt == profile.format
+        sweep, format = types.load(path)
+        assert format == profile.format
         assert (sweep.status, sweep.lost) == (Status.OK, 0)
-        begin = (act.start + act.stop - fmt.window) / 2
-        felt = [act.frames[int(begin + more) :][: fmt.window].astype(float) for more in (0, 0.5)]
+        begin = (act.start + act.stop - format.window) / 2
+        felt = [act.frames[int(begin + more) :][: format.window].astype(float) for more in (0, 0.5)]
         rounding = 0.006 if name == "reskin" else 0.0  # two digits after the point
         assert min(abs(sweep.frames.taxels - window).max() for window in felt) <= rounding
 
@@ -97,16 +97,18 @@ def test_demo_without_a_bundle_for_the_skin(capsys: pytest.CaptureFixture[str]) 
 
 def test_replayed_set_through_the_bytes_of_a_skin(tmp_path: Path) -> None:
     """`--sim replay:SET --skin NAME` plays a set of that skin over its line."""
-    fmt = skins.profile(settings("flexitac")).format
+    format = skins.profile(settings("flexitac")).format
     samples = (
-        np.random.default_rng(1).integers(0, 200, (2, fmt.window, *fmt.shape)).astype(np.uint8)
+        np.random.default_rng(1)
+        .integers(0, 200, (2, format.window, *format.shape))
+        .astype(np.uint8)
     )
     np.savez(
         tmp_path / "s.npz",
         samples=samples,
         labels=[0, 1],
         materials=["a", "b"],
-        rate_hz=fmt.rate_hz,
+        rate_hz=format.rate_hz,
     )
     arguments = ["--sim", f"replay:{tmp_path / 's.npz'}", "--skin", "flexitac", "--virtual"]
     assert main(["record", *arguments, "--out", str(tmp_path / "kept")]) == 0

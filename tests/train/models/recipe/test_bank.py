@@ -18,7 +18,7 @@ from train.models.recipe.recipe import FIXED
 from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
 
-FORMS = [
+FORMATS = [
     SweepFormat(2, 2, 100.0, 64, "uint8"),
     SweepFormat(3, 3, 50.0, 40, "int16"),
     SweepFormat(1, 1, 10.0, 16, "uint16"),
@@ -26,58 +26,60 @@ FORMS = [
     SweepFormat(4, 2, 750.0, 600, "float32"),
     SweepFormat(2, 2, 750.0, 600, "int16", 3),
 ]
-forms = pytest.mark.parametrize("form", FORMS, ids=str)
+forms = pytest.mark.parametrize("format", FORMATS, ids=str)
 BANK = replace(FIXED, pools=2)
 
 
-def counts(form: SweepFormat, n: int = 3) -> np.ndarray:
+def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
     """Random walks [n, T, R, C] of raw counts."""
-    walk = np.random.default_rng(7).integers(-3, 4, (n, form.window, *form.shape)).cumsum(axis=1)
+    walk = (
+        np.random.default_rng(7).integers(-3, 4, (n, format.window, *format.shape)).cumsum(axis=1)
+    )
     return (
-        1000 * (form.dtype != "uint8")
+        1000 * (format.dtype != "uint8")
         + np.clip(100 + walk - walk.mean(axis=1, keepdims=True).astype(int), 0, 255)
-    ).astype(form.dtype)
+    ).astype(format.dtype)
 
 
-def small(form: SweepFormat, architecture: Architecture = BANK) -> Bank:
+def small(format: SweepFormat, architecture: Architecture = BANK) -> Bank:
     """Twenty filters of the kinds that `form` allows, fitted to the random walks."""
     rng, kinds = (
         np.random.default_rng(3),
-        (False,) if architecture.zero_sum(form.window) else (False, True),
+        (False,) if architecture.zero_sum(format.window) else (False, True),
     )
-    every = bank.draw(form, rng, kinds)
+    every = bank.draw(format, rng, kinds)
     some = every.take(np.concatenate([np.flatnonzero(every.free == free)[:20] for free in kinds]))
-    given, seen = counts(form, 12), [np.empty(0)] * len(some)
-    for numbers, model in graph.bank_responses(form, texture_scale(given), architecture, some):
+    given, seen = counts(format, 12), [np.empty(0)] * len(some)
+    for numbers, model in graph.bank_responses(format, texture_scale(given), architecture, some):
         for number, values in zip(numbers, run(model, given).swapaxes(0, 2), strict=True):
             seen[number] = values.ravel()
     return bank.fitted(some, seen, rng)
 
 
-def trunk(form: SweepFormat, filters: Bank, int8: bool, tenths: bool = False) -> onnx.ModelProto:
+def trunk(format: SweepFormat, filters: Bank, int8: bool, tenths: bool = False) -> onnx.ModelProto:
     """The trunk of these filters alone."""
-    given = counts(form, 12)
+    given = counts(format, 12)
     ranges = graph.Ranges(graph.count_range(given, BANK), ()) if int8 else None
-    return graph.trunk_graph(form, texture_scale(given), filters.weights(), BANK, ranges, tenths)
+    return graph.trunk_graph(format, texture_scale(given), filters.weights(), BANK, ranges, tenths)
 
 
 @forms
-def test_the_graph_is_the_definition(form: SweepFormat):
+def test_the_graph_is_the_definition(format: SweepFormat):
     """Each response tap by tap; log of its mean magnitude in deviations, share above its
     threshold."""
-    filters, given = small(form), counts(form)
-    scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(form, 12))
+    filters, given = small(format), counts(format)
+    scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(format, 12))
     for sweep, row in zip(
-        scaled.reshape(len(given), form.window, -1),
-        run(trunk(form, filters, False), given),
+        scaled.reshape(len(given), format.window, -1),
+        run(trunk(format, filters, False), given),
         strict=True,
     ):
         sizes, shares = [], []
         for weights, dilation, reach, limit in zip(
             filters.taps(), filters.dilations, filters.reach, filters.limits, strict=True
         ):
-            stride = bank.stage(form, dilation).stride
-            starts = range(0, form.window - (TAPS - 1) * dilation, stride)
+            stride = bank.stage(format, dilation).stride
+            starts = range(0, format.window - (TAPS - 1) * dilation, stride)
             y = np.array(
                 [
                     sum(weights[:, tap] @ sweep[at + tap * dilation] for tap in range(TAPS))
@@ -91,14 +93,14 @@ def test_the_graph_is_the_definition(form: SweepFormat):
 
 
 @forms
-def test_int8_is_close_and_the_last_tenth_is_the_whole_window(form: SweepFormat):
+def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepFormat):
     """Magnitudes within a few hundredths of a logarithm, shares within a few responses; in both
     forms."""
-    filters, given = small(form), counts(form)
-    precise, rounded = (run(trunk(form, filters, int8), given) for int8 in (False, True))
+    filters, given = small(format), counts(format)
+    precise, rounded = (run(trunk(format, filters, int8), given) for int8 in (False, True))
     assert np.abs(precise - rounded).mean() < 0.03
     for int8, whole in ((False, precise), (True, rounded)):
-        tenths = run(trunk(form, filters, int8, tenths=True), given)
+        tenths = run(trunk(format, filters, int8, tenths=True), given)
         assert tenths.shape == (len(given), 10, whole.shape[1])
         np.testing.assert_allclose(tenths[:, -1], whole, atol=1e-5)
 
@@ -106,14 +108,16 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(form: SweepFormat)
 def test_wide_counts_keep_what_a_byte_would_round_away():
     """One sweep of eight is ten thousand times as large as the others, which are below a step of 8
     bits then: the int8 form gives what the float form gives."""
-    form = FORMS[4]
-    given = counts(form, 8)
+    format = FORMATS[4]
+    given = counts(format, 8)
     given[0] = (given[0] - 1000) * 1e4
     assert graph.count_range(given, BANK) / 127 > given[1:].max() - given[1:].min()
-    ranges, filters = graph.Ranges(graph.count_range(given, BANK), ()), small(form)
+    ranges, filters = graph.Ranges(graph.count_range(given, BANK), ()), small(format)
     rounded, precise = (
         run(
-            graph.trunk_graph(form, texture_scale(counts(form, 12)), filters.weights(), BANK, some),
+            graph.trunk_graph(
+                format, texture_scale(counts(format, 12)), filters.weights(), BANK, some
+            ),
             given,
         )
         for some in (ranges, None)
@@ -123,40 +127,42 @@ def test_wide_counts_keep_what_a_byte_would_round_away():
 
 
 @forms
-def test_an_offset_changes_nothing(form: SweepFormat):
+def test_an_offset_changes_nothing(format: SweepFormat):
     """Every taxel higher by as much: the same bits in int8, where counts are whole."""
-    filters, given = small(form), counts(form)
-    higher = (given.clip(0, 250) + 5 if form.dtype == "uint8" else given + 1000).astype(form.dtype)
-    given = given.clip(0, 250).astype(form.dtype) if form.dtype == "uint8" else given
-    model = trunk(form, filters, True)
+    filters, given = small(format), counts(format)
+    higher = (given.clip(0, 250) + 5 if format.dtype == "uint8" else given + 1000).astype(
+        format.dtype
+    )
+    given = given.clip(0, 250).astype(format.dtype) if format.dtype == "uint8" else given
+    model = trunk(format, filters, True)
     np.testing.assert_allclose(
         run(model, higher),
         run(model, given),
-        atol=0 if form.dtype == "uint8" and form.window == 600 else 0.05,
+        atol=0 if format.dtype == "uint8" and format.window == 600 else 0.05,
     )
 
 
 @forms
-def test_filters_fit_the_window(form: SweepFormat):
+def test_filters_fit_the_window(format: SweepFormat):
     """Unit norm, sums of zero but for free ones; only dilations that fit; some see one taxel alone
     and some see all."""
     for free in (False, True):
-        drawn = bank.draw(form, np.random.default_rng(0), (free,))
+        drawn = bank.draw(format, np.random.default_rng(0), (free,))
         assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)
         assert 0 < max(np.abs(drawn.across).max(), np.abs(drawn.along).max()) <= bank.LARGEST
         np.testing.assert_allclose(np.linalg.norm(drawn.taps(), axis=(1, 2)), 1, atol=1e-5)
-        assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < form.window}
+        assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < format.window}
         seen = (drawn.across != 0).sum(axis=1)
-        assert (seen.min(), seen.max()) == (1, form.channels)
-        assert len(drawn) * form.channels * TAPS <= bank.MOST_TAPS
-        last = bank.stage(form, int(drawn.dilations.max()))
-        assert (last.steps - 1) * last.hop + last.reach <= form.window
+        assert (seen.min(), seen.max()) == (1, format.channels)
+        assert len(drawn) * format.channels * TAPS <= bank.MOST_TAPS
+        last = bank.stage(format, int(drawn.dilations.max()))
+        assert (last.steps - 1) * last.hop + last.reach <= format.window
 
 
 def test_thresholds_leave_the_shares_that_were_drawn():
     """Of the responses that they were taken from."""
-    form = FORMS[0]
-    shares = run(trunk(form, small(form), False), counts(form, 12))[:, 40:].mean(axis=0)
+    format = FORMATS[0]
+    shares = run(trunk(format, small(format), False), counts(format, 12))[:, 40:].mean(axis=0)
     assert 0.05 < shares.min() < 0.25
     assert 0.75 < shares.max() < 0.95
 

@@ -36,35 +36,35 @@ CONVOLUTIONAL = {name: shape for name, shape in ARCHITECTURES.items() if shape.c
 """Those with stages."""
 
 
-def drawn(form: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
+def drawn(format: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
     """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much
     noisier than others."""
     rng, t = (
         np.random.default_rng(seed),
-        np.arange(form.window).reshape(-1, *(1,) * len(form.shape)),
+        np.arange(format.window).reshape(-1, *(1,) * len(format.shape)),
     )
-    taxels = (n, 1, *form.shape)
+    taxels = (n, 1, *format.shape)
     x = rng.uniform(80, 120, taxels) + rng.uniform(8, 14, taxels) * np.sin(
         t * rng.uniform(0.6, 1.2, taxels)
     )
-    return (x + rng.standard_normal((n, form.window, *form.shape))).astype(form.dtype)
+    return (x + rng.standard_normal((n, format.window, *format.shape))).astype(format.dtype)
 
 
 def trunks(
-    form: SweepFormat, architecture: Architecture = SMALL, **asked: bool
+    format: SweepFormat, architecture: Architecture = SMALL, **asked: bool
 ) -> tuple[Compact, onnx.ModelProto, onnx.ModelProto]:
     """A network with random weights, its float and its int8 trunk."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = Compact(form, 3, 0.1, architecture=architecture)
-        model.train()(torch.from_numpy(drawn(form).astype(np.float32)))
+        model = Compact(format, 3, 0.1, architecture=architecture)
+        model.train()(torch.from_numpy(drawn(format).astype(np.float32)))
     model = model.fused()
     weights, found = (
         {k: v.numpy() for k, v in model.state_dict().items()},
-        model.ranges(drawn(form)),
+        model.ranges(drawn(format)),
     )
     return model, *(
-        graph.trunk_graph(form, 0.1, weights, architecture, ranges, **asked)
+        graph.trunk_graph(format, 0.1, weights, architecture, ranges, **asked)
         for ranges in (None, found)
     )
 
@@ -96,9 +96,9 @@ def fitted() -> Fit:
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str, axes: int):
     """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the
     same as one at another level."""
-    form = SweepFormat(rows, cols, 100.0, window, dtype, axes)
-    model, plain, int8 = trunks(form)
-    counts = drawn(form, seed=1)
+    format = SweepFormat(rows, cols, 100.0, window, dtype, axes)
+    model, plain, int8 = trunks(format)
+    counts = drawn(format, seed=1)
     want = seen(model, counts)
     np.testing.assert_allclose(graph_builder.run(plain, counts), want, atol=1e-3)
     have = graph_builder.run(int8, counts)
@@ -113,13 +113,13 @@ def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: s
 def test_no_offset_moves_a_bit_of_bytes():
     """Every kernel's integer taps sum to zero and need no more than seven bits: offsets change
     nothing at all."""
-    form = skin.FORMAT
-    _, _, int8 = trunks(form)
+    format = skin.FORMAT
+    _, _, int8 = trunks(format)
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
     first = next(v for v in values.values() if v.dtype == np.int8 and v.ndim == 3)
     np.testing.assert_array_equal(first.sum(axis=2, dtype=int), 0)
     assert np.abs(first).max() == nodes.MAX_TAP
-    counts = drawn(form, 2)
+    counts = drawn(format, 2)
     offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
     np.testing.assert_array_equal(
         graph_builder.run(int8, counts + offset), graph_builder.run(int8, counts)
@@ -148,9 +148,9 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
 def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
     """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came
     just before."""
-    form = SweepFormat(2, 2, 100.0, window, dtype)
-    trunk, whole = trunks(form, tenths=True)[1 + int8], trunks(form)[1 + int8]
-    counts, other = drawn(form, 3), drawn(form, 3, seed=7)
+    format = SweepFormat(2, 2, 100.0, window, dtype)
+    trunk, whole = trunks(format, tenths=True)[1 + int8], trunks(format)[1 + int8]
+    counts, other = drawn(format, 3), drawn(format, 3, seed=7)
     want = graph_builder.run(trunk, counts)
     assert want.shape == (3, 10, 22)
     np.testing.assert_allclose(want[:, -1], graph_builder.run(whole, counts), atol=2e-5)
@@ -219,9 +219,9 @@ def test_a_noisy_taxel_is_attenuated():
 def test_int8_attenuates_as_the_network_does(dtype: str):
     """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the
     limit."""
-    form = SweepFormat(4, 4, 750.0, 600, dtype)
-    model, plain, int8 = trunks(form)
-    counts = drawn(form, 4)
+    format = SweepFormat(4, 4, 750.0, 600, dtype)
+    model, plain, int8 = trunks(format)
+    counts = drawn(format, 4)
     counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
     want = seen(model, counts)
     np.testing.assert_allclose(graph_builder.run(plain, counts), want, atol=1e-3)
@@ -231,9 +231,9 @@ def test_int8_attenuates_as_the_network_does(dtype: str):
 def test_tenths_are_means_of_what_was_known():
     """In float: the first half's features are those of a window of half the length, as both see the
     same responses."""
-    form = SweepFormat(2, 2, 100.0, 800, "uint8")
-    model, trunk, _ = trunks(form, tenths=True)
-    counts = drawn(form, 3)
+    format = SweepFormat(2, 2, 100.0, 800, "uint8")
+    model, trunk, _ = trunks(format, tenths=True)
+    counts = drawn(format, 3)
     half = graph_builder.run(trunk, counts)[:, 4]
     np.testing.assert_allclose(half, seen(model, counts[:, :400]), atol=1e-3)
 
@@ -365,7 +365,7 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
 def test_a_cut_network_gives_what_its_first_stages_gave():
     """Each stage as it was before; the spectrum behind them, or nothing but that."""
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
-    counts = drawn(model.form)
+    counts = drawn(model.format)
     model.architecture = replace(SMALL, spectrum=True)
     every = seen(model, counts)
     assert every.shape == (6, 27)
@@ -439,13 +439,13 @@ def test_a_fit_without_a_convolution_survives_its_file(
 def test_training_augments_as_its_generator_says(frames: int):
     """What PyTorch trains on: the same for the same state of its generator, which moves on; the
     sweeps stay as they are."""
-    form, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
+    format, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
     before, rng, again = (
         x.clone(),
         torch.Generator().manual_seed(3),
         torch.Generator().manual_seed(3),
     )
-    change = fit.augmenter(form, Augmentation())
+    change = fit.augmenter(format, Augmentation())
     first, second, same = change(x, rng), change(x, rng), change(x, again)
     assert first.shape == x.shape
     assert first.dtype == torch.float32

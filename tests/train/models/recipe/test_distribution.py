@@ -16,7 +16,7 @@ from train.models.recipe.recipe import FIXED
 from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
 
-FORMS = [
+FORMATS = [
     SweepFormat(2, 2, 100.0, 64, "uint8"),
     SweepFormat(3, 3, 50.0, 40, "int16"),
     SweepFormat(1, 1, 10.0, 16, "uint16"),
@@ -25,36 +25,36 @@ FORMS = [
     SweepFormat(2, 2, 750.0, 600, "int16", 3),
     SweepFormat(8, 8, 100.0, 64, "uint16"),
 ]
-forms = pytest.mark.parametrize("form", FORMS, ids=str)
+forms = pytest.mark.parametrize("format", FORMATS, ids=str)
 ALONE = replace(FIXED, distribution=True)
 
 
-def counts(form: SweepFormat, n: int = 3) -> np.ndarray:
+def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
     """White noise [n, T, R, C] of raw counts, alike on all taxels: none is attenuated."""
-    noise = np.random.default_rng(7).normal(100, 12, (n, form.window, *form.shape)).clip(0, 255)
-    return noise.round().astype(form.dtype)
+    noise = np.random.default_rng(7).normal(100, 12, (n, format.window, *format.shape)).clip(0, 255)
+    return noise.round().astype(format.dtype)
 
 
-def levels(form: SweepFormat) -> Levels:
+def levels(format: SweepFormat) -> Levels:
     """Fitted to twelve sweeps."""
-    given = counts(form, 12)
+    given = counts(format, 12)
     return distribution.fitted(given, texture_scale(given), np.random.default_rng(0))
 
 
-def trunk(form: SweepFormat, some: Levels, int8: bool, tenths: bool = False) -> onnx.ModelProto:
+def trunk(format: SweepFormat, some: Levels, int8: bool, tenths: bool = False) -> onnx.ModelProto:
     """The trunk of the distribution alone."""
-    given = counts(form, 12)
+    given = counts(format, 12)
     ranges = graph.Ranges(graph.count_range(given, ALONE), ()) if int8 else None
-    return graph.trunk_graph(form, texture_scale(given), some.weights(), ALONE, ranges, tenths)
+    return graph.trunk_graph(format, texture_scale(given), some.weights(), ALONE, ranges, tenths)
 
 
-def defined(form: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
+def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
     """Shares of frames above the levels, of counts about their mean and of differences."""
-    x = given.reshape(len(given), form.window, -1)[:, :, some.taxels] * texture_scale(
-        counts(form, 12)
+    x = given.reshape(len(given), format.window, -1)[:, :, some.taxels] * texture_scale(
+        counts(format, 12)
     )
-    hop = max(form.window // distribution.MOST_FRAMES, 1)
-    older = x[:, : form.window - 1 : hop]
+    hop = max(format.window // distribution.MOST_FRAMES, 1)
+    older = x[:, : format.window - 1 : hop]
     signals = older - older.mean(axis=1, keepdims=True), np.diff(x, axis=1)[:, ::hop]
     pairs = zip(signals, some.levels, strict=True)
     return np.hstack(
@@ -63,35 +63,35 @@ def defined(form: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
 
 
 @forms
-def test_the_graph_is_the_definition(form: SweepFormat):
+def test_the_graph_is_the_definition(format: SweepFormat):
     """In both forms, but for a few frames about a level: bytes about their mean are rounded to
     bytes again."""
-    some, given = levels(form), counts(form)
-    wanted = defined(form, some, given)
+    some, given = levels(format), counts(format)
+    wanted = defined(format, some, given)
     for int8 in (False, True):
-        have = run(trunk(form, some, int8), given)
+        have = run(trunk(format, some, int8), given)
         assert have.shape == (len(given), len(some))
-        assert np.abs(have - wanted).max() < 8.5 / min(form.window, distribution.MOST_FRAMES)
+        assert np.abs(have - wanted).max() < 8.5 / min(format.window, distribution.MOST_FRAMES)
         assert np.abs(have - wanted).mean() < (2e-2 if int8 else 1e-3)
 
 
 @forms
-def test_the_last_tenth_is_the_whole_window(form: SweepFormat):
+def test_the_last_tenth_is_the_whole_window(format: SweepFormat):
     """And the first depends on no later frame, where later ones repeat the newest."""
-    some, given = levels(form), counts(form)
+    some, given = levels(format), counts(format)
     for int8 in (False, True):
-        tenths = run(trunk(form, some, int8, tenths=True), given)
+        tenths = run(trunk(format, some, int8, tenths=True), given)
         assert tenths.shape == (len(given), 10, len(some))
-        np.testing.assert_allclose(tenths[:, -1], run(trunk(form, some, int8), given), atol=2e-2)
-        assert np.abs(tenths[:, -1] - run(trunk(form, some, int8), given)).mean() < 1e-3
+        np.testing.assert_allclose(tenths[:, -1], run(trunk(format, some, int8), given), atol=2e-2)
+        assert np.abs(tenths[:, -1] - run(trunk(format, some, int8), given)).mean() < 1e-3
 
 
 def test_the_shares_of_training_sweeps_are_evenly_spaced():
     """Levels are quantiles of what they were fitted to."""
-    form = FORMS[3]
-    some = levels(form)
+    format = FORMATS[3]
+    some = levels(format)
     number = some.levels.shape[2]
-    shares = defined(form, some, counts(form, 12)).mean(axis=0).reshape(2, 16, number)
+    shares = defined(format, some, counts(format, 12)).mean(axis=0).reshape(2, 16, number)
     wanted = 1 - (np.arange(number) + 0.5) / number
     assert np.abs(shares - wanted).max() < 0.1
     assert np.abs(shares.mean(axis=1) - wanted).max() < 0.05
@@ -99,30 +99,30 @@ def test_the_shares_of_training_sweeps_are_evenly_spaced():
 
 def test_an_offset_changes_nothing():
     """Every taxel higher by as much: the same bits in int8, where counts are bytes."""
-    form = FORMS[3]
-    given = counts(form).clip(0, 200)
-    model = trunk(form, levels(form), True)
+    format = FORMATS[3]
+    given = counts(format).clip(0, 200)
+    model = trunk(format, levels(format), True)
     np.testing.assert_allclose(run(model, given + np.uint8(40)), run(model, given), atol=1e-2)
 
 
 @forms
-def test_the_features_have_a_limit(form: SweepFormat):
+def test_the_features_have_a_limit(format: SweepFormat):
     """More taxels have fewer levels each; of more than that random ones are looked at."""
-    some = levels(form)
+    some = levels(format)
     assert len(some) <= distribution.MOST_FEATURES
     assert distribution.FEWEST_LEVELS <= some.levels.shape[2] <= distribution.MOST_LEVELS
     assert (np.diff(some.taxels) > 0).all()
-    assert len(some.taxels) == min(form.channels, 32)
+    assert len(some.taxels) == min(format.channels, 32)
 
 
 @pytest.mark.parametrize("value", [7, 9])
 def test_a_silent_taxel_is_above_no_level(value: int):
     """Whatever its constant count is, and although its mean is rounded."""
-    form = FORMS[0]
-    given = counts(form, 12)
+    format = FORMATS[0]
+    given = counts(format, 12)
     given[:, :, 0, 0] = 7
     some = distribution.fitted(given, texture_scale(given), np.random.default_rng(0))
     given[:, :, 0, 0] = value
-    have = run(trunk(form, some, False), given)
+    have = run(trunk(format, some, False), given)
     assert np.isfinite(have).all()
-    assert not have.reshape(12, 2, form.channels, -1)[:, :, 0].any()
+    assert not have.reshape(12, 2, format.channels, -1)[:, :, 0].any()

@@ -28,7 +28,7 @@ from train.onnx_tools import graph_builder
 BARE = ARCHITECTURES["bands"]
 SMALL = Architecture((6, 8, 8), 8, 2)
 ODD = SweepFormat(2, 2, 100.0, 163, "int16")
-FORMS = {
+FORMATS = {
     "skin": (skin.FORMAT, True),
     "four frames a period": (SweepFormat(1, 1, 200.0, 450, "float32"), True),
     "three frames a period": (SweepFormat(3, 3, 150.0, 450, "uint16"), False),
@@ -42,28 +42,28 @@ FORMS = {
 """Forms, and whether the mains are taken away there."""
 
 
-def drawn(form: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
+def drawn(format: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
     """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much
     noisier than others."""
     rng = np.random.default_rng(seed)
-    own = rng.standard_normal((n, form.window, *form.shape))
-    x = 90 + 8 * rng.standard_normal((n, form.window, *(1,) * len(form.shape))) + 4 * own
-    return x.astype(form.dtype)
+    own = rng.standard_normal((n, format.window, *format.shape))
+    x = 90 + 8 * rng.standard_normal((n, format.window, *(1,) * len(format.shape))) + 4 * own
+    return x.astype(format.dtype)
 
 
 def trunk(
-    form: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0
+    format: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0
 ) -> onnx.ModelProto:
     """The graph that gives nothing but the spectrum."""
-    return graph.trunk_graph(form, scale, {}, replace(BARE, mains_hz=mains_hz), tenths=tenths)
+    return graph.trunk_graph(format, scale, {}, replace(BARE, mains_hz=mains_hz), tenths=tenths)
 
 
 def heard(
-    form: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
+    format: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
 ) -> np.ndarray:
     """What PyTorch's head sees where there is nothing but the spectrum."""
     with torch.no_grad():
-        model = Compact(form, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
+        model = Compact(format, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
         return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
 
@@ -77,7 +77,7 @@ def turned(x: np.ndarray) -> np.ndarray:
 
 
 def defined(
-    form: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True
+    format: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True
 ) -> np.ndarray:
     """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of
     one axis after the other.
@@ -85,58 +85,61 @@ def defined(
     Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a
     transform at half bins, the mean of each band.
     """
-    x, length = counts.reshape(len(counts), form.window, -1).astype(np.float64), form.window // 10
-    each = (x * turned(x) if limited else x).reshape(len(x), form.window, -1, form.axes).mean(2)
+    x, length = (
+        counts.reshape(len(counts), format.window, -1).astype(np.float64),
+        format.window // 10,
+    )
+    each = (x * turned(x) if limited else x).reshape(len(x), format.window, -1, format.axes).mean(2)
     wave = scale * each.swapaxes(1, 2)[:, :, : 10 * length].reshape(-1, length)
-    turn = 2 * np.pi * 50 / form.rate_hz * np.arange(length)
+    turn = 2 * np.pi * 50 / format.rate_hz * np.arange(length)
     fits = np.stack([np.ones(length), np.sin(turn), np.cos(turn)][: 3 if mains else 1], axis=1)
     wave = wave - (fits @ np.linalg.lstsq(fits, wave.T, rcond=None)[0]).T
     window = np.hanning(length + 2)[1:-1]
     power = np.abs(np.fft.fft(wave * window, 2 * length)) ** 2 / (window**2).sum()
     edges = sorted({round(2 * ((length + 1) / 2) ** (i / 24)) for i in range(25)})
     bands = np.stack([power[:, a:b].mean(1) for a, b in pairwise(edges)], 1).reshape(
-        len(counts), form.axes, 10, -1
+        len(counts), format.axes, 10, -1
     )
     bands = bands.swapaxes(1, 2).reshape(len(counts), 10, -1)
     return np.log(bands.cumsum(1) / np.arange(1, 11)[:, None] + 1e-4)
 
 
-@pytest.mark.parametrize(("form", "mains"), FORMS.values(), ids=FORMS)
-def test_the_spectrum_is_that_of_its_definition(form: SweepFormat, mains: bool):
+@pytest.mark.parametrize(("format", "mains"), FORMATS.values(), ids=FORMATS)
+def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool):
     """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth
     holds two periods."""
-    counts = drawn(form)
-    want = defined(form, counts, mains)
+    counts = drawn(format)
+    want = defined(format, counts, mains)
     rows, whole = (
-        graph_builder.run(trunk(form, tenths=True), counts),
-        graph_builder.run(trunk(form), counts),
+        graph_builder.run(trunk(format, tenths=True), counts),
+        graph_builder.run(trunk(format), counts),
     )
-    assert rows.shape == want.shape == (2, 10, spectrum.count(form))
+    assert rows.shape == want.shape == (2, 10, spectrum.count(format))
     np.testing.assert_allclose(rows, want, atol=2e-3)
     np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
-    np.testing.assert_allclose(heard(form, counts), whole, atol=1e-3)
+    np.testing.assert_allclose(heard(format, counts), whole, atol=1e-3)
     if mains:
-        assert np.abs(defined(form, counts, False) - want).max() > 0.1
+        assert np.abs(defined(format, counts, False) - want).max() > 0.1
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
     """Behind the trunk's own features, in float and in int8; without the limit it would be
     measured."""
-    form = SweepFormat(4, 4, 750.0, 600, dtype)
-    counts = drawn(form)
+    format = SweepFormat(4, 4, 750.0, 600, dtype)
+    counts = drawn(format)
     counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
-    want = defined(form, counts, True)
+    want = defined(format, counts, True)
     assert turned(counts.reshape(2, 600, 16).astype(float)).min() < 0.8
-    assert np.abs(defined(form, counts, True, limited=False) - want).max() > 0.3
-    np.testing.assert_allclose(heard(form, counts), want[:, -1], atol=2e-3)
-    plain = Compact(form, 3, 0.1, norm=False, architecture=SMALL).eval()
+    assert np.abs(defined(format, counts, True, limited=False) - want).max() > 0.3
+    np.testing.assert_allclose(heard(format, counts), want[:, -1], atol=2e-3)
+    plain = Compact(format, 3, 0.1, norm=False, architecture=SMALL).eval()
     weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
     for ranges in (None, found):
         for tenths in (False, True):
             both, alone = (
                 graph_builder.run(
-                    graph.trunk_graph(form, 0.1, weights, shape, ranges, tenths), counts
+                    graph.trunk_graph(format, 0.1, weights, shape, ranges, tenths), counts
                 )
                 for shape in (SMALL.cut(3, True), SMALL)
             )
@@ -156,8 +159,8 @@ def test_the_hum_of_the_mains_changes_nothing(
 ):
     """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is
     measured everywhere. Of a fit for 60 Hz the other way round."""
-    form = SweepFormat(2, 2, rate_hz, window, "float32")
-    counts, rng = drawn(form), np.random.default_rng(1)
+    format = SweepFormat(2, 2, rate_hz, window, "float32")
+    counts, rng = drawn(format), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
     for hz, silent in ((mains_hz, deaf), (110 - mains_hz, False)):
         hum = strength * np.sin(
@@ -165,10 +168,10 @@ def test_the_hum_of_the_mains_changes_nothing(
         )
         hummed = (counts + hum).astype(np.float32)
         for ask in (
-            lambda form, x: heard(form, x, mains_hz=mains_hz),
-            lambda form, x: graph_builder.run(trunk(form, tenths=True, mains_hz=mains_hz), x),
+            lambda format, x: heard(format, x, mains_hz=mains_hz),
+            lambda format, x: graph_builder.run(trunk(format, tenths=True, mains_hz=mains_hz), x),
         ):
-            apart = np.abs(ask(form, hummed) - ask(form, counts)).max(-1)
+            apart = np.abs(ask(format, hummed) - ask(format, counts)).max(-1)
             assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
 
 
@@ -205,15 +208,17 @@ def test_later_frames_and_offsets_do_not_matter():
     np.testing.assert_allclose(heard(ODD, counts), heard(ODD, counts + np.int16(300)), atol=5e-3)
 
 
-@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_silence_is_finite(name: str):
     """No power at all but what is added to each band, whatever the offset."""
-    form, _ = FORMS[name]
-    quiet = np.stack([np.full((form.window, *form.shape), level, form.dtype) for level in (0, 90)])
+    format, _ = FORMATS[name]
+    quiet = np.stack(
+        [np.full((format.window, *format.shape), level, format.dtype) for level in (0, 90)]
+    )
     for have in (
-        heard(form, quiet),
-        graph_builder.run(trunk(form), quiet),
-        graph_builder.run(trunk(form, tenths=True), quiet),
+        heard(format, quiet),
+        graph_builder.run(trunk(format), quiet),
+        graph_builder.run(trunk(format, tenths=True), quiet),
     ):
         np.testing.assert_allclose(have, np.log(1e-4), atol=1e-3)
 
