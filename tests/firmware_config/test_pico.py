@@ -73,7 +73,7 @@ def check_all_there(frames: Frames) -> None:
 
 
 @pytest.mark.parametrize(
-    "form",
+    "format",
     [
         {"ROWS": 4, "COLS": 4, "RATE_HZ": 750},
         {"ROWS": 16, "COLS": 16, "RATE_HZ": 50, "DTYPE": "uint16"},
