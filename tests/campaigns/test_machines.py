@@ -24,7 +24,7 @@ from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
 from train.data import sets
 from train.export import quantized_bundle
-from train.models.recipe import fit
+from train.models.recipe import stages
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 
@@ -45,7 +45,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(bundle.DEFAULT, folder / "default")
     np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
     for dtype in TENSOR:
-        fitted = fit.fit(easy(dtype=dtype), 1, fit.FitRecipe(steps=40))
+        fitted = stages.fit_network(easy(dtype=dtype), 1, stages.FitRecipe(steps=40))
         quantized_bundle.export(fitted, folder / dtype, dtype, "1", "")
         np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
     for name in INSIDE:

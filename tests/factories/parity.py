@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.models.recipe import fit
+from train.models.recipe import stages
 
 
-def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.Dataset:
+def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> stages.Dataset:
     """Three materials that hum at nearly the same rates, in much noise, one sweep [64, 2, 2] to a
     recording."""
     rng = np.random.default_rng(seed)
@@ -19,6 +19,6 @@ def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> fit.Dataset:
         offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
     )
     groups = {"recording": np.arange(3 * n)}
-    return fit.Dataset(
+    return stages.Dataset(
         samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close"
     )

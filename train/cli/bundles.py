@@ -19,7 +19,7 @@ from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
-from train.calibration.posthoc import calibrate
+from train.calibration.calibrate import calibrate
 from train.cli import numbers, options
 from train.cli.options import Add
 from train.data import labels
@@ -220,12 +220,12 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
             raise FormatError(
                 f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with --size {args.size}"
             )
-        from train.models.recipe import fit  # here: the default recipe needs no PyTorch
+        from train.models.recipe import stages  # here: the default recipe needs no PyTorch
 
-        trained = fit.FitRecipe(
+        trained = stages.FitRecipe(
             steps=args.steps, augmentation=augmentation, keep_means=args.keep_means
         )
-        return fit.fit(
+        return stages.fit_network(
             sweeps, args.seed, trained, options.Log(), architecture, unfinished
         ), unfinished
     if args.keep_means:
@@ -249,7 +249,8 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augment
     depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation), args.mains]
     return (
-        CACHE / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.fit')}.pt"
+        CACHE
+        / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.stages')}.pt"
     )
 
 

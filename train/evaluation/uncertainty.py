@@ -21,9 +21,9 @@ from appliance.bundle.bundle import Early
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from appliance.inference.enrolment import extended
+from train.calibration.calibrate import Calibration
 from train.calibration.early_exit import LEVELS, decide
 from train.calibration.novelty import Embedding, auroc, embed
-from train.calibration.posthoc import Posthoc
 from train.data.sets import Dataset, digest, join
 from train.data.splitters import Protocol
 from train.evaluation.evaluate import Where
@@ -45,7 +45,7 @@ LIMITS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0)
 """Multiples of the novelty limit at which what it keeps and what it lets through is reported."""
 DRAWS, ORDERS = 500, 20
 """Draws of the bootstrap; random orders of the sweeps of one object, or of one enrolment."""
-Trained = tuple[Case, Posthoc]
+Trained = tuple[Case, Calibration]
 """One training, and what is fitted after it."""
 
 
@@ -95,7 +95,7 @@ def run(
 
 def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
     """All figures; those that need a material left out are missing where there are only two."""
-    fitted = [(case, case.posthoc()) for case in trained]
+    fitted = [(case, case.calibration()) for case in trained]
     full = [one for one in fitted if one[0].left_out < 0]
     result = {
         "calibration": calibration(full),
@@ -352,7 +352,7 @@ def _mean_of(values: Array, some: Array) -> float:
     return float(values[some].mean())
 
 
-def _of_trunk(case: Case, done: Posthoc) -> Array:
+def _of_trunk(case: Case, done: Calibration) -> Array:
     """Squared distance in the trained features alone; the same for all sweeps where there are
     none."""
     if not (size := case.seen.shape[2] - case.fixed):
@@ -360,7 +360,7 @@ def _of_trunk(case: Case, done: Posthoc) -> Array:
     return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
 
 
-SCORES: dict[str, Callable[[Case, Posthoc], Array]] = {
+SCORES: dict[str, Callable[[Case, Calibration], Array]] = {
     "distance": lambda case, done: done.embedding.novelty(case.new[:, -1]) / done.limit,
     "distance, trained features only": _of_trunk,
     "distance, where trained materials differ": lambda case, done: embed(
@@ -411,7 +411,7 @@ def enrolment(
 
 
 def _enrolled(
-    case: Case, done: Posthoc, whole: Case, trained: Posthoc, rng: np.random.Generator
+    case: Case, done: Calibration, whole: Case, trained: Calibration, rng: np.random.Generator
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
     """Of random draws: (sweeps, where, (accuracy, that of the whole model, recall of the new one,
     loss of the old))."""

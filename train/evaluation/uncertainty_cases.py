@@ -21,8 +21,13 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.calibration.moved import AugmentedCopies
-from train.calibration.posthoc import Posthoc, PosthocInputs, fit_posthoc, posthoc_inputs
+from train.calibration.calibrate import (
+    Calibration,
+    CalibrationInputs,
+    calibration_inputs,
+    fit_calibration,
+)
+from train.calibration.displacement import AugmentedCopies
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
 from train.evaluation.evaluate import Where
@@ -61,7 +66,7 @@ class Case:
     `seen_labels` [N] from 0 on without the one left out; seen_groups [N]: positions or recordings;
     judged: bool [N], those that the trunk did not see, which may judge. copied: features [M, F] of
     augmented copies, of copied_labels, copied_groups and copied_held [M]; see AugmentedCopies.
-    disturbed: bool [N] of the seen sweeps; see posthoc.fit_posthoc. new, labels, places: features
+    disturbed: bool [N] of the seen sweeps; see fit_calibration. new, labels, places: features
     of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
     """
 
@@ -87,13 +92,13 @@ class Case:
         known: Array = self.labels != self.left_out
         return known
 
-    def posthoc(self) -> Posthoc:
+    def calibration(self) -> Calibration:
         """What is fitted on the trunk of this training."""
         copies = AugmentedCopies(
             self.copied, self.copied_labels, self.copied_groups, self.copied_held
         )
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
-        given = PosthocInputs(
+        given = CalibrationInputs(
             self.seen,
             self.seen_labels,
             self.seen_groups,
@@ -103,7 +108,7 @@ class Case:
             self.disturbed,
             plan,
         )
-        return fit_posthoc(given)
+        return fit_calibration(given)
 
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out
@@ -129,7 +134,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
-    given = posthoc_inputs(made)
+    given = calibration_inputs(made)
     copies = given.copied
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
@@ -172,7 +177,7 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
         fingerprint(
             [data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
             methods.module_of(t.method),
-            "train.calibration.posthoc",
+            "train.calibration.calibrate",
         )
         for t in wanted
     ]

@@ -32,7 +32,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status
 from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
 from appliance.inference.novelty import shaped_distances
-from train.calibration.posthoc import HeldOut, calibrate
+from train.calibration.calibrate import HeldOut, calibrate
 from train.data.readers import counted
 from train.data.sets import Dataset
 from train.export import bundle_score, contact_limit
@@ -118,7 +118,7 @@ def pack(
     loads = contact_limit.find(train)
     limits = thresholds(train, loads.contact, full_scale)
     place = place_of(train, loads, pitch_mm)
-    content = with_posthoc(content, place is not None)
+    content = with_calibration(content, place is not None)
     logits = run(content.model, model_inputs(content.input, train))
     golden = golden_file(
         content,
@@ -208,7 +208,7 @@ def pack_to_measure(
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
-def with_posthoc(content: Content, located: bool = True) -> Content:
+def with_calibration(content: Content, located: bool = True) -> Content:
     """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps
     support them, and novelty. Unchanged where nothing was held out, or not all its materials were
     trained.
@@ -235,7 +235,7 @@ def with_posthoc(content: Content, located: bool = True) -> Content:
         model=done.graph(made.trunk(), tenths),
         early=rule.early,
         known=done.known(),
-        moved=done.moved_rule(),
+        moved=done.displacement_rule(),
         means=done.means(),
         about=content.about | {"early": early},
         figures=content.figures | own,

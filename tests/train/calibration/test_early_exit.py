@@ -13,9 +13,9 @@ from appliance.core.clock import SystemClock
 from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
 from appliance.inference.novelty import Means
-from tests.factories.posthoc_inputs import plain_inputs
+from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.trunk import FORM, trunk
-from train.calibration import early_exit, posthoc
+from train.calibration import calibrate, early_exit
 from train.evaluation import uncertainty
 from train.onnx_tools.graph_builder import run
 
@@ -117,7 +117,7 @@ def test_temperatures_calibrate_each_step():
     """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every
     step."""
     x, y, at = tenths(40)
-    done = posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool)))
+    done = calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool)))
     new, labels, _ = tenths(60, seed=9)
     p = done.probabilities(new)
     right = (p.argmax(2) == labels[:, None]).mean(0)
@@ -133,7 +133,7 @@ def test_each_step_has_its_own_temperature():
     # positions
     x = x + 3 * np.random.default_rng(4).standard_normal((9, 1, 5))[3 * at + y]
     done, every = (
-        posthoc.fit_posthoc(plain_inputs(x, y, at, np.ones(len(y), bool))),
+        calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool))),
         np.ones(len(y), bool),
     )
     logits, numbers = early_exit.cross_fitted_logits(x, y, at, every)
@@ -150,16 +150,18 @@ def test_a_material_of_one_place_and_two_materials():
     NaN."""
     x, y, at = tenths(20)
     keep = (y != 2) | (at == 0)
-    done = posthoc.fit_posthoc(plain_inputs(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool)))
+    done = calibrate.fit_calibration(
+        plain_inputs(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
+    )
     assert np.isfinite(done.probabilities(x)).all()
     assert (done.logits(x[:, -1]).argmax(1) == y).mean() > 0.9
-    two = posthoc.fit_posthoc(plain_inputs(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4))
+    two = calibrate.fit_calibration(plain_inputs(x[y < 2], y[y < 2], at[y < 2], at[y < 2] < 4))
     assert np.isfinite(two.probabilities(x[y < 2])).all()
 
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk, one of whose features is untrained: Posthoc, features, raw
+    """A bundle's parts on the toy trunk, one of whose features is untrained: Calibration, features, raw
     counts, labels, Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
@@ -170,7 +172,7 @@ def made():
     counts = np.rint(counts + rng.normal(0, 5, counts.shape)).astype(np.int16)
     trunks = trunk(FORM, True)
     x, size = run(trunks, counts), 1
-    done = posthoc.fit_posthoc(
+    done = calibrate.fit_calibration(
         plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     )
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
@@ -200,7 +202,7 @@ def made():
 
 def test_the_graph_gives_what_training_computed(made):
     """Logits, embedding and the heads of all tenths in the box's classifier are those of
-    Posthoc."""
+    Calibration."""
     done, x, counts, _, whole = made
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()
@@ -242,7 +244,7 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     new = enrolment.enrol(whole, "new", counts[drawn]).bundle
     z = done.embedding(x[:, -1])
     means = Means(new.classes, new.manifest.known, new.manifest.labels)
-    want = means.logits(means.distances(z)) * done.warmth
+    want = means.logits(means.distances(z)) * done.class_mean_temperature
     have = uncertainty.enrolled_logits(done.embedding, z, z[drawn])
     assert np.allclose(
         have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02

@@ -20,7 +20,7 @@ from tests.factories.sweep_sets import easy
 from train.cli import bundles
 from train.cli.main import GROUPS, main
 from train.data import pull, sets
-from train.models.recipe.fit import Fit
+from train.models.recipe.stages import Fit
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
-from tests.factories.posthoc_inputs import plain_inputs
-from train.calibration.posthoc import fit_posthoc
+from tests.factories.calibration_inputs import plain_inputs
+from train.calibration.calibrate import fit_calibration
 from train.data.sets import Dataset
 from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
@@ -100,7 +100,7 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     # sweeps of one position close together: their scatter says little of other positions
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
     one = replace(one, seen=one.seen + shift[one.seen_groups], new=one.new + shift[one.places])
-    done = fit_posthoc(plain_inputs(one.seen, one.seen_labels, one.seen_groups, one.judged))
+    done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups, one.judged))
     figures = uncertainty.calibration([(one, done)])
     right = figures["accuracy"]["accuracy"]
     mean = {
@@ -182,7 +182,8 @@ def test_an_unknown_material_that_does_not_differ_is_not_seen():
     """Materials that do not differ: AUROC of a half."""
     held = [case(k, apart=0.0) for k in (0, 1)]
     done = [
-        (c, fit_posthoc(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged))) for c in held
+        (c, fit_calibration(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged)))
+        for c in held
     ]
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
 

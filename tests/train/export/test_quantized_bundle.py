@@ -26,7 +26,7 @@ from appliance.inference.session import session
 from appliance.sim import skin
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
-from train.calibration.posthoc import calibrate
+from train.calibration.calibrate import calibrate
 from train.cli.main import main
 from train.data import sets
 from train.export import pack, quantized_bundle
@@ -34,11 +34,11 @@ from train.export.pack import ExportRefused
 from train.models import methods
 from train.models.linear_head import closed_form_head, hold_out
 from train.models.peers import paper_cnn
-from train.models.recipe import fit
+from train.models.recipe import stages
 from train.models.recipe.architectures import ARCHITECTURES
-from train.models.recipe.fit import FitRecipe
 from train.models.recipe.fitted import Fit
 from train.models.recipe.network import Compact
+from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import cost, graph_builder, parity
 from train.onnx_tools.parity import Layer
 
@@ -50,7 +50,7 @@ def fitted() -> Fit:
     """A fit on the easy set, two sweeps to a recording, of a skin that reads 0 without contact."""
     sweeps = easy(pieces=2)
     rest = np.zeros((len(sweeps), 2, *sweeps.format.shape))
-    return fit.fit(
+    return stages.fit_network(
         replace(sweeps, unloaded=rest), 1, FitRecipe(steps=40), architecture=ARCHITECTURES["20k"]
     )
 
@@ -58,7 +58,7 @@ def fitted() -> Fit:
 @pytest.fixture(scope="module")
 def tight() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, FitRecipe(steps=60), architecture=ARCHITECTURES["20k"])
+    return stages.fit_network(close(), 1, FitRecipe(steps=60), architecture=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
@@ -504,7 +504,7 @@ def test_the_command_exports_what_fit_wrote(
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both forms are the same, the box's labels are its network's, no tensor
     is reported; what another head says is told here as well."""
-    made = fit.fit(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
+    made = stages.fit_network(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
@@ -628,7 +628,7 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     )
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        made = fit.fit(
+        made = stages.fit_network(
             offset, 1, FitRecipe(steps=20, keep_means=keep), architecture=ARCHITECTURES["20k"]
         )
         manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")

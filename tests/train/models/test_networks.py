@@ -23,8 +23,8 @@ from train.models import methods, training
 from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
-from train.models.recipe import fit, network
-from train.models.recipe.fit import FitRecipe
+from train.models.recipe import network, stages
+from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import graph_builder
 
 NETS = (
@@ -300,7 +300,7 @@ def test_compact_is_what_palpate_train_fits():
     s = easy(12)
     line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
     for given in (s, line):
-        same, model = fit.fit(given, 1, FitRecipe(steps=6)), train("compact", given)
+        same, model = stages.fit_network(given, 1, FitRecipe(steps=6)), train("compact", given)
         with torch.no_grad():
             want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
         have = model.forms["float"].logits(given.samples)

@@ -16,8 +16,8 @@ from appliance.core.errors import FormatError
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from train.export import quantized_bundle
-from train.models.recipe import fit
-from train.models.recipe.fit import Fit, FitRecipe
+from train.models.recipe import stages
+from train.models.recipe.stages import Fit, FitRecipe
 from train.onnx_tools import parity
 from train.onnx_tools.parity import Layer
 from train.onnx_tools.quantize import quantize
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on a set that takes all int8 has."""
-    return fit.fit(close(), 1, FitRecipe(steps=60))
+    return stages.fit_network(close(), 1, FitRecipe(steps=60))
 
 
 def measured(fitted: Fit) -> parity.Parity:

@@ -32,7 +32,7 @@ Columns = tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Judged:
+class ScoredPlan:
     """One candidate. losses: cross entropy [n] of each held-out sweep; logits [n, K] are of the
     temperature that is best."""
 
@@ -41,7 +41,7 @@ class Judged:
     losses: Array
 
 
-class Court:
+class HeldOutScores:
     """Judges candidates on held-out parts. known: what heads are fitted to, for each part the same
     sweeps in the same order; their features may differ, where a trunk was trained without the part.
     copied: augmented copies of the held-out sweeps are judged too, and count as much as these.
@@ -74,7 +74,7 @@ class Court:
         self.weights = 1 / counts[member] / len(counts)
         self._logits: dict[tuple[Columns, bool], Array] = {}
 
-    def judge(self, parts: Sequence[HeadPart]) -> Judged:
+    def score(self, parts: Sequence[HeadPart]) -> ScoredPlan:
         """The candidate that adds the logits of `parts`, each scaled to the same size; what factors
         they had does not count."""
         logits = [self._of(part) for part in parts]
@@ -87,17 +87,17 @@ class Court:
         plan = HeadPlan(
             tuple(replace(p, factor=f / temperature) for p, f in zip(parts, factors, strict=True))
         )
-        return Judged(plan, total / temperature, self._losses(total / temperature))
+        return ScoredPlan(plan, total / temperature, self._losses(total / temperature))
 
-    def loss(self, judged: Judged) -> float:
+    def loss(self, judged: ScoredPlan) -> float:
         """Mean cross entropy, every group counting the same."""
         return float(self.weights @ judged.losses)
 
-    def accuracy(self, judged: Judged) -> float:
+    def accuracy(self, judged: ScoredPlan) -> float:
         """Share of held-out sweeps that are named rightly, every group counting the same."""
         return float(self.weights @ self._right(judged))
 
-    def better(self, one: Judged, other: Judged) -> bool:
+    def better(self, one: ScoredPlan, other: ScoredPlan) -> bool:
         """Whether `one` has less loss and names more sweeps rightly, by more than ERRORS standard
         errors of the paired difference.
 
@@ -111,7 +111,7 @@ class Court:
             gain.sum() > ERRORS * max(map(_error, (gain, by_part)))
         )
 
-    def holds(self, one: Judged, other: Judged) -> bool:
+    def holds(self, one: ScoredPlan, other: ScoredPlan) -> bool:
         """Whether held-out sweeps show that `one` loses no more than MOST_LOST of those that
         `other` names rightly, and MOST_WORSE of its cross entropy: a standard error of the paired
         difference is added, at least one sweep."""
@@ -122,12 +122,12 @@ class Court:
             and worse <= MOST_WORSE
         )
 
-    def _lost(self, one: Judged, other: Judged) -> Array:
+    def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
         """What each sweep [n] adds to the accuracy of `other` less that of `one`."""
         lost: Array = self.weights * (self._right(other).astype(float) - self._right(one))
         return lost
 
-    def _right(self, judged: Judged) -> Array:
+    def _right(self, judged: ScoredPlan) -> Array:
         right: Array = judged.logits.argmax(axis=1) == self.labels
         return right
 
@@ -169,14 +169,14 @@ def _error(x: Array) -> float:
 
 
 def choose(
-    court: Court,
+    scores: HeldOutScores,
     kinds: Sequence[Array],
     pools: Sequence[Array],
     levels: Array,
     bands: Array,
     log: Callable[[str], None],
     always_copies: bool = False,
-) -> Judged:
+) -> ScoredPlan:
     """The candidate with the least loss, where it is `better` than the usual one; else the usual
     one.
 
@@ -191,14 +191,14 @@ def choose(
     augmented copies are there, as held-out sweeps cannot show what these are for.
     """
 
-    def judged(named: str, parts: Sequence[HeadPart]) -> Judged:
+    def judged(named: str, parts: Sequence[HeadPart]) -> ScoredPlan:
         log(f"choosing: {named}")
-        return court.judge(parts)
+        return scores.score(parts)
 
-    def best(of: Sequence[Judged]) -> Judged:
-        return min(of, key=court.loss)
+    def best(of: Sequence[ScoredPlan]) -> ScoredPlan:
+        return min(of, key=scores.loss)
 
-    sizes, shares = (views(kinds, pools[:n], always_copies) for n in (1, 2))
+    sizes, shares = (filter_groups(kinds, pools[:n], always_copies) for n in (1, 2))
     usual = [
         *sizes,
         *_with(shares, bands),
@@ -221,7 +221,7 @@ def choose(
         if copies != always_copies or name != "without more of the spectrum"
     ]
     chosen = best([*plain, *more])
-    return chosen if court.better(chosen, plain[0]) else plain[0]
+    return chosen if scores.better(chosen, plain[0]) else plain[0]
 
 
 def _with(parts: Sequence[HeadPart], more: Array) -> list[HeadPart]:
@@ -229,9 +229,13 @@ def _with(parts: Sequence[HeadPart], more: Array) -> list[HeadPart]:
     return [replace(p, columns=tuple(dict.fromkeys([*p.columns, *more.tolist()]))) for p in parts]
 
 
-def fewer(
-    court: Court, chosen: Judged, filters: Array, least: int, log: Callable[[str], None]
-) -> Judged:
+def with_fewer_filters(
+    scores: HeldOutScores,
+    chosen: ScoredPlan,
+    filters: Array,
+    least: int,
+    log: Callable[[str], None],
+) -> ScoredPlan:
     """`chosen` with half of its filters, a quarter and so on, at least `least`, as long as held-out
     parts show that this `holds`. filters: of each feature [F] the number of its filter, -1 where it
     has none."""
@@ -244,14 +248,16 @@ def fewer(
         parts = [
             replace(p, columns=tuple(c for c in p.columns if kept[c])) for p in full.plan.parts
         ]
-        less = court.judge(parts)
-        if not court.holds(less, full):
+        less = scores.score(parts)
+        if not scores.holds(less, full):
             break
         chosen = less
     return chosen
 
 
-def views(kinds: Sequence[Array], pools: Sequence[Array], copies: bool = False) -> list[HeadPart]:
+def filter_groups(
+    kinds: Sequence[Array], pools: Sequence[Array], copies: bool = False
+) -> list[HeadPart]:
     """A discriminant for each of `kinds`, filters [n] that are pooled in some ways."""
     return [
         HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), copies)

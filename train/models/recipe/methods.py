@@ -18,8 +18,8 @@ from train.data.sets import Dataset
 from train.models.linear_head import expanded_head, hold_out_or_all
 from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architecture
-from train.models.recipe.fit import FitRecipe, fit_on
 from train.models.recipe.fitted import CompactModel
+from train.models.recipe.stages import FitRecipe, fit_network_on
 from train.models.training import NetworkModel, describe_run, scale_steps
 
 Array = NDArray[Any]
@@ -41,7 +41,7 @@ def train_compact(
     occurs, where each occurs only once, or where a window is too short.
     """
     known = replace(sweeps, samples=inputs).select(())
-    fit = fit_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)
+    fit = fit_network_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)
     network, present, ran = (
         fit.network(),
         np.unique(sweeps.labels),

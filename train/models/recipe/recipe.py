@@ -28,7 +28,7 @@ from train.models.recipe import bank, choice, distribution, graph, spectrum
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ, Architecture
 from train.models.recipe.augment import Augmentation, default_augmentation
 from train.models.recipe.bank import Bank
-from train.models.recipe.choice import Court, Judged
+from train.models.recipe.choice import HeldOutScores, ScoredPlan
 from train.models.recipe.copies import COPIES, copies
 from train.models.recipe.fitted import Fit
 from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
@@ -109,16 +109,16 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     changed = list(copies(sweeps, augmentation, seed, COPIES))
     known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
     parts = inner_parts(sweeps)
-    court = Court([known] * len(parts), parts, classes, settings.reattached)
-    judged, stages = _choose(court, fixed, settings, partial(told, 2)), None
+    scores = HeldOutScores([known] * len(parts), parts, classes, settings.reattached)
+    judged, stages = _choose(scores, fixed, settings, partial(told, 2)), None
     train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
-    if may_train and court.accuracy(judged) < ENOUGH:
+    if may_train and scores.accuracy(judged) < ENOUGH:
         stages = _stages(
             train, fixed.scale, seed, replace(settings, augmentation=augmentation), partial(told, 3)
         )
         both = _side_by_side(_known(stages, sweeps, changed), known)
-        court = Court([both], [InnerPart(by, out)], classes, settings.reattached)
-        judged = _beside_stages(court, judged, fixed, settings, partial(told, 3))
+        scores = HeldOutScores([both], [InnerPart(by, out)], classes, settings.reattached)
+        judged = _beside_stages(scores, judged, fixed, settings, partial(told, 3))
     trunk, plan = _pruned(fixed, stages, judged.plan)
     heads: dict[str, Array] = {}
     for name, int8 in (("head", False), ("int8", True)):
@@ -138,7 +138,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         },
         "held_out_by": by,
         "chosen": describe(trunk, plan),
-        "validation": _validation(court, judged),
+        "validation": _validation(scores, judged),
     }
     return Fit(
         {**trunk.weights, **heads},
@@ -187,7 +187,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
-def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
+def _choose(scores: HeldOutScores, trunk: Trunk, settings: Settings, log: Log) -> ScoredPlan:
     """choice.choose for a trunk with the whole bank; the usual candidate where there is no
     choosing."""
     layout, filters = trunk.layout(), Bank.of(trunk.weights)
@@ -197,14 +197,16 @@ def _choose(court: Court, trunk: Trunk, settings: Settings, log: Log) -> Judged:
     )
     kinds = [which for free in (False, True) if len(which := np.flatnonzero(filters.free == free))]
     if not settings.choose:
-        return court.judge(choice.views([np.flatnonzero(~filters.free)], pools))
-    chosen = choice.choose(court, kinds, pools, levels, bands, log, settings.reattached)
-    return choice.fewer(court, chosen, _filter_numbers(trunk), bank.LEAST_FILTERS, log)
+        return scores.score(choice.filter_groups([np.flatnonzero(~filters.free)], pools))
+    chosen = choice.choose(scores, kinds, pools, levels, bands, log, settings.reattached)
+    return choice.with_fewer_filters(
+        scores, chosen, _filter_numbers(trunk), bank.LEAST_FILTERS, log
+    )
 
 
 def _beside_stages(
-    court: Court, judged: Judged, fixed: Trunk, settings: Settings, log: Log
-) -> Judged:
+    scores: HeldOutScores, judged: ScoredPlan, fixed: Trunk, settings: Settings, log: Log
+) -> ScoredPlan:
     """What was chosen with a discriminant of trained stages, with as few filters as then do.
 
     For a skin that will be reattached stages and the spectrum are enough unless held-out sweeps and
@@ -212,16 +214,16 @@ def _beside_stages(
     alone would not do as judges: they do not show what a view is good for in a condition that
     nobody recorded.
     """
-    size, full = sum(STAGES.channels), court.judge(_with_stages(judged.plan))
+    size, full = sum(STAGES.channels), scores.score(_with_stages(judged.plan))
     if not settings.choose:
         return full
     if settings.reattached:
         log("choosing: stages and the spectrum alone")
-        lean = court.judge(_stages_alone(fixed.layout().get("bands", slice(0, 0))))
-        if not court.better(full, lean):
+        lean = scores.score(_stages_alone(fixed.layout().get("bands", slice(0, 0))))
+        if not scores.better(full, lean):
             return lean
     numbers = np.append(np.full(size, -1), _filter_numbers(fixed))
-    return choice.fewer(court, full, numbers, bank.LEAST_FILTERS, log)
+    return choice.with_fewer_filters(scores, full, numbers, bank.LEAST_FILTERS, log)
 
 
 def _stages_alone(bands: slice) -> list[HeadPart]:
@@ -284,16 +286,14 @@ def _with_stages(plan: HeadPlan) -> list[HeadPart]:
 
 def _stages(sweeps: Dataset, scale: float, seed: int, settings: Settings, log: Log) -> Trunk:
     """Stages trained on `sweeps`, as a trunk of their own."""
-    from train.models.recipe import (
-        fit as training,
-    )  # here: the rest of the recipe needs no PyTorch
+    from train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
 
-    recipe = training.FitRecipe(steps=settings.steps, augmentation=settings.augmentation)
-    stages = replace(STAGES, mains_hz=settings.mains_hz)
-    weights, ranges = training.train_stages(
-        sweeps, scale, seed, recipe, log, stages, settings.unfinished
+    recipe = stages.FitRecipe(steps=settings.steps, augmentation=settings.augmentation)
+    architecture = replace(STAGES, mains_hz=settings.mains_hz)
+    weights, ranges = stages.train_stages(
+        sweeps, scale, seed, recipe, log, architecture, settings.unfinished
     )
-    return Trunk(sweeps, scale, weights, stages, ranges)
+    return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
 def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
@@ -344,9 +344,9 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
     return f"{', '.join(what)}; {len(plan.parts)} discriminants, {copied} with augmented copies"
 
 
-def _validation(court: Court, judged: Judged) -> dict[str, Any]:
+def _validation(scores: HeldOutScores, judged: ScoredPlan) -> dict[str, Any]:
     """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by part;
     copies do not count."""
-    right = (judged.logits.argmax(axis=1) == court.labels)[court.own]
-    low, high = interval(right, court.clusters[court.own])
+    right = (judged.logits.argmax(axis=1) == scores.labels)[scores.own]
+    low, high = interval(right, scores.clusters[scores.own])
     return {"accuracy": round(float(right.mean()), 4), "n": len(right), "low": low, "high": high}

@@ -12,7 +12,7 @@ from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.models.peers import minirocket, minirocket_augmented
-from train.models.recipe import fit
+from train.models.recipe import stages
 from train.models.recipe.architectures import DEFAULT
 from train.models.recipe.augment import SLOW, default_augmentation
 from train.models.recipe.copies import copies
@@ -21,7 +21,7 @@ from train.models.recipe.copies import copies
 def test_copies_are_augmented_as_in_our_own_training():
     """As many of them, augmented as for the format; a window that our networks cannot take is that
     of a slow sensor."""
-    assert minirocket_augmented.COPIES == fit.COPIES
+    assert minirocket_augmented.COPIES == stages.COPIES
     for window in (64, 1500):
         assert minirocket_augmented.augmentation(window) == default_augmentation(
             DEFAULT.zero_sum(window)

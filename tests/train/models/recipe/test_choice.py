@@ -11,7 +11,7 @@ from appliance.inference.classifier import softmax
 from train.data.splitters import InnerPart
 from train.models import discriminant
 from train.models.recipe import choice
-from train.models.recipe.choice import Court
+from train.models.recipe.choice import HeldOutScores
 from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
 
 GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
@@ -33,10 +33,10 @@ def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
     return given, [InnerPart("place", group == value) for value in range(3)]
 
 
-def court() -> Court:
+def scores() -> HeldOutScores:
     """Of `known`."""
     given, parts = known()
-    return Court([given] * 3, parts, 3)
+    return HeldOutScores([given] * 3, parts, 3)
 
 
 def test_a_plan_is_the_sum_of_its_discriminants():
@@ -75,8 +75,8 @@ def test_a_part_takes_the_copies_of_its_sweeps_alone():
 def test_what_lies_in_another_group_is_not_chosen():
     """The feature that names every material within a group is the worst of all for a group that was
     not seen."""
-    at = court()
-    losses = [at.loss(at.judge([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
+    at = scores()
+    losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
     assert losses[0] < 0.2 < losses[1]
     assert losses[0] < losses[2]
     pools = np.array(GOOD), np.array(NOISE)
@@ -90,7 +90,7 @@ def test_what_lies_in_another_group_is_not_chosen():
 def test_what_is_clearly_better_is_chosen():
     """Bands that name the materials, beside filters that say nothing; all discriminants see
     them."""
-    at = court()
+    at = scores()
     chosen = choice.choose(
         at,
         [np.arange(2)],
@@ -100,16 +100,16 @@ def test_what_is_clearly_better_is_chosen():
         print,
     )
     assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
-    assert at.better(chosen, at.judge([HeadPart(NOISE, False)]))
+    assert at.better(chosen, at.score([HeadPart(NOISE, False)]))
 
 
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
     """A discriminant of all magnitudes and one of all features, without copies."""
-    at = court()
+    at = scores()
     chosen = choice.choose(
         at, [np.arange(2)], (np.array(GOOD), np.array(NOISE)), np.arange(0), np.arange(0), print
     )
-    assert chosen.plan == at.judge([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
+    assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
 
 
 def test_a_factor_from_before_does_not_count():
@@ -117,17 +117,19 @@ def test_a_factor_from_before_does_not_count():
     of other sweeps."""
     given, parts = known()
     for factor in (1.0, 1e-3):
-        at = Court([given] * 3, parts, 3)
-        both = at.judge([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
-        fresh = Court([given] * 3, parts, 3).judge([HeadPart(GOOD, False), HeadPart(NOISE, False)])
+        at = HeldOutScores([given] * 3, parts, 3)
+        both = at.score([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
+        fresh = HeldOutScores([given] * 3, parts, 3).score(
+            [HeadPart(GOOD, False), HeadPart(NOISE, False)]
+        )
         assert both.plan == fresh.plan
 
 
 def test_loss_alone_is_no_reason():
     """Of two that name the same sweeps rightly, neither is better, however sure one is of what it
     names wrongly."""
-    at = court()
-    one = at.judge([HeadPart(GOOD, False)])
+    at = scores()
+    one = at.score([HeadPart(GOOD, False)])
     wrong = one.logits.argmax(axis=1) != at.labels
     surer = replace(one, losses=one.losses + 5.0 * wrong)
     assert at.loss(surer) > at.loss(one)
@@ -146,14 +148,14 @@ def test_fewer_filters_where_held_out_parts_show_no_loss():
         np.float32
     )
     own = HeadData(x, given.labels, np.empty((0, 17), np.float32), np.empty(0, int))
-    at, number = Court([own] * 3, parts, 3), np.append(np.arange(16), -1)
-    full = at.judge([HeadPart(tuple(range(17)), False)])
+    at, number = HeldOutScores([own] * 3, parts, 3), np.append(np.arange(16), -1)
+    full = at.score([HeadPart(tuple(range(17)), False)])
     tried: list[str] = []
     # every other of these has the same sign: a half is not enough to name the materials
-    assert choice.fewer(at, full, number, 4, tried.append) == full
+    assert choice.with_fewer_filters(at, full, number, 4, tried.append) == full
     assert tried == ["choosing: 8 filters"]
     pairs = np.append(np.arange(16) // 2, -1)
-    less = choice.fewer(at, full, pairs, 2, print)
+    less = choice.with_fewer_filters(at, full, pairs, 2, print)
     assert less.plan.parts[0].columns == (0, 1, 8, 9, 16)
     assert at.accuracy(less) > at.accuracy(full) - 0.01
 
@@ -161,14 +163,14 @@ def test_fewer_filters_where_held_out_parts_show_no_loss():
 def test_too_few_sweeps_show_nothing():
     """A hundred sweeps, all named rightly by fewer filters: that may be luck, so all stay."""
     given, parts = known(99)
-    at = Court([given] * 3, parts, 3)
-    sure = at.judge([HeadPart(GOOD, False)])
+    at = HeldOutScores([given] * 3, parts, 3)
+    sure = at.score([HeadPart(GOOD, False)])
     assert not at.holds(sure, sure)
     many, parts = known(600)
-    at = Court([many] * 3, parts, 3)
-    sure = at.judge([HeadPart(GOOD, False)])
+    at = HeldOutScores([many] * 3, parts, 3)
+    sure = at.score([HeadPart(GOOD, False)])
     assert at.holds(sure, sure)
-    assert not at.holds(at.judge([HeadPart(NOISE, False)]), sure)
+    assert not at.holds(at.score([HeadPart(NOISE, False)]), sure)
 
 
 def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
@@ -182,8 +184,8 @@ def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
         np.empty((0, 400)),
         np.empty(0, int),
     )
-    at = Court([own] * 3, parts, 3)
-    assert at.accuracy(at.judge([HeadPart(tuple(range(400)), False)])) < 0.5
+    at = HeldOutScores([own] * 3, parts, 3)
+    assert at.accuracy(at.score([HeadPart(tuple(range(400)), False)])) < 0.5
     assert at.labels.tolist() == given.labels.tolist()
 
 
@@ -199,21 +201,24 @@ def test_copies_of_held_out_sweeps_count_as_much_as_these():
     )
     both = replace(given, features=blind[0], copied=blind[1])
     fails, stands = [HeadPart(GOOD, False)], [HeadPart((5, 6), False)]
-    in_place, moved = Court([both] * 3, parts, 3), Court([both] * 3, parts, 3, copied=True)
+    in_place, moved = (
+        HeldOutScores([both] * 3, parts, 3),
+        HeldOutScores([both] * 3, parts, 3, copied=True),
+    )
     assert in_place.own.all()
-    assert in_place.accuracy(in_place.judge(fails)) == in_place.accuracy(in_place.judge(stands))
+    assert in_place.accuracy(in_place.score(fails)) == in_place.accuracy(in_place.score(stands))
     assert moved.own.sum() == len(given.labels) == (~moved.own).sum()
     assert moved.weights[moved.own].sum() == pytest.approx(0.5)
-    assert moved.better(moved.judge(stands), moved.judge(fails))
-    assert not moved.holds(moved.judge(fails), moved.judge(stands))
-    own = moved.judge(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
-    assert own.mean() == pytest.approx(in_place.accuracy(in_place.judge(fails)))
+    assert moved.better(moved.score(stands), moved.score(fails))
+    assert not moved.holds(moved.score(fails), moved.score(stands))
+    own = moved.score(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
+    assert own.mean() == pytest.approx(in_place.accuracy(in_place.score(fails)))
 
 
 def test_the_temperature_is_the_best_for_held_out_sweeps():
     """No other divisor of its logits gives less loss; every group counts the same."""
-    at = court()
-    judged = at.judge([HeadPart(GOOD, False), HeadPart(NOISE, True)])
+    at = scores()
+    judged = at.score([HeadPart(GOOD, False), HeadPart(NOISE, True)])
 
     def loss(temperature: float) -> float:
         p = softmax(judged.logits / temperature)[np.arange(240), at.labels]
@@ -233,12 +238,12 @@ def test_candidates_are_what_the_features_allow():
         (np.array([0, 1]), np.array([2, 3])),
         np.arange(0),
     )
-    choice.choose(court(), kinds, pools, none, np.array([4]), tried.append)
+    choice.choose(scores(), kinds, pools, none, np.array([4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 5
     assert tried[:2] == ["choosing: magnitudes, shares, distribution", "choosing: magnitudes"]
     assert tried[-1] == "choosing: the spectrum alone, with copies"
     tried.clear()
-    chosen = choice.choose(court(), kinds[:1], pools, none, none, tried.append)
+    chosen = choice.choose(scores(), kinds[:1], pools, none, none, tried.append)
     assert len(tried) == 2 + 1
     assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
 
@@ -247,7 +252,7 @@ def test_every_discriminant_sees_copies_where_these_are_wanted():
     """Fewer candidates: none is there without."""
     tried: list[str] = []
     kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
-    chosen = choice.choose(court(), kinds, pools, np.arange(0), np.array([4]), tried.append, True)
+    chosen = choice.choose(scores(), kinds, pools, np.arange(0), np.array([4]), tried.append, True)
     assert all(part.copies for part in chosen.plan.parts)
     assert len(tried) == len(set(tried)) == 2 + 2
 
@@ -264,7 +269,7 @@ def test_the_usual_one_sees_each_kind_three_times():
         copied=np.zeros((240, 12)),
     )
     kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
-    at = Court([own] * 3, parts, 3)
+    at = HeldOutScores([own] * 3, parts, 3)
     chosen = choice.choose(at, kinds, pools, np.arange(4, 8), np.arange(8, 12), print)
     wanted = [(0,), (1,)]
     wanted += [(kind, kind + 2, 8, 9, 10, 11) for kind in (0, 1)] + [

@@ -19,13 +19,13 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.methods import Effort
-from train.models.recipe import fit, graph, network, nodes, spectrum
+from train.models.recipe import graph, network, nodes, spectrum, stages
 from train.models.recipe import methods as compact_methods
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.recipe.augment import Augmentation
-from train.models.recipe.fit import FitRecipe
 from train.models.recipe.fitted import Fit
 from train.models.recipe.network import Compact
+from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import cost as graph_cost
 from train.onnx_tools import graph_builder
 
@@ -78,7 +78,7 @@ def seen(model: Compact, counts: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set."""
-    return fit.fit(easy(), 1, FitRecipe(steps=40), architecture=SMALL)
+    return stages.fit_network(easy(), 1, FitRecipe(steps=40), architecture=SMALL)
 
 
 @pytest.mark.slow
@@ -348,7 +348,7 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
     y += np.where(useful, known[held], rng.standard_normal((60, 27)))
     for fewest in (0, 1):
         model.architecture = replace(SMALL, spectrum=True, fewest=fewest)
-        less, weights = fit._select_depth(model, ((x, y), (x, y)), labels, held)
+        less, weights = stages._select_depth(model, ((x, y), (x, y)), labels, held)
         least = max(depth, fewest)
         assert (len(less.convs), less.architecture) == (
             least,
@@ -358,7 +358,7 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
         assert weights["int8.weight"].shape == weights["head.weight"].shape == (3, seen_by_heads)
     if not useful[BANDS].any():
         model.architecture = SMALL
-        less, _ = fit._select_depth(model, ((x[:, ~BANDS], y[:, ~BANDS]),) * 2, labels, held)
+        less, _ = stages._select_depth(model, ((x[:, ~BANDS], y[:, ~BANDS]),) * 2, labels, held)
         assert less.architecture == SMALL.cut(depth)
 
 
@@ -384,15 +384,15 @@ def test_a_cut_network_gives_what_its_first_stages_gave():
 def bare() -> compact_methods.CompactModel:
     """The method of the box where its stages say nothing about what was held out."""
 
-    def blind(model: Compact, *others: object) -> fit.HeadInputs:
+    def blind(model: Compact, *others: object) -> stages.HeadInputs:
         inputs, size = seen_by_heads(model, *others), sum(model.architecture.channels)
         for _, held in inputs:
             held[:, :size] = 9 * np.random.default_rng(0).standard_normal((len(held), size))
         return inputs
 
-    seen_by_heads, s = fit._head_inputs, easy()
+    seen_by_heads, s = stages._head_inputs, easy()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "_head_inputs", blind)
+        patch.setattr(stages, "_head_inputs", blind)
         return methods.find(["compact"], Effort(share=0.01))[0].train(s, s.samples, 1)
 
 
@@ -445,7 +445,7 @@ def test_training_augments_as_its_generator_says(frames: int):
         torch.Generator().manual_seed(3),
         torch.Generator().manual_seed(3),
     )
-    change = fit.augmenter(format, Augmentation())
+    change = stages.augmenter(format, Augmentation())
     first, second, same = change(x, rng), change(x, rng), change(x, again)
     assert first.shape == x.shape
     assert first.dtype == torch.float32
@@ -458,7 +458,7 @@ def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
     """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each
     tenth."""
     s = easy(6)
-    made = fit.fit(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
+    made = stages.fit_network(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
     level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
     first = sum(made.architecture.channels)
     for int8 in (False, True):

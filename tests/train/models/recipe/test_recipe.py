@@ -192,7 +192,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     trunk holds no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
-    monkeypatch.setattr(choice.Court, "better", lambda *_: better)
+    monkeypatch.setattr(choice.HeldOutScores, "better", lambda *_: better)
     fit = recipe.fit(easy(), 1, Settings(steps=20, reattached=True))
     bands = fit.bands
     assert bands

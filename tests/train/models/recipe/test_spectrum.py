@@ -19,10 +19,10 @@ from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models.methods import Effort
-from train.models.recipe import fit, graph, methods, spectrum
+from train.models.recipe import graph, methods, spectrum, stages
 from train.models.recipe.architectures import ARCHITECTURES, Architecture
-from train.models.recipe.fit import FitRecipe
 from train.models.recipe.network import Compact
+from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import graph_builder
 
 BARE = ARCHITECTURES["bands"]
@@ -247,7 +247,7 @@ def test_a_window_too_short_has_no_spectrum():
     convolutions refuses with the reason."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
-    made = fit.fit(short, 1, FitRecipe(steps=2))
+    made = stages.fit_network(short, 1, FitRecipe(steps=2))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
     assert made.architecture.channels
     method = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]

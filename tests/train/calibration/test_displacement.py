@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from appliance.bundle.bundle import Classes
-from train.calibration import moved, novelty
-from train.calibration.moved import AugmentedCopies, fit_moved
+from train.calibration import displacement, novelty
+from train.calibration.displacement import AugmentedCopies, fit_displacement
 from train.models.recipe.augment import Augmentation
 
 MEANS = 8 * np.eye(4)[:3]
@@ -23,7 +23,7 @@ def sweeps(n: int, seed: int, spread: float = 0.0):
 
 
 def made(n: int = 20, wrong: float = 0.0):
-    """A MovedFit; of the held-out copies the share `wrong` is named wrongly, less surely than the
+    """A DisplacementFit; of the held-out copies the share `wrong` is named wrongly, less surely than the
     others are rightly."""
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
@@ -33,14 +33,14 @@ def made(n: int = 20, wrong: float = 0.0):
     logits = 4 * np.eye(3)[truth]
     others = np.arange(len(truth)) < wrong * len(truth)
     logits[others] = 1.2 * np.eye(3)[(truth[others] + 1) % 3]
-    return novelty.embed(x, labels, 2), fit_moved(x, labels, held, 2, copied, logits), copied
+    return novelty.embed(x, labels, 2), fit_displacement(x, labels, held, 2, copied, logits), copied
 
 
 def test_copies_that_judge_are_moved_and_nothing_else():
     """The skin's place, its contact and its gains change; what the sensor adds or loses does
     not."""
     usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
-    judging = moved.displaced(usual)
+    judging = displacement.displaced(usual)
     assert (
         judging.noise,
         judging.noisy,
@@ -88,7 +88,7 @@ def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
     more than for any sweep."""
     _, fit, _ = made()
     assert fit
-    assert (fit.rule.unsure, fit.rule.temperature) == (moved.UNSURE[0], 1)
+    assert (fit.rule.unsure, fit.rule.temperature) == (displacement.UNSURE[0], 1)
     _, fit, _ = made(wrong=0.1)
     assert fit
     assert 0.5 < fit.rule.unsure < 0.95
@@ -103,9 +103,9 @@ def test_copies_that_are_surely_wrong_leave_no_sure_answer():
     truth = labels[groups >= 6]
     logits = 40.0 * np.eye(3)[(truth + (np.arange(len(truth)) % 2)) % 3]
     logits[:, :] = np.where(logits > 0, 1e6, 0)
-    fit = fit_moved(x, labels, groups >= 6, 2, copied, logits)
+    fit = fit_displacement(x, labels, groups >= 6, 2, copied, logits)
     assert fit
-    assert fit.rule.unsure == moved.NEVER
+    assert fit.rule.unsure == displacement.NEVER
 
 
 def test_without_copies_that_judge_there_is_no_rule():
@@ -114,10 +114,10 @@ def test_without_copies_that_judge_there_is_no_rule():
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])
-    assert fit_moved(x, labels, held, 2, none, np.zeros((0, 3))) is None
+    assert fit_displacement(x, labels, held, 2, none, np.zeros((0, 3))) is None
     copied = AugmentedCopies(x, labels, groups, held)
     logits = np.zeros((int(held.sum()), 3))
     lacking = copied.take((labels < 2) | held)
-    assert fit_moved(x, labels, held, 2, lacking, logits) is None
+    assert fit_displacement(x, labels, held, 2, lacking, logits) is None
     some = (labels < 2) | held
-    assert fit_moved(x[some], labels[some], held[some], 2, copied, logits) is None
+    assert fit_displacement(x[some], labels[some], held[some], 2, copied, logits) is None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.factories.posthoc_inputs import plain_inputs
+from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.sweep_sets import easy
-from train.calibration.posthoc import ONE_IN, fit_posthoc, posthoc_inputs
+from train.calibration.calibrate import ONE_IN, calibration_inputs, fit_calibration
 from train.models.recipe import recipe
 
 NOISE = np.array([0.0, 0.0, 0.0, 12.0])
@@ -35,8 +35,10 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     more = [np.concatenate([of[known], of[known][one]]) for of in (x, y, at)]
     more[0][known.sum() :] += factors * NOISE
     disturbed = np.arange(len(more[0])) >= known.sum()
-    plain = fit_posthoc(plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1))
-    sturdy = fit_posthoc(plain_inputs(*more, ~disturbed, 1, disturbed=disturbed))
+    plain = fit_calibration(
+        plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
+    )
+    sturdy = fit_calibration(plain_inputs(*more, ~disturbed, 1, disturbed=disturbed))
     shaken = x[known][:, -1] + NOISE / 3
     kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
     assert kept[0] < 0.3
@@ -51,7 +53,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten of them, changed, of the same materials and groups; none judges."""
     fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
-    given = posthoc_inputs(fit)
+    given = calibration_inputs(fit)
     tenths, labels, groups, judged, disturbed = (
         given.tenths,
         given.labels,

@@ -17,11 +17,11 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data import sets
 from train.models import linear_head
-from train.models.recipe import architectures, fit, spectrum
+from train.models.recipe import architectures, spectrum, stages
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT
-from train.models.recipe.fit import FitRecipe
 from train.models.recipe.fitted import Fit
 from train.models.recipe.network import Compact
+from train.models.recipe.stages import FitRecipe
 
 QUICK = FitRecipe(steps=40)
 
@@ -29,7 +29,7 @@ QUICK = FitRecipe(steps=40)
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set."""
-    return fit.fit(easy(), 1, QUICK)
+    return stages.fit_network(easy(), 1, QUICK)
 
 
 @pytest.mark.slow
@@ -139,13 +139,14 @@ def test_a_fit_is_its_seed_s_alone(fitted: Fit):
     others."""
     torch.manual_seed(99)
     before, threads = torch.get_rng_state(), torch.get_num_threads()
-    again = fit.fit(easy(), 1, QUICK)
+    again = stages.fit_network(easy(), 1, QUICK)
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.get_num_threads() == threads
     for name, value in fitted.weights.items():
         np.testing.assert_array_equal(again.weights[name], value)
     assert not np.array_equal(
-        fit.fit(easy(), 2, QUICK).weights["convs.0.weight"], fitted.weights["convs.0.weight"]
+        stages.fit_network(easy(), 2, QUICK).weights["convs.0.weight"],
+        fitted.weights["convs.0.weight"],
     )
 
 
@@ -154,7 +155,7 @@ def test_positions_are_held_out_where_there_are_several():
     """The figures of validation are of positions that training never saw."""
     s = easy()
     s.groups["position"] = np.arange(len(s)) % 5
-    made = fit.fit(s, 1, replace(QUICK, steps=2))
+    made = stages.fit_network(s, 1, replace(QUICK, steps=2))
     assert made.about["held_out_by"] == "position"
     assert len(np.unique(made.held.groups["position"])) == 1
     assert not set(made.train.groups["position"]) & set(made.held.groups["position"])
@@ -183,7 +184,7 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
 
 def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
     """No iteration, no cost; it distinguishes what is easy, and comes back from its file."""
-    made = fit.fit(easy(), 1, QUICK, architecture=ARCHITECTURES["bands"])
+    made = stages.fit_network(easy(), 1, QUICK, architecture=ARCHITECTURES["bands"])
     assert (made.architecture, made.bands, made.cost) == (ARCHITECTURES["bands"], 5, [])
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
     assert made.about["validation"]["accuracy"] > 0.9
@@ -191,7 +192,7 @@ def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
     again = Fit.load(tmp_path / "fit.npz")
     assert (again.architecture, again.ranges) == (made.architecture, made.ranges)
     np.testing.assert_array_equal(
-        fit.features(again.network(), made.held), fit.features(made.network(), made.held)
+        stages.features(again.network(), made.held), stages.features(made.network(), made.held)
     )
     assert again.trunk() == made.trunk()
 
@@ -224,7 +225,7 @@ def test_fabrics_are_distinguished(tmp_path: Path):
     whole = sets.load(str(path)).select(["direction=0", "force<=180"])
     assert len(whole.materials) == 7
     seen, unseen = whole.split("recording", 0.7, 1)
-    made = fit.fit(seen, 1, FitRecipe(steps=300))
+    made = stages.fit_network(seen, 1, FitRecipe(steps=300))
     with torch.no_grad():
         given = (
             made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()

@@ -53,7 +53,7 @@ class AugmentedCopies:
 
 
 @dataclass(frozen=True)
-class MovedFit:
+class DisplacementFit:
     """turned: the Embedding of an embedding z, fitted to copies. rule: for the manifest."""
 
     turned: Embedding
@@ -75,12 +75,12 @@ def displaced(augmentation: Augmentation) -> Augmentation:
     return replace(augmentation, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0, clipped=0.0)
 
 
-def fit_moved(
+def fit_displacement(
     whole: Array, labels: Array, judged: Array, fixed: int, copied: AugmentedCopies, logits: Array
-) -> MovedFit | None:
+) -> DisplacementFit | None:
     """The rule for moved sweeps; None where there are no copies to fit it or to judge by.
 
-    whole, labels, judged: features [N, F], labels [N] and bool [N] as for posthoc.fit_posthoc.
+    whole, labels, judged: features [N, F], labels [N] and bool [N] as for calibrate.fit_calibration.
     logits: [m, K] of the copies that are held out, calibrated for sweeps in place, by a head that
     saw none of their groups.
     """
@@ -106,7 +106,7 @@ def fit_moved(
     enough = [
         float(level) for level in UNSURE if np.mean(wrong & (p.max(1) >= level)) <= MOST_WRONG
     ]
-    return MovedFit(
+    return DisplacementFit(
         turn(np.ones(len(labels), bool))[1],
         Moved(beyond, temperature, enough[0] if enough else NEVER),
     )

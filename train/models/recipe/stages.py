@@ -67,7 +67,7 @@ class FitRecipe(training.TrainingRecipe):
         return fields | {"scene": fields.pop("augmentation")}
 
 
-def fit(
+def fit_network(
     sweeps: Dataset,
     seed: int,
     recipe: FitRecipe,
@@ -77,10 +77,10 @@ def fit(
 ) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for
     windows too short."""
-    return fit_on(*hold_out(sweeps, seed), seed, recipe, log, architecture, unfinished)
+    return fit_network_on(*hold_out(sweeps, seed), seed, recipe, log, architecture, unfinished)
 
 
-def fit_on(
+def fit_network_on(
     train: Dataset,
     held: Dataset,
     by: str,

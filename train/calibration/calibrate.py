@@ -1,5 +1,5 @@
 """Everything that is fitted after training. In: a Fit, or its trunk's features of the training
-sweeps. Out: a Posthoc.
+sweeps. Out: a Calibration.
 
 That is an embedding, heads for each tenth, temperatures, the rule for early decisions, the limit of
 what is known, and the graph of all of it. What was fitted is judged by sweeps that it did not see,
@@ -22,8 +22,13 @@ from onnx import TensorProto, helper, numpy_helper
 from appliance.bundle.bundle import Known, Moved
 from appliance.inference.classifier import softmax
 from train.calibration import early_exit, novelty
+from train.calibration.displacement import (
+    AugmentedCopies,
+    DisplacementFit,
+    displaced,
+    fit_displacement,
+)
 from train.calibration.early_exit import EarlyRule, Heads
-from train.calibration.moved import AugmentedCopies, MovedFit, displaced, fit_moved
 from train.calibration.novelty import Embedding
 from train.calibration.temperature import fit_temperature
 from train.models.linear_head import hold_out
@@ -72,11 +77,11 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Posthoc:
+class Calibration:
     """What is fitted to a trunk. weight [F, K], bias [K]: the head that names the material, divided
     by `temperature`.
 
-    warmth: temperature of logits from class means. steps: heads of the tenths, with their
+    class_mean_temperature: temperature of logits from class means. steps: heads of the tenths, with their
     temperatures. limit: see novelty. moved: for sweeps of a moved skin, None where there were no
     copies to fit it to. held: what it answers to held-out sweeps.
     """
@@ -85,11 +90,11 @@ class Posthoc:
     weight: Array
     bias: Array
     temperature: float
-    warmth: float
+    class_mean_temperature: float
     steps: Heads
     rule: EarlyRule
     limit: float
-    moved: MovedFit | None
+    moved: DisplacementFit | None
     held: HeldOut
 
     def logits(self, features: Array) -> Array:
@@ -105,9 +110,9 @@ class Posthoc:
 
     def known(self) -> Known:
         """The entry `known` of a manifest."""
-        return Known(self.limit, self.warmth)
+        return Known(self.limit, self.class_mean_temperature)
 
-    def moved_rule(self) -> Moved | None:
+    def displacement_rule(self) -> Moved | None:
         """The entry `moved` of a manifest."""
         return self.moved.rule if self.moved else None
 
@@ -130,7 +135,7 @@ class Posthoc:
 
 
 @dataclass(frozen=True)
-class PosthocInputs:
+class CalibrationInputs:
     """What everything is fitted to: features [N, D + 1, F] of sweeps with labels [N] from 0 to K -
     1, of groups [N].
 
@@ -154,13 +159,13 @@ class PosthocInputs:
     plan: HeadPlan | None = None
 
 
-def calibrate(fit: Fit) -> Posthoc:
-    """Fit everything to the int8 trunk of `fit`. Raises FormatError as `posthoc_inputs` and
-    `fit_posthoc`."""
-    return fit_posthoc(posthoc_inputs(fit))
+def calibrate(fit: Fit) -> Calibration:
+    """Fit everything to the int8 trunk of `fit`. Raises FormatError as `calibration_inputs` and
+    `fit_calibration`."""
+    return fit_calibration(calibration_inputs(fit))
 
 
-def posthoc_inputs(fit: Fit) -> PosthocInputs:
+def calibration_inputs(fit: Fit) -> CalibrationInputs:
     """What the int8 trunk of `fit` gives for the sweeps that were trained on, held out and
     disturbed, in this order, and for augmented copies of the first two. Raises FormatError where
     none was held out: nothing could judge."""
@@ -191,10 +196,12 @@ def posthoc_inputs(fit: Fit) -> PosthocInputs:
     copied = AugmentedCopies(
         np.concatenate(features), np.concatenate(sides), copied_groups, is_held
     )
-    return PosthocInputs(tenths, labels, groups, role == 1, fit.bands, copied, role == 2, fit.plan)
+    return CalibrationInputs(
+        tenths, labels, groups, role == 1, fit.bands, copied, role == 2, fit.plan
+    )
 
 
-def fit_posthoc(given: PosthocInputs) -> Posthoc:
+def fit_calibration(given: CalibrationInputs) -> Calibration:
     """Fit all of it. Raises FormatError as novelty.embed, and where there is only one group or
     nothing to judge by."""
     tenths, labels, groups, judged, fixed = (
@@ -216,7 +223,7 @@ def fit_posthoc(given: PosthocInputs) -> Posthoc:
         return weight.T, bias
 
     logits, numbers = early_exit.cross_fitted_logits(tenths, labels, groups, judged, fixed)
-    warmth = fit_temperature(logits[:, -1], labels[numbers], groups[numbers])
+    class_mean_temperature = fit_temperature(logits[:, -1], labels[numbers], groups[numbers])
     row_of = {number: row for row, number in enumerate(numbers)}
     for fit, judges in novelty.parts(groups, judged):
         weight, bias = naming_head(fit)
@@ -235,12 +242,21 @@ def fit_posthoc(given: PosthocInputs) -> Posthoc:
     moved = None
     if more.held.any():
         weight, bias = naming_head(~np.isin(groups, groups[judged]))
-        moved = fit_moved(
+        moved = fit_displacement(
             whole, labels, judged, fixed, more, (more.features[more.held] @ weight + bias) / last
         )
     weight, bias = naming_head(every)
-    return Posthoc(
-        embedding, weight / last, bias / last, last, warmth, steps, rule, limit, moved, held
+    return Calibration(
+        embedding,
+        weight / last,
+        bias / last,
+        last,
+        class_mean_temperature,
+        steps,
+        rule,
+        limit,
+        moved,
+        held,
     )
 
 

@@ -1,11 +1,11 @@
-"""What `fit_posthoc` is fitted to, without augmented copies where none are given."""
+"""What `fit_calibration` is fitted to, without augmented copies where none are given."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from train.calibration.moved import AugmentedCopies
-from train.calibration.posthoc import PosthocInputs
+from train.calibration.calibrate import CalibrationInputs
+from train.calibration.displacement import AugmentedCopies
 
 
 def plain_inputs(
@@ -15,10 +15,10 @@ def plain_inputs(
     judged: np.ndarray,
     fixed: int = 0,
     disturbed: np.ndarray | None = None,
-) -> PosthocInputs:
+) -> CalibrationInputs:
     """Features [N, D + 1, F] and what is known of these sweeps; disturbed: None where none is."""
     none = AugmentedCopies(tenths[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
-    return PosthocInputs(
+    return CalibrationInputs(
         tenths,
         labels,
         groups,
