@@ -30,7 +30,7 @@ from train.calibration.displacement import (
 )
 from train.calibration.early_exit import EarlyRule, Heads
 from train.calibration.novelty import Embedding
-from train.calibration.temperature import fit_temperature
+from train.metrics.temperature import sufficient_temperature
 from train.models.linear_head import hold_out
 from train.models.recipe.augment import Augmentation
 from train.models.recipe.copies import COPIES, copies
@@ -223,7 +223,7 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
         return weight.T, bias
 
     logits, numbers = early_exit.cross_fitted_logits(tenths, labels, groups, judged, fixed)
-    class_mean_temperature = fit_temperature(logits[:, -1], labels[numbers], groups[numbers])
+    class_mean_temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])
     row_of = {number: row for row, number in enumerate(numbers)}
     for fit, judges in novelty.parts(groups, judged):
         weight, bias = naming_head(fit)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import Classes, Moved, MovedClasses
 from appliance.inference.classifier import softmax
 from train.calibration.novelty import Embedding, embed, limit
-from train.calibration.temperature import fit_temperature
+from train.metrics.temperature import sufficient_temperature
 from train.models.recipe.augment import Augmentation
 
 Array = NDArray[Any]
@@ -100,7 +100,7 @@ def fit_displacement(
     across, judge = turn(~judged)
     novelty = judge.novelty(across(judging.features))
     beyond = limit(novelty)
-    temperature = fit_temperature(logits, judging.labels, judging.groups)
+    temperature = sufficient_temperature(logits, judging.labels, judging.groups)
     p = softmax(logits / temperature)
     wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)
     enough = [

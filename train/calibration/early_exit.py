@@ -17,7 +17,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.bundle.bundle import Early
 from train.calibration.novelty import embed_present, parts
-from train.calibration.temperature import fit_temperature
+from train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
@@ -126,7 +126,9 @@ def cross_fitted_logits(
 def fit_temperatures(logits: Array, labels: Array, groups: Array) -> Array:
     """One for each step and the whole: logits [n, D + 1, K] of sweeps that the heads did not see ->
     [D + 1]."""
-    return np.array([fit_temperature(step, labels, groups) for step in logits.swapaxes(0, 1)])
+    return np.array(
+        [sufficient_temperature(step, labels, groups) for step in logits.swapaxes(0, 1)]
+    )
 
 
 def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:

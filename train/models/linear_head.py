@@ -20,20 +20,18 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
+from train.metrics.temperature import platt_temperature
 from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
 HELD_OUT = 0.2
 """Share of the groups that training does not see: they give the temperature and the validation
 accuracy."""
-TEMPERATURES = np.geomspace(1, 100, 200)
-"""Candidates, from LDA's own posteriors, which are never too modest, to an almost uniform
-distribution."""
 ABSENT = -30.0
 """Logit of a material that training never saw, where the best of the others is never below 0: its
 probability is below 1e-12."""
 SHARPENING = 30.0
-"""Factor on margins before `fit_temperature`: margins are about 1 and need sharpening, while it
+"""Factor on margins before `platt_temperature`: margins are about 1 and need sharpening, while it
 only softens."""
 
 
@@ -110,29 +108,8 @@ def closed_form_head(
     weight, bias = lda.coef_, lda.intercept_
     if len(weight) == 1:  # of two classes scikit-learn gives only the difference
         weight, bias = np.vstack([0 * weight, weight]), np.append(0, bias)
-    temperature = fit_temperature(held_out @ weight.T + bias, held_out_labels)
+    temperature = platt_temperature(held_out @ weight.T + bias, held_out_labels)
     return (weight / temperature).astype(np.float32), (bias / temperature).astype(np.float32)
-
-
-def fit_temperature(logits: Array, labels: Array) -> float:
-    """The divisor of `logits` [N, K], one of TEMPERATURES, with the best likelihood of `labels`
-    [N].
-
-    Each label counts as right with probability (N + 1) / (N + 2), Platt's correction (Platt 1999):
-    without it a few held-out sweeps, all right, would allow any certainty.
-    """
-    wrong = 1 / (len(labels) + 2)
-    costs = []
-    for t in TEMPERATURES:
-        z = logits / t
-        z = z - z.max(axis=1, keepdims=True)
-        log_p = z - np.log(np.exp(z).sum(axis=1, keepdims=True))
-        costs.append(
-            -np.mean(
-                (1 - wrong) * log_p[np.arange(len(labels)), labels] + wrong * log_p.mean(axis=1)
-            )
-        )
-    return float(TEMPERATURES[np.argmin(costs)])
 
 
 def train_linear_head(
@@ -158,7 +135,7 @@ def train_linear_head(
         train, held_out = (side.group("index") for side in hold_out(numbered, seed)[:2])
         weight, bias = _centred(*fit(computed[train], labels[train]))
         margins = computed[held_out] @ weight.T + bias
-        factor = SHARPENING / fit_temperature(SHARPENING * margins, labels[held_out])
+        factor = SHARPENING / platt_temperature(SHARPENING * margins, labels[held_out])
     all_weight = np.zeros((len(sweeps.materials), computed.shape[1]), np.float32)
     all_bias = np.full(len(sweeps.materials), ABSENT, np.float32)
     weight, bias = _centred(*fit(computed, labels))

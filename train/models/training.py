@@ -26,8 +26,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from appliance.core.types import SweepFormat
 from train.data.sets import Dataset
+from train.metrics.temperature import platt_temperature
 from train.models.checkpoint import Checkpoint, Stateful, default_generators
-from train.models.linear_head import fit_temperature, hold_out_or_all
+from train.models.linear_head import hold_out_or_all
 from train.models.methods import Cost, Effort, Log, Method, Model, no_log, spoken
 from train.models.networks import Network
 from train.onnx_tools.graph_builder import GraphModel
@@ -270,7 +271,7 @@ def train_network(
         )
         trained = NetworkModel(network, describe_run(recipe, device, half, bfloat16), cost)
     temperature = (
-        fit_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
+        platt_temperature(trained.logits(held_out.samples), held_out.labels) if calibrated else 1.0
     )
     network.expand_head(np.unique(sweeps.labels), len(sweeps.materials), temperature)
     return replace(

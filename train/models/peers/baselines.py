@@ -34,7 +34,7 @@ from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY
 from appliance.inference.session import session
 from train.data.sets import Dataset
-from train.models.linear_head import fit_temperature
+from train.metrics.temperature import platt_temperature
 from train.models.methods import Method
 from train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder
 
@@ -48,7 +48,7 @@ FOLDS = 5
 """Parts of the training set, at most, that are held out one after another to find the
 temperature."""
 SHARPENING = 10
-"""Factor on logits before fit_temperature, which only softens: votes are less certain than they
+"""Factor on logits before platt_temperature, which only softens: votes are less certain than they
 might be."""
 ABSENT = math.log(LEAST_PROBABILITY)
 """Log probability of a material without a sweep in training: the box's lower limit when it fuses
@@ -186,7 +186,7 @@ def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: i
         held_out.append(FeatureModel(to_onnx(estimator, classes)).logits(inputs[test]))
         held_out_labels.append(labels[test])
     logits, truth = np.concatenate(held_out), np.concatenate(held_out_labels)
-    temperature = fit_temperature(SHARPENING * logits, truth) / SHARPENING if len(logits) else 1.0
+    temperature = platt_temperature(SHARPENING * logits, truth) / SHARPENING if len(logits) else 1.0
     return FeatureModel(to_onnx(make().fit(features, labels), classes, temperature))
 
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from appliance.inference.classifier import softmax
 from train.data.splitters import InnerPart
+from train.metrics.temperature import weighted_platt_temperature
 from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
 
 Array = NDArray[Any]
@@ -82,8 +82,7 @@ class HeldOutScores:
             1 / max(float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()), TINY) for x in logits
         ]
         total = np.sum([x * f for x, f in zip(logits, factors, strict=True)], axis=0)
-        found = minimize_scalar(lambda t: self._cost(total / np.exp(t)), bounds=(-6, 4))
-        temperature = float(np.exp(found.x))
+        temperature = weighted_platt_temperature(total, self.labels, self.weights)
         plan = HeadPlan(
             tuple(replace(p, factor=f / temperature) for p, f in zip(parts, factors, strict=True))
         )
@@ -136,14 +135,6 @@ class HeldOutScores:
             np.maximum(softmax(logits)[np.arange(len(logits)), self.labels], TINY)
         )
         return losses
-
-    def _cost(self, logits: Array) -> float:
-        """What the temperature makes least: the mean cross entropy, each label being right with
-        probability (n + 1) / (n + 2), Platt's correction: without it a few sweeps, all right, would
-        allow any certainty."""
-        p, wrong = np.log(np.maximum(softmax(logits), TINY)), 1 / (len(self.labels) + 2)
-        right = p[np.arange(len(p)), self.labels]
-        return float(-self.weights @ ((1 - wrong) * right + wrong * p.mean(axis=1)))
 
     def _of(self, part: HeadPart) -> Array:
         """Logits [n, K] of one discriminant for the held-out sweeps."""

@@ -16,7 +16,8 @@ from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.data import sets
-from train.models import linear_head
+from train.metrics.temperature import platt_temperature
+from train.models.linear_head import closed_form_head
 from train.models.recipe import architectures, spectrum, stages
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT
 from train.models.recipe.fitted import Fit
@@ -104,9 +105,9 @@ def test_temperature_scaling_calibrates():
     labels = np.array(
         [rng.choice(4, p=p) for p in np.exp(calibrated) / np.exp(calibrated).sum(1, keepdims=True)]
     )
-    assert linear_head.fit_temperature(5 * calibrated, labels) == pytest.approx(5, rel=0.1)
+    assert platt_temperature(5 * calibrated, labels) == pytest.approx(5, rel=0.1)
     sure = 50 * np.eye(3)[np.arange(9) % 3]
-    assert 50 / linear_head.fit_temperature(sure, np.arange(9) % 3) < 6
+    assert 50 / platt_temperature(sure, np.arange(9) % 3) < 6
 
 
 def test_a_head_of_two_classes_has_two_logits():
@@ -114,7 +115,7 @@ def test_a_head_of_two_classes_has_two_logits():
     rng = np.random.default_rng(0)
     labels = np.arange(200) % 2
     seen = rng.standard_normal((200, 5)) + labels[:, None] * np.array([2, 0, 0, 0, 0])
-    weight, bias = linear_head.closed_form_head(seen, labels, seen, labels)
+    weight, bias = closed_form_head(seen, labels, seen, labels)
     assert weight.shape == (2, 5)
     assert np.mean((seen @ weight.T + bias).argmax(1) == labels) > 0.8
 

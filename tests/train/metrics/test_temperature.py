@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.calibration.temperature import fit_temperature
-from train.models import linear_head
+from train.metrics.temperature import platt_temperature, sufficient_temperature
 
 
 def drawn(n: int, groups: int, seed: int = 0, scale: float = 2.0):
@@ -21,18 +20,18 @@ def test_a_head_that_is_too_sure_is_cooled(times: float):
     """Calibrated logits times `times`: that temperature, or one within an error of it, and never a
     higher one."""
     logits, labels, groups = drawn(3000, 30)
-    found = fit_temperature(times * logits, labels, groups)
+    found = sufficient_temperature(times * logits, labels, groups)
     assert 0.8 * times < found < 1.05 * times
 
 
 def test_a_calibrated_head_stays_as_it_is():
     """Where nothing shows that the head is too sure, the temperature is 1: so too where all sweeps
     are right by far."""
-    temperatures = [fit_temperature(*drawn(300, 10, seed)) for seed in range(20)]
+    temperatures = [sufficient_temperature(*drawn(300, 10, seed)) for seed in range(20)]
     assert np.mean(np.array(temperatures) == 1) > 0.8
     assert max(temperatures) < 1.3
     labels = np.arange(60) % 3
-    assert fit_temperature(100 * np.eye(3)[labels], labels, np.arange(60) % 6) == 1
+    assert sufficient_temperature(100 * np.eye(3)[labels], labels, np.arange(60) % 6) == 1
 
 
 def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
@@ -41,7 +40,7 @@ def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
     labels = np.arange(300) % 3
     logits = 30 * np.eye(3)[labels]
     logits[0] = [0, 1, 0]
-    assert fit_temperature(logits, labels, np.arange(300) % 10) < 0.6 * linear_head.fit_temperature(
+    assert sufficient_temperature(logits, labels, np.arange(300) % 10) < 0.6 * platt_temperature(
         logits, labels
     )
 
@@ -53,14 +52,14 @@ def test_sweeps_that_fail_together_count_as_one():
     logits = np.tile([6.0, 0.0], (300, 1))
     logits[:10] = [0.0, 6.0]
     together, apart = np.repeat(np.arange(30), 10), np.arange(300) % 30
-    apart_temperature = fit_temperature(logits, labels, apart)
-    assert fit_temperature(logits, labels, together) < apart_temperature
+    apart_temperature = sufficient_temperature(logits, labels, apart)
+    assert sufficient_temperature(logits, labels, together) < apart_temperature
     assert apart_temperature > 1.2
 
 
 def test_with_one_group_each_sweep_is_its_own():
     """One group has no spread between groups; the sweeps' own is taken."""
     logits, labels, groups = drawn(1000, 1)
-    assert fit_temperature(4 * logits, labels, groups) == fit_temperature(
+    assert sufficient_temperature(4 * logits, labels, groups) == sufficient_temperature(
         4 * logits, labels, np.arange(1000)
     )
