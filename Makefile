@@ -96,7 +96,7 @@ types: $(DESKTOP) ## mypy --strict
 
 bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of README and manual
 	$(BIN)/palpate bench --json docs/bench.json
-	$(BIN)/palpate-train figures
+	$(BIN)/python -m train.studies figures
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
@@ -107,19 +107,19 @@ skins: $(DESKTOP) ## measure emulated skins: docs/skins.md; PART=way, noise or l
 	nice $(BIN)/python -m tests.skins $(PART) $(SKINS)
 
 reports: $(DESKTOP) ## all pages that are stale, the most telling first: PAGES= some, SCHEDULER= a Dask cluster, LIST=1: what would run, DRAW=1: draw them alone
-	nice $(BIN)/palpate-train reports $(PAGES) $(if $(LIST),--list) $(if $(DRAW),--draw) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
+	nice $(BIN)/python -m train.studies reports $(PAGES) $(if $(LIST),--list) $(if $(DRAW),--draw) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
 
 figures: $(DESKTOP) ## the figures of docs/ in README, manual and pages
-	$(BIN)/palpate-train figures
+	$(BIN)/python -m train.studies figures
 
 chart: $(DESKTOP) ## speed against accuracy: docs/chart/ (goes on where it was interrupted)
-	$(BIN)/palpate-train chart $(CHART)
+	$(BIN)/python -m train.studies chart $(CHART)
 
 development: $(DESKTOP) ## ours and its peers on all development sets: docs/development/, README's picture (goes on where it was interrupted)
-	$(BIN)/palpate-train development $(DEVELOPMENT)
+	$(BIN)/python -m train.studies development $(DEVELOPMENT)
 
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
-	$(BIN)/palpate-train paper $(PAPER)
+	$(BIN)/python -m train.studies paper $(PAPER)
 
 deploy: $(FLEET) ## put a signed BUNDLE= on a box, HOST=user@box, or on many, HOSTS=inventory.py; SHADOW=1: as the candidate
 	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \

@@ -173,14 +173,12 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
 def _make_references(folder: Path) -> None:
     """Let the desktop's tools write the reference models, where they are installed beside this
     program."""
-    tool = Path(sys.executable).with_name("palpate-train")
-    if folder.is_dir() or not tool.exists():
+    if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
         return
-    done = subprocess.run(
-        [tool, "references", "--out", str(folder)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "train.studies", "references", "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise BundleError(f"palpate-train references failed: {done.stderr.strip()[-300:]}")
+        raise BundleError(f"train.studies references failed: {done.stderr.strip()[-300:]}")
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:

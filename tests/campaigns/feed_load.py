@@ -34,7 +34,7 @@ from tests.campaigns.feed_inside import spent_ns
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
-from train.reports import marked_text
+from train.studies import marked_text
 
 SLOT_S, SETTLE_S = 20.0, 2.0
 WAIT_S = 0.1

@@ -45,7 +45,7 @@ from tests.robots.attacked import said
 from tests.robots.shared_line import SharedLine
 from tests.robots.side_by_side import page_of
 from tests.skins import load
-from train.reports import marked_text
+from train.studies import marked_text
 
 SKINS = ("flexitac", "papillarray")
 SETTLE_S, LOOK_S, WAIT_S = 20.0, 5.0, 0.1

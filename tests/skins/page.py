@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from appliance.core.storage import put
-from train.reports import marked_text, provenance
+from train.reports import provenance
+from train.studies import marked_text
 
 Json = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""The commands that make and judge bundles: fit, export, pack, score, parity, references."""
+"""The commands that make and judge bundles: fit, export, pack, score, parity."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
+from train.arguments import numbers, options
+from train.arguments.types import Add
 from train.calibration.calibrate import calibrate
-from train.cli import numbers, options
-from train.cli.options import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
@@ -42,21 +42,16 @@ LEAST_STEPS = 2
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, score, parity, references."""
+    """fit, export, pack, score, parity."""
     _add_fit(add)
     _add_bundles(add)
-    score = add(
-        "score",
-        run_score,
-        "run a set through the box's classifier with a bundle, and print what it named",
-    )
+    score = add("score", run_score)
     score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(score)
     score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
-        "show what int8 changes in a model's answers, and in each tensor",
     )
     parity.add_argument(
         "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form"
@@ -66,7 +61,7 @@ def register(add: Add) -> None:
 
 
 def _add_fit(add: Add) -> None:
-    command = add("fit", run_fit, "choose a model and fit it to sweep sets")
+    command = add("fit", run_fit)
     command.set_defaults(resumes=True)
     options.add_set(command)
     command.add_argument(
@@ -130,13 +125,13 @@ def _add_fit(add: Add) -> None:
 
 
 def _add_bundles(add: Add) -> None:
-    """export, pack and references: the commands that write models."""
-    export = add("export", run_export, "quantize a fit and pack its bundle")
+    """export and pack: the commands that write models."""
+    export = add("export", run_export)
     export.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    pack_command = add("pack", run_pack, "train any method and pack its bundle")
+    pack_command = add("pack", run_pack)
     options.add_set(pack_command)
     pack_command.add_argument(
-        "--method", required=True, metavar="NAME", help="see palpate-train methods"
+        "--method", required=True, metavar="NAME", help="see palpate-train evaluate --list"
     )
     pack_command.add_argument(
         "--seed",
@@ -165,10 +160,6 @@ def _add_bundles(add: Add) -> None:
             type=numbers.above_zero("--pitch-mm"),
             help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
         )
-    references = add(
-        "references", run_references, "write the models that palpate bench times beside the bundle"
-    )
-    references.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def run_fit(args: argparse.Namespace) -> None:
@@ -359,12 +350,6 @@ def _print_figures(figures: Mapping[str, dict[str, Any]]) -> None:
             print(f"{protocol}, as the box answers: {_text(figure)}; {others}")
         elif "accuracy" in figure:
             print(f"{protocol}: {_text(figure)}")
-
-
-def run_references(args: argparse.Namespace) -> None:
-    """Write the references and print their paths."""
-    for path in quantized_bundle.references(args.out):
-        print(path)
 
 
 def _by_share(text: str) -> tuple[str, float]:

@@ -13,7 +13,7 @@ from typing import Any
 from appliance.bundle.manifest import Manifest
 from appliance.core.provenance import commit
 from appliance.core.storage import put
-from train.cli import options
+from train.arguments import options
 from train.data.sets import Dataset, digest
 from train.data.transforms import WHOLE, Change
 from train.export import measure, pack
@@ -28,7 +28,7 @@ Json = dict[str, Any]
 
 def register(add: Callable[..., argparse.ArgumentParser]) -> None:
     """The command, with its options."""
-    command = add("choose", run, "pick the smallest model that a scene needs, and pack its bundle")
+    command = add("choose", run)
     command.add_argument(
         "--scene", type=Path, required=True, metavar="FILE", help="as docs/choose/tubes.toml"
     )

@@ -1,134 +1,38 @@
-"""The commands that judge methods: methods, evaluate, stress, certainty, calibrate, cnn-curve,
-alignment."""
+"""The command that judges methods: evaluate."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from appliance.inference.classifier import Classifier
-from train.cli import numbers, options
-from train.cli.options import Add
-from train.data import sets
-from train.data.progress import Progress
-from train.evaluation import evaluate, robustness, sim_calibration, uncertainty
-from train.evaluation.corruptions import EvaluationSweeps
-from train.export import bundle_stress, contact_positions
-from train.metrics import score
+from train.arguments import options
+from train.arguments.types import Add
+from train.evaluation import evaluate
 from train.models import methods
-from train.reports import (
-    contact_plot,
-    contact_table,
-    marked_text,
-    provenance,
-    stress_report,
-    uncertainty_report,
-)
 
-STRESSED = "sim:T-REAL:101-104:1"
-"""At 36 attachments at which neither the methods nor the packaged bundle are trained."""
-STRESSED_METHODS = "default-reattached,default,minirocket,minirocket-augmented,H-svm,compact"
-"""First the recipe of the packaged bundle."""
+
+class ListMethods(argparse.Action):
+    """--list: a line for each method, and the end."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print("\n".join(method_lines()), flush=True)
+        parser.exit()
 
 
 def register(add: Add) -> None:
-    """methods, evaluate, stress, certainty, calibrate, cnn-curve, alignment."""
-    add("methods", run_methods, "list the methods that evaluate knows")
-    _add_evaluate(add)
-    _add_stress(add)
-    _add_certainty(add)
-    calibrate = add(
-        "calibrate",
-        run_calibrate,
-        "compare the simulator with the twenty accuracies that the paper prints",
+    """evaluate."""
+    command = add("evaluate", run_evaluate)
+    command.add_argument(
+        "--list",
+        action=ListMethods,
+        nargs=0,
+        help="the methods that --method takes, and nothing else",
     )
-    calibrate.add_argument(
-        "--seeds",
-        type=numbers.span("--seeds", "201-208"),
-        default=range(201, 209),
-        metavar="FIRST-LAST",
-        help="of the simulated worlds (201-208)",
-    )
-    calibrate.add_argument(
-        "--ablate", action="store_true", help="also without each of its effects in turn"
-    )
-    calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    options.add_jobs(calibrate)
-    follow = add(
-        "cnn-curve", run_cnn_curve, "follow the paper's CNN while it learns the simulated skin"
-    )
-    follow.set_defaults(resumes=True)
-    follow.add_argument(
-        "--size",
-        choices=("small", "whole"),
-        default="small",
-        help="small (a stand-in of a minute) or whole (an hour of one core)",
-    )
-    follow.add_argument(
-        "--seed",
-        type=numbers.whole("--seed", 0),
-        default=1,
-        metavar="N",
-        help="of the simulated world and the training (1)",
-    )
-    follow.add_argument(
-        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
-    )
-    follow.add_argument(
-        "--steps",
-        type=numbers.whole("--steps", 1),
-        metavar="N",
-        help="iterations (those of the size)",
-    )
-    follow.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="where the curve goes; an interrupted training goes on from there",
-    )
-    _add_alignment(add)
-
-
-def _add_alignment(add: Add) -> None:
-    alignment = add(
-        "alignment",
-        run_alignment,
-        "measure whether a skin that has moved is flagged before accuracy is lost (simulated)",
-    )
-    alignment.add_argument(
-        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
-    )
-    alignment.add_argument(
-        "--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on"
-    )
-    alignment.add_argument(
-        "--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places"
-    )
-    alignment.add_argument(
-        "--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead"
-    )
-    alignment.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go"
-    )
-    alignment.add_argument(
-        "--draw",
-        action="store_true",
-        help="measure nothing: picture and tables of place.json in --out again",
-    )
-
-
-def _add_evaluate(add: Add) -> None:
-    command = add("evaluate", run_evaluate, "train and test methods under a protocol")
     options.add_set(command)
     command.add_argument(
         "--protocol",
@@ -142,7 +46,7 @@ def _add_evaluate(add: Add) -> None:
         "--method",
         required=True,
         metavar="NAME[,NAME...]",
-        help="or all; see palpate-train methods",
+        help="or all; see --list",
     )
     command.add_argument(
         "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
@@ -162,91 +66,11 @@ def _add_evaluate(add: Add) -> None:
     options.add_where(command)
 
 
-def _add_stress(add: Add) -> None:
-    command = add(
-        "stress",
-        run_stress,
-        "test trained methods, and a bundle, on corrupted sweeps, one corruption at a time",
-    )
-    options.add_set(command, "sim:T-REAL:1")
-    command.add_argument(
-        "--test",
-        default=STRESSED,
-        metavar="SET",
-        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
-    )
-    command.add_argument(
-        "--method",
-        default=STRESSED_METHODS,
-        metavar="NAME[,NAME...]",
-        help=f"ours first; the first five are drawn; or all; see palpate-train methods ({STRESSED_METHODS})",
-    )
-    command.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
-    )
-    command.add_argument(
-        "--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)"
-    )
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path("docs/stress"),
-        metavar="DIR",
-        help="for results.json, pictures and page (docs/stress)",
-    )
-    command.add_argument(
-        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
-    command.add_argument(
-        "--draw",
-        action="store_true",
-        help="run nothing: draw the page of results.json in --out again",
-    )
-    options.add_effort(command)
-    options.add_where(command)
-
-
-def _add_certainty(add: Add) -> None:
-    command = add(
-        "certainty",
-        run_certainty,
-        "measure how far a model's probabilities can be trusted: calibration, more sweeps, unknown materials, enrolment",
-    )
-    options.add_set(command)
-    command.add_argument("--test", metavar="SET", help="test on this set")
-    command.add_argument(
-        "--protocol",
-        default="leave:position",
-        help="what is tested on where --test is not given (leave:position)",
-    )
-    command.add_argument(
-        "--method",
-        default=methods.SHIPPED,
-        metavar="NAME",
-        help=f"{methods.SHIPPED}, compact or one of its family ({methods.SHIPPED})",
-    )
-    command.add_argument(
-        "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
-    )
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path("docs/certainty"),
-        metavar="DIR",
-        help="where it goes (docs/certainty)",
-    )
-    command.add_argument(
-        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
-    options.add_effort(command)
-    options.add_where(command)
-
-
-def run_methods(args: argparse.Namespace) -> None:
-    """One line for each method."""
+def method_lines() -> Iterator[str]:
+    """A line for each method that `evaluate` and `pack` take."""
     for method in methods.every().values():
         extra = f" (needs pip install 'palpate-train[{method.extra}]')" if method.extra else ""
-        print(f"{method.name:<20} {method.about}{extra}")
+        yield f"{method.name:<20} {method.about}{extra}"
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
@@ -297,137 +121,3 @@ def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
         ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode(),
         parents=True,
     )
-
-
-def run_stress(args: argparse.Namespace) -> None:
-    """Write the figures, the pictures and the page; print the page's path. With --draw only the
-    pictures and the page."""
-    if args.draw:
-        print(stress_report.write(stress_report.read(args.out), args.out))
-        return
-    train, seeds, log = options.load(args), options.seeds(args), options.Log()
-    test = (
-        EvaluationSweeps.simulated(args.test)
-        if args.test.startswith("sim:")
-        else EvaluationSweeps.of(sets.load(args.test).select(args.only))
-    )
-    box = _box_under_stress(args.bundle, test, seeds, log)
-    result = robustness.run(
-        options.names(args),
-        train,
-        test,
-        options.where(args),
-        seeds=seeds,
-        effort=options.effort(args),
-        log=log,
-    )
-    positions = test.sweeps.groups.get("position")
-    result |= {
-        "box": box,
-        "train": train.source,
-        "train_sweeps": len(train),
-        "train_digest": sets.digest(train),
-        "test": test.sweeps.source,
-        "test_sweeps": len(test.sweeps),
-        "test_digest": sets.digest(test.sweeps),
-        "attachments": 0 if positions is None else len(np.unique(positions)),
-        "format": str(train.format),
-        "seeds": list(seeds),
-    } | score.provenance()
-    print(stress_report.write(result, args.out))
-
-
-def _box_under_stress(
-    folder: Path | None, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None]
-) -> dict[str, Any]:
-    """What a bundle answers. Raises FormatError where it cannot; of the packaged one (None) the
-    curves are missing then."""
-    box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock())
-    try:
-        curves = bundle_stress.under_corruptions(box, test, seeds, log)
-    except FormatError:
-        if folder:
-            raise
-        curves = {}
-    manifest = box.bundle.manifest
-    return {
-        "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id},
-        "made": dict(manifest.made),
-        "uninformative": robustness.box_answers(box.bundle),
-        "curves": curves,
-    }
-
-
-def run_certainty(args: argparse.Namespace) -> None:
-    """Write the figures and the page; print the page's path."""
-    test = sets.load(args.test).select(args.only) if args.test else None
-    result = uncertainty.run(
-        options.load(args),
-        test,
-        args.protocol,
-        args.method,
-        options.where(args),
-        options.Log(),
-        options.effort(args),
-        args.seed,
-    )
-    print(uncertainty_report.write(result, args.out))
-
-
-def run_calibrate(args: argparse.Namespace) -> None:
-    """Print the table; write the figures as JSON where a file is named."""
-    result = (
-        sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs)
-        | score.provenance()
-    )
-    if args.json:
-        put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    print(sim_calibration.table(result))
-
-
-def run_cnn_curve(args: argparse.Namespace) -> None:
-    """Train, write the curve, print it."""
-    log = options.Log()
-    from train.evaluation import cnn_curve  # here: it imports PyTorch
-
-    print(
-        cnn_curve.table(
-            cnn_curve.follow(
-                args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
-            )
-        )
-    )
-
-
-def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the figures and the plot, the tables into the page where one lies there, and
-    print a summary."""
-    if args.draw:
-        result = options.earlier_run(
-            args.out / "place.json",
-            "alignment",
-            {"bundle", "moved", "T-HARD", "other positions"},
-            "leave --draw away to measure",
-        )
-    else:
-        box = Classifier(bundle.load(args.bundle), SystemClock())
-        displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
-        progress = Progress(displacements, options.Log())
-        result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
-        put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    about = provenance.of(result)
-    put(
-        args.out / "place.svg",
-        (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(),
-        parents=True,
-    )
-    page = args.out / "README.md"
-    if page.exists():
-        text = page.read_text(encoding="utf-8")
-        for name, content in (
-            ("in short", contact_table.headline(result)),
-            ("alignment", contact_table.table(result)),
-        ):
-            text = marked_text.insert(text, name, content, str(page))
-        put(page, provenance.in_markdown(text, about).encode())
-    print("\n".join(contact_positions.lines(result)))

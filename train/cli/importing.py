@@ -11,8 +11,8 @@ from pathlib import Path
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.core.types import DATA_TYPES
-from train.cli import numbers, options
-from train.cli.options import Add
+from train.arguments import numbers, options
+from train.arguments.types import Add
 from train.data import labels, summary
 from train.data.file_names import EXAMPLE, NamePattern
 from train.data.importing import Cut, Imported, ImportPlan, LeftOut, Length, import_folder
@@ -23,9 +23,7 @@ SHOWN = 5
 
 def register(add: Add) -> None:
     """import."""
-    command = add(
-        "import", run, "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/import.md)"
-    )
+    command = add("import", run)
     command.add_argument(
         "folder", type=Path, metavar="FOLDER", help="of recordings, and the folders in it"
     )

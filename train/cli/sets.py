@@ -7,17 +7,15 @@ from pathlib import Path
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.cli import numbers, options
-from train.cli.options import Add
+from train.arguments import numbers, options
+from train.arguments.types import Add
 from train.data import pull, summary
 from train.reports import sweep_pages, sweep_plot
 
 
 def register(add: Add) -> None:
     """sets and pull."""
-    known = add(
-        "sets", run_known, "list the sweep sets that can be named, describe sets, or show one sweep"
-    )
+    known = add("sets", run_known)
     commands = known.add_subparsers(metavar="COMMAND")
     describe = commands.add_parser(
         "describe", help="count what is in sets: materials by position and session, frames lost"
@@ -42,7 +40,7 @@ def register(add: Add) -> None:
         help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
     )
     view.set_defaults(run=run_view)
-    pull_command = add("pull", run_pull, "fetch what a box has recorded and is not here yet")
+    pull_command = add("pull", run_pull)
     pull_command.set_defaults(resumes=True)
     pull_command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
     pull_command.add_argument(

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle
-from train.cli import numbers
+from train.arguments import numbers
 from train.export import sign
 
 if TYPE_CHECKING:
-    from train.cli.options import Add
+    from train.arguments.types import Add
 
 
 def register(add: Add) -> None:
     """sign."""
-    command = add("sign", run, "sign a bundle, so that boxes take it")
+    command = add("sign", run)
     command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     command.add_argument(
         "--key",

@@ -2,7 +2,7 @@
 accuracy of a moved skin.
 
 The ContactPositions go into the bundle, so that the box can say how far a contact is from those of
-training. How well that predicts accuracy is measured by `palpate-train alignment`: the same sweeps,
+training. How well that predicts accuracy is measured by `python -m train.studies alignment`: the same sweeps,
 with the skin moved further and further.
 """
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.data.sets import Dataset
-from train.reports import formatting, html, plots, provenance, sweep_plot
+from train.reports import confusion_plot, formatting, html, provenance, sweep_plot
+from train.reports.formatting import level
 from train.reports.plot_style import ACCENT, FAINT, GREY, SMALL, set_ticks, single_axes, to_svg
-from train.reports.stress_report import level
 
 Array = NDArray[Any]
 Json = Mapping[str, Any]
@@ -194,7 +194,7 @@ def confusion(figures: Json) -> str:
     """Which label the sweeps of each material get, those that get one: rows the truth."""
     names = figures["labels"]
     counts = [[figures["answers"].get(of, {}).get(named, 0) for named in names] for of in names]
-    return plots.confusion(np.array(counts), names, "materials by the labels that they get")
+    return confusion_plot.draw(np.array(counts), names, "materials by the labels that they get")
 
 
 def calibration(found: Json) -> str:

@@ -3,7 +3,9 @@ text."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import ceil
+from typing import Any
 
 
 def percent(share: float, places: int = 1) -> str:
@@ -52,3 +54,14 @@ def seconds(value: float) -> str:
         if value >= 10
         else f"{value:.2g} s"
     )
+
+
+def level(curve: Mapping[str, Any], severity: float) -> str:
+    """A severity for readers: "35 %", "3 % of full load", "1 taxel", "0.7 rows". A part of a taxel
+    counts as one."""
+    unit = curve["unit"]
+    if unit.startswith(("share", "of ")):
+        return f"{100 * severity:.2g} % {unit.removeprefix('share')}".rstrip()
+    number = f"{ceil(severity) if unit == 'taxels' else severity:.2g}"
+    unit = "bits fewer" if unit.startswith("fewer") else unit
+    return f"{number} {unit.removesuffix('s') if number == '1' else unit}"

@@ -133,7 +133,7 @@ def read(path: Path) -> Provenance:
         return Provenance(**known)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
         why = e.strerror if isinstance(e, OSError) else "no header that says where it is from"
-        raise FormatError(f"{path}: {why}; make it again: palpate-train reports") from e
+        raise FormatError(f"{path}: {why}; make it again: python -m train.studies reports") from e
 
 
 def _parts(figures: Any) -> Iterator[dict[str, Any]]:

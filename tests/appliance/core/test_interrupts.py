@@ -48,8 +48,13 @@ def _loading(
     ("program", "module", "argv", "library"),
     [
         ("palpate", "appliance", ["skin", "list"], "onnxruntime"),
-        ("palpate-train", "train", ["methods"], "numpy"),  # while the program is imported
-        ("palpate-train", "train", ["methods"], "sklearn"),  # while the command is
+        (
+            "palpate-train",
+            "train",
+            ["evaluate", "--list"],
+            "numpy",
+        ),  # while the program is imported
+        ("palpate-train", "train", ["evaluate", "--list"], "sklearn"),  # while the command is
     ],
 )
 def test_ctrl_c_during_the_imports_is_one_line(

@@ -18,7 +18,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
 from train.cli import bundles
-from train.cli.main import GROUPS, main
+from train.cli.main import PROGRAM, main
 from train.data import pull, sets
 from train.models.recipe.stages import Fit
 
@@ -129,8 +129,8 @@ def test_an_error_of_the_project_is_one_line(
 
 @pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
-    """`palpate-train methods | head -1`: exit code 1, and nothing on the error stream."""
-    command = [sys.executable, "-m", "train", "methods"]
+    """`palpate-train evaluate --list | head -1`: exit code 1, and nothing on the error stream."""
+    command = [sys.executable, "-m", "train", "evaluate", "--list"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -252,14 +252,14 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
 
 def test_each_command_is_found_in_the_module_that_registers_it():
     """So that one command needs the imports of one module; `palpate-train --help` has all."""
-    for group, names in GROUPS.items():
+    for group, names in PROGRAM.modules.items():
         assert registered_by(group) == sorted(names)
 
 
 def registered_by(group: str) -> list[str]:
     """The commands that a module of train.cli adds."""
     commands = argparse.ArgumentParser().add_subparsers()
-    import_module(f"train.cli.{group}").register(lambda name, run, text: commands.add_parser(name))
+    import_module(f"train.cli.{group}").register(lambda name, run: commands.add_parser(name))
     return sorted(commands.choices)
 
 

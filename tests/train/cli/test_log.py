@@ -12,12 +12,12 @@ import pytest
 
 from tests.factories import terminals
 from tests.factories.paths import ROOT
-from train.cli import options
+from train.arguments import options
 from train.data.progress import ProgressLine
 
 SCRIPT = """
 import sys, time
-from train.cli.options import Log
+from train.arguments.options import Log
 from train.data.progress import Progress
 log = Log()
 progress = Progress(4, log)

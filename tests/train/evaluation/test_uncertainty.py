@@ -17,8 +17,8 @@ from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
 from train.evaluation.uncertainty_cases import NONE_LEFT_OUT, Case
 from train.models.methods import Effort
-from train.reports import uncertainty_report
 from train.reports.plot_style import SCHEMES
+from train.studies import uncertainty_report
 
 pytestmark = pytest.mark.slow
 

@@ -18,12 +18,12 @@ from appliance.signal.contact import ContactPositions, centre
 from appliance.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch
 from tests.factories.paths import ROOT
-from train.cli.main import main
 from train.data import sets
 from train.data.sets import Dataset
 from train.export import contact_positions
 from train.export.contact_limit import ContactLimit
-from train.reports import contact_plot, contact_table
+from train.studies import contact_plot, contact_table
+from train.studies.command import main as study
 
 LOADS = ContactLimit(5.0, TARE)
 
@@ -200,18 +200,18 @@ def test_the_page_is_drawn_again_without_measuring(
     cleared = re.sub(r"(?s)(<!-- (in short|alignment) -->).*?(?=<!-- /)", r"\1\n", page)
     (tmp_path / "README.md").write_text(cleared)
     (tmp_path / "place.json").write_bytes((folder / "place.json").read_bytes())
-    assert main(["alignment", "--draw", "--out", str(tmp_path)]) == 0
+    assert study(["alignment", "--draw", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "README.md").read_text() == page
     assert (tmp_path / "place.svg").read_text() == (folder / "place.svg").read_text()
     capsys.readouterr()
-    assert main(["alignment", "--draw", "--out", str(tmp_path / "none")]) == FormatError.exit_code
+    assert study(["alignment", "--draw", "--out", str(tmp_path / "none")]) == FormatError.exit_code
     assert (
         "place.json cannot be read: No such file or directory; leave --draw away"
         in capsys.readouterr().err
     )
     (tmp_path / "place.json").write_text("[1]")
-    assert main(["alignment", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
+    assert study(["alignment", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
     assert (
-        "place.json is not what palpate-train alignment wrote; leave --draw away to measure"
+        "place.json is not what python -m train.studies alignment wrote; leave --draw away to measure"
         in capsys.readouterr().err
     )

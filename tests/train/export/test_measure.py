@@ -18,7 +18,8 @@ from train.cli.main import main
 from train.export import measure, model_forms
 from train.export.measure import Measurement
 from train.models.peers import minirocket
-from train.reports import chart_report
+from train.studies import chart_report
+from train.studies.command import main as study
 
 KEYS = (
     "method",
@@ -170,7 +171,7 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
     )
     monkeypatch.setattr(chart_report, "QUICK", replace(chart_report.QUICK, named=("L-gauss",)))
     command = "chart"
-    assert main(["chart", "--quick", "--out", str(tmp_path / "chart"), *where]) == 0
+    assert study(["chart", "--quick", "--out", str(tmp_path / "chart"), *where]) == 0
     (candidate,) = json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"]
     (dot,) = json.loads((tmp_path / "chart" / "chart.json").read_text())
     assert digests["choose"] == digests["chart"]

@@ -41,6 +41,7 @@ from train.models.recipe.network import Compact
 from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import cost, graph_builder, parity
 from train.onnx_tools.parity import Layer
+from train.studies.command import main as study
 
 pytestmark = pytest.mark.slow
 
@@ -451,7 +452,7 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
     six logits. No library speaks while they are made, of a bias that stays in float, say."""
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
-    assert main(["references", "--out", str(tmp_path / "new")]) == 0
+    assert study(["references", "--out", str(tmp_path / "new")]) == 0
     assert not caplog.records
     sizes = {}
     for path in (tmp_path / "new").iterdir():

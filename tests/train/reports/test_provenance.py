@@ -72,7 +72,9 @@ def test_a_file_without_header_is_named(tmp_path: Path, text: str):
     path = tmp_path / "index.html"
     if text:
         path.write_text(text)
-    with pytest.raises(FormatError, match=r"index\.html: .*; make it again: palpate-train reports"):
+    with pytest.raises(
+        FormatError, match=r"index\.html: .*; make it again: python -m train.studies reports"
+    ):
         provenance.read(path)
 
 

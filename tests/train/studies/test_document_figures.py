@@ -1,0 +1,126 @@
+"""What README, manual and pages say in figures: it is what the files of results hold, and what is
+older says so."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.core.errors import FormatError
+from tests.factories.paths import ROOT
+from train.metrics import score
+from train.reports import provenance
+from train.studies import document_figures
+from train.studies.command import main
+from train.studies.document_figures import FIGURES
+
+DOCUMENTS = sorted({figure.document for figure in FIGURES})
+MARKED = re.compile(r"<!-- (?!provenance|/)([a-z-]+) -->\n")
+PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+\.svg)\)")
+Break = Callable[[Path], Any]
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the documents and results of this project, as the working folder."""
+    for name in {*DOCUMENTS, *(figure.results for figure in FIGURES)}:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_documents_show_the_figures_of_their_results(name: str):
+    """To the letter, and nothing else: what differs is written again by `python -m train.studies figures`."""
+    assert (ROOT / name).read_text(encoding="utf-8") == document_figures.written(name, ROOT)
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_all_markers_of_a_document_are_written(name: str):
+    """No text between markers that no command writes."""
+    known = {figure.marker for figure in FIGURES if figure.document == name}
+    assert set(MARKED.findall((ROOT / name).read_text(encoding="utf-8"))) == known
+
+
+def test_the_command_writes_what_has_changed_and_nothing_else(
+    project: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A changed figure changes its documents, and text beside the markers stays; a second run
+    changes nothing."""
+    results, before = project / document_figures.BENCH, (project / "README.md").read_text()
+    figures = json.loads(results.read_bytes())
+    figures["rss_mb"]["after_1000"] = 1234.5
+    results.write_text(json.dumps(figures))
+    assert main(["figures"]) == 0
+    assert capsys.readouterr().out.split() == ["README.md", "docs/manual.md"]
+    after = (project / "README.md").read_text()
+    changed = [
+        pair
+        for pair in zip(before.split("\n"), after.split("\n"), strict=True)
+        if pair[0] != pair[1]
+    ]
+    assert ["1234.5 MiB" in line for _, line in changed] == [True]
+    assert main(["figures"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            lambda root: (root / document_figures.BENCH).unlink(),
+            "docs/bench.json does not hold the figures of 'bench': .*make bench",
+        ),
+        (
+            lambda root: (root / document_figures.BENCH).write_text("{"),
+            "docs/bench.json .* run `make bench`",
+        ),
+        (
+            lambda root: (root / document_figures.ALIGNMENT).write_text('{"moved": {"rows": []}}'),
+            "place.json .* run `python -m train.studies alignment",
+        ),
+        (
+            lambda root: (root / "README.md").write_text("# no markers"),
+            "README.md has not one pair of markers",
+        ),
+        (
+            lambda root: (root / "README.md").write_text(
+                "<!-- /bench --><!-- bench --><!-- front --><!-- /front -->"
+            ),
+            "one pair",
+        ),
+        (
+            lambda root: (root / "README.md").unlink(),
+            "no docs/ and README.md; run this in the project's folder",
+        ),
+    ],
+    ids=["no file", "no JSON", "other JSON", "no markers", "wrong order", "elsewhere"],
+)
+def test_what_is_missing_is_named_and_nothing_is_written(
+    project: Path, capsys: pytest.CaptureFixture[str], damage: Break, said: str
+):
+    """One line with the file and what to do; no document is changed."""
+    damage(project)
+    manual = (project / "docs" / "manual.md").read_bytes()
+    assert main(["figures"]) == FormatError.exit_code
+    assert re.search(said, capsys.readouterr().err)
+    assert (project / "docs" / "manual.md").read_bytes() == manual
+
+
+def test_a_picture_of_an_older_default_is_called_so():
+    """Every document that shows one holds its sentence; a picture without a header tells of no
+    default."""
+    for document in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        text = document.read_text(encoding="utf-8")
+        for name in PICTURE.findall(text):
+            picture = document.parent / name
+            if re.search(provenance.FOUND[".svg"], picture.read_text(encoding="utf-8"), re.DOTALL):
+                assert provenance.read(picture).older in text, (document, name)
+    assert document_figures.picture_note({"method": "H-svm"}).startswith("*Made without")
+    assert document_figures.picture_note({"method": "default", "shipped": score.shipped()}) == ""

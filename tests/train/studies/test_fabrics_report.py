@@ -1,0 +1,119 @@
+"""`python -m train.studies fabrics`: which tests it runs, what of an earlier run stays, and what it says
+where something is missing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from train.data.sets import Dataset
+from train.studies import fabrics_report
+from train.studies.command import main
+from train.studies.development_experiment import FOUR
+
+MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Linen", "WovenFabric")
+PAGE = "# Fabrics\n\n<!-- matrix -->\nold\n<!-- /matrix -->\n"
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with a set of FabricSlide's names: noise that is louder for each material, two
+    values of each condition."""
+    labels, force, speed, rep, direction = (
+        x.ravel() for x in np.meshgrid(range(len(MATERIALS)), (100, 180), (1, 2), (1, 2), (0, 1))
+    )
+    noise = np.random.default_rng(1).normal(size=(len(labels), 40, 2, 1))
+    samples = (noise * (labels + 1.0)[:, None, None, None]).astype(np.float32)
+    groups = {
+        "force": force,
+        "speed": speed,
+        "rep": rep,
+        "direction": direction,
+        "recording": np.arange(len(labels)),
+    }
+    (tmp_path / "fabricslide").mkdir()
+    Dataset(samples, labels, MATERIALS, 1000.0, groups, "made").save(
+        tmp_path / "fabricslide" / "fabricslide.npz"
+    )
+    return tmp_path
+
+
+def run(data: Path, *more: str, method: str = "static-svm") -> int:
+    """The command on the made set, its folds kept beside it."""
+    out, cache = data / "page", data / "cache"
+    return main(
+        [
+            "fabrics",
+            "--data",
+            str(data),
+            "--method",
+            method,
+            "--out",
+            str(out),
+            "--jobs",
+            "1",
+            "--cache",
+            str(cache),
+            *more,
+        ]
+    )
+
+
+def results(data: Path) -> list[dict[str, Any]]:
+    """What the command wrote."""
+    found: list[dict[str, Any]] = json.loads((data / "page" / "results.json").read_bytes())
+    return found
+
+
+def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.CaptureFixture[str]):
+    """Twelve tests, means removed first; a second method joins them, and what lay there of the
+    first is as it was."""
+    (data / "page").mkdir()
+    (data / "page" / "README.md").write_text(PAGE)
+    assert run(data) == 0
+    first = results(data)
+    assert [(r["means_removed"], r["protocol"]) for r in first] == [
+        (removed, protocol)
+        for removed in (True, False)
+        for _, protocols in fabrics_report.PARTS
+        for protocol in protocols
+    ]
+    assert Counter(len(r["materials"]) for r in first) == {7: 6, 4: 6}
+    assert all(r["only"] == list(FOUR) for r in first if r["protocol"] == "leave:direction")
+    assert run(data, method="default") == 0
+    both = results(data)
+    assert [r for r in both if r["method"] == "static-svm"] == first
+    assert len(both) == 24
+    page = (data / "page" / "README.md").read_text()
+    assert "| 7 classes: a force it never felt | removed |" in page
+    assert "old" not in page
+    assert {path.name for path in (data / "page").iterdir()} >= {"windows.svg", "recordings.svg"}
+
+
+def test_what_is_missing_is_named(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Real sweeps, a method that cannot take these, results to draw, a page to draw into: each by
+    name."""
+    monkeypatch.delenv("PALPATE_DATA", raising=False)
+    assert (
+        main(["fabrics", "--method", "static-svm", "--out", str(data / "page")])
+        == FormatError.exit_code
+    )
+    assert "name their folder with --data or PALPATE_DATA" in capsys.readouterr().err
+    assert run(data) == FormatError.exit_code
+    assert "README.md is not there" in capsys.readouterr().err
+    assert not (data / "cache").exists()
+    (data / "page").mkdir()
+    (data / "page" / "README.md").write_text(PAGE)
+    assert run(data, "--draw") == FormatError.exit_code
+    assert "results.json is not of the command fabrics" in capsys.readouterr().err
+    assert run(data, method="H-svm,static-svm") == 0
+    assert "left out: H-svm: 40 frames" in capsys.readouterr().out
+    assert {r["method"] for r in results(data)} == {"static-svm"}

@@ -1,0 +1,32 @@
+"""The README's picture: what it shows is what the packaged bundle answers."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from appliance.bundle import bundle
+from appliance.core.errors import FormatError
+from appliance.sim import skin
+from train.studies import overview_plot
+
+
+@pytest.mark.slow
+def test_it_shows_the_verdict_and_every_label():
+    """Each label once with its probability, the winner in the title too; it says that the sweep is
+    simulated."""
+    svg = overview_plot.draw("paper")
+    assert "the box answers paper (simulated)" in svg
+    shares = [float(share) for share in re.findall(r">([0-9.]+) %<", svg)]
+    assert len(shares) == len(bundle.load(bundle.DEFAULT).manifest.labels)
+    assert sum(shares) == pytest.approx(100, abs=0.31)
+    assert shares == sorted(shares, reverse=True)
+    assert f"raw counts at {skin.FORMAT.rate_hz:g} Hz (simulated)" in svg
+
+
+@pytest.mark.slow
+def test_an_unknown_material_is_named():
+    """With what may be used instead."""
+    with pytest.raises(FormatError, match=r"'cheese' is not simulated; use one of .*wood"):
+        overview_plot.draw("cheese")

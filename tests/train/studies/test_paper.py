@@ -1,0 +1,424 @@
+"""The paper's page: which sweeps are fused, how results are counted, what the page shows, and that
+it needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from appliance.core.errors import FormatError
+from appliance.sim.skin import MATERIALS
+from tests.factories.page_reader import PageReader
+from train.evaluation.evaluate import Where
+from train.reports.html import picture
+from train.studies import paper_experiment, paper_report, paper_values
+from train.studies.paper_experiment import Outcome, PaperPart, Step
+
+SURE = 9.0
+FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
+
+
+def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: int = 3) -> Outcome:
+    """Made up: 4 sweeps of each material at each place, `right` of them named right, all others
+    taken for the next."""
+    labels = np.tile(np.repeat(np.arange(6), 4), places)
+    place = np.repeat(np.arange(places), 24) + 10_000 * world
+    given = np.where(
+        np.random.default_rng(world).random(len(labels)) < right, labels, (labels + 1) % 6
+    )
+    confusion = np.zeros((6, 6), int)
+    np.add.at(confusion, (labels, given), 1)
+    about = {
+        "part": part,
+        "method": method,
+        "world": world,
+        "materials": list(MATERIALS),
+        "machine": "abacus, 2 cores",
+        "confusion": confusion.tolist(),
+        "fit_s": 1.5,
+        "ms_p50": 0.25,
+        "ran": "7 beads" if "cnn" in method else "",
+        "commit": "c0ffee<",
+        "means_removed": False,
+    }
+    costs = [np.array([[1, 1.7], [7, 0.5]])] * 2 if "cnn" in method else []
+    return Outcome(
+        part, method, world, labels, SURE * np.eye(6, dtype=np.float32)[given], place, costs, about
+    )
+
+
+def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
+    """What `run` would write of made-up outcomes, as it reads back from results.json."""
+    outcomes = [
+        outcome(p, m, w)
+        for p in paper_experiment.FULL
+        for m in (*paper_experiment.BASELINES, "default")
+        for w in (1, 2)
+    ]
+    outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
+    more = {"quick": quick}
+    return json.loads(
+        paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | more)
+    )
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, Any]:
+    """A summary that many tests look at."""
+    return summary()
+
+
+@pytest.fixture(scope="module")
+def made(results: dict[str, Any]) -> tuple[str, dict[str, str]]:
+    """Its page and pictures."""
+    return paper_report.render(results)
+
+
+def test_printed_numbers_are_the_papers():
+    """One of each figure by hand; rows of the confusion matrix sum to one, rounded; .917 is 55 of
+    60."""
+    assert [
+        paper_values.ACCURACY[p][m]
+        for p, m in (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"), ("hard", "L-knn"))
+    ] == [0.96, 0.75, 0.83, 0.58]
+    assert round(55 / 60, 3) == paper_values.ACCURACY["hard"]["paper-cnn"]
+    assert np.allclose(paper_values.CONFUSION.sum(1), 1, atol=0.011)
+
+
+def test_objects_begin_with_every_sweep_once_and_mix_nothing():
+    """Numbers in a row differ, are of one material and place, and as many as the smallest such
+    group has."""
+    o = outcome("lopo", "H-svm")
+    keep = np.arange(len(o.labels)) != 5
+    labels, place = o.labels[keep], o.place[keep]
+    drawn = paper_experiment.objects(labels, place, seed=1)
+    assert drawn.shape == (71, 3)
+    assert drawn[:, 0].tolist() == list(range(71))
+    assert (labels[drawn] == labels[:, None]).all()
+    assert (place[drawn] == place[:, None]).all()
+    assert all(len(set(row)) == 3 for row in drawn.tolist())
+    assert np.array_equal(drawn, paper_experiment.objects(labels, place, seed=1))
+    assert not np.array_equal(drawn, paper_experiment.objects(labels, place, seed=2))
+
+
+def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
+    """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products
+    go beyond it."""
+    o = outcome("lopo", "H-svm", right=1)
+    weak = np.arange(len(o.labels)) % 2 == 0
+    o.logits[weak] = np.eye(6)[(o.labels[weak] + 1) % 6]
+    by = paper_experiment.several([o])
+    assert [by["vote"][n][0] for n in (0, 1)] == [0.5, 0.5]
+    assert by["product"][0][0] == 0.5
+    assert by["product"][1][0] > 0.7
+    assert all(low <= mean <= high for lines in by.values() for mean, low, high in lines)
+
+
+def test_exploration_stops_when_it_is_sure():
+    """Sure sweeps need one; sweeps that know nothing take all four and are right one time in
+    six."""
+    sure = outcome("lopo", "H-svm", right=1)
+    assert [e["sweeps"] for e in paper_experiment.explored([sure])] == [1, 1, 1]
+    assert all(e["share"][0] == 1 for e in paper_experiment.explored([sure]))
+    sure.logits[:] = 0
+    assert [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])] == [
+        (4, round(1 / 6, 4))
+    ] * 3
+
+
+def test_intervals_are_over_places():
+    """Eight places all right or all wrong are no 192 sweeps: the interval is far wider than of
+    independent ones."""
+    place = np.repeat(np.arange(8), 24)
+    _, low, high = paper_experiment.estimate(place % 2 == 0, place)
+    assert high - low > 0.5
+
+
+def test_a_cost_curve_keeps_its_ends_in_few_points():
+    """4,000 iterations become at most 160 points: the first as it was, means later, x in order."""
+    cost = np.stack([np.arange(1, 4001), np.geomspace(2, 0.001, 4000)], axis=1)
+    thin = paper_experiment._thinned(cost)
+    assert len(thin) <= 160
+    assert np.allclose(thin[0], cost[0], atol=1e-4)
+    assert thin[-1, 0] > 3850
+    assert (np.diff(thin[:, 0]) > 0).all()
+    assert len(paper_experiment._thinned(cost[:1])) == 1
+
+
+def test_summary_pools_worlds_and_keeps_each_result(results):
+    """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11
+    confusion rows of 24."""
+    row = next(r for r in results["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
+    assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (
+        144,
+        [1, 2],
+        0.86,
+        6,
+    )
+    assert row["share"][0] == round(row["right"] / 144, 4)
+    assert len(results["results"]) == 4 * 6 * 2 + 2
+    assert np.sum(results["confusion"]["H-svm"], 1).tolist() == [24] * 6
+    assert results["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
+
+
+def test_the_page_is_one_file_that_a_phone_can_read(made):
+    """It parses, is as wide as its reader, follows light and dark, names no address, and its tables
+    scroll."""
+    html, pictures = made
+    read = PageReader(html)
+    assert (read.wrong, read.open) == ([], [])
+    assert all(link.startswith("#") or link == "../../README.md" for link in read.links)
+    assert not re.search(r"@import|url\((?!#)|<script>|<link", html)
+    assert 'name="viewport" content="width=device-width' in html
+    assert "prefers-color-scheme: dark" in html
+    assert html.count("<table") == len(re.findall(r'<div class="wide"[^>]*><table', html))
+    assert all(picture(svg) in html and len(svg) < 150_000 for svg in pictures.values())
+
+
+def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
+    """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed
+    value and difference."""
+    html, pictures = made
+    assert sorted(pictures) == sorted(FIGURES)
+    text = " ".join(PageReader(html).text.split())
+    for row in results["table"]:
+        if row["printed"] is not None:
+            difference = f"{100 * (row['share'][0] - row['printed']):+.1f}".replace("-", "−")
+            low, high = (f"{100 * v:.1f}" for v in row["share"][1:])
+            value = f"{100 * row['printed']:.1f}".removesuffix(".0")
+            assert (
+                f"{low} – {high} % {value} % {difference} {row['right']} / {row['total']}" in text
+            )
+    for fact in (
+        "simulated sweeps",
+        "c0ffee<",
+        "abacus, 2 cores",
+        "7 beads",
+        "55 of them",
+        "81.9 to 96.4 %",
+        "60 sweeps",
+    ):
+        assert fact in text
+
+
+@pytest.mark.slow
+def test_only_a_quick_run_says_that_it_means_nothing(results, made):
+    """The banner is there for --quick and not otherwise."""
+    assert "quick run" not in made[0]
+    assert 'class="stop"' in paper_report.render(results | {"quick": True})[0]
+
+
+def test_hard_protocols_come_first(made):
+    """In the summary, and in the picture of all methods."""
+    html, pictures = made
+    assert (
+        html.index("T-REAL, leave one position out")
+        < html.index("tested on T-HARD")
+        < html.index("T-LAB, random")
+    )
+    assert pictures["methods"].index(">leave position<") < pictures["methods"].index(">random<")
+
+
+@pytest.mark.slow
+def test_a_plan_without_the_network_still_makes_a_page():
+    """Figures 9 to 11 need the paper's CNN; all others are there."""
+    html, pictures = paper_report.render(summary(cnn=""))
+    assert set(FIGURES) - set(pictures) == {"figure-9", "figure-10", "figure-11", "figure-12"}
+    assert not PageReader(html).wrong
+
+
+@pytest.mark.slow
+def test_the_network_without_means_is_called_so():
+    """Where only sweeps without means were given to it, the page shows that and says so."""
+    html, pictures = paper_report.render(summary(cnn=paper_values.CNNS[1]))
+    assert set(pictures) == set(FIGURES)
+    assert "Fig. 11: paper-cnn, centred" in html
+
+
+def curve(step: int = 400) -> dict[str, Any]:
+    """What cnn_curve has written after some iterations: nine places, of which the last is always
+    taken for the next."""
+    made = {
+        part: outcome(part, "paper-cnn", right=1.0, places=9)
+        for part in paper_experiment.CURVE_PARTS
+    }
+    for one in made.values():
+        one.logits[one.place == 10_008] = np.eye(6)[1]
+    newest = {
+        name: {
+            "labels": made[part].labels.tolist(),
+            "position": made[part].place.tolist(),
+            "logits": made[part].logits.tolist(),
+        }
+        for part, name in paper_experiment.CURVE_PARTS.items()
+    }
+    points = [
+        {
+            "step": n,
+            "cost": 1 / n,
+            "new confusion": np.eye(6, dtype=int).tolist(),
+            "hard confusion": [[1] * 6] * 6,
+        }
+        for n in (25, 50, step)
+    ]
+    return {
+        "about": ["whole", 1, False],
+        "steps": 4000,
+        "points": points,
+        "newest": newest,
+        "commit": "c0de",
+        "machine": "x",
+    }
+
+
+def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
+    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training beside
+    results.json is refused."""
+    (tmp_path / "results.json").write_text(json.dumps(summary(cnn=paper_values.CNNS[1])))
+    (tmp_path / paper_experiment.CURVE).write_text(json.dumps(curve()))
+    text = " ".join(PageReader(paper_experiment.draw(tmp_path).read_text()).text.split())
+    for fact in (
+        "the CNN (400 of 4000 iterations of 50)",
+        "at iteration 400 of 4000",
+        "Fig. 11: paper-cnn, position",
+        "Commit c0de: paper-cnn; Commit c0ffee<: all other methods",
+        "Ours ended at 0.0025",
+    ):
+        assert fact in text, fact
+    taken = json.loads((tmp_path / "results.json").read_text())
+    assert [row["ran"] for row in taken["table"] if row["method"] == "paper-cnn"] == [
+        "400 of 4000 iterations of 50"
+    ] * 2
+    found = paper_experiment.as_printed(curve(), paper_experiment.FULL)
+    (lopo,) = (row for row in found["table"] if row["part"] == "lopo")
+    assert (lopo["right"], lopo["total"], lopo["attachments"][0], lopo["ms_p50"]) == (
+        196,
+        216,
+        9,
+        None,
+    )
+    assert found["several"]["paper-cnn"]["product"][0][0] == lopo["share"][0]
+    (tmp_path / paper_experiment.CURVE).write_text(
+        json.dumps(curve() | {"about": ["small", 1, False]})
+    )
+    with pytest.raises(
+        FormatError,
+        match=r"is not the CNN as printed; run python -m train\.studies cnn-curve --size whole",
+    ):
+        paper_experiment.draw(tmp_path)
+
+
+def test_some_methods_are_run_again_and_the_others_stay():
+    """Of what both results have the new one counts; a quick run does not mix with a whole one."""
+    earlier, new = summary(), summary(cnn="")
+    for row in new["table"]:
+        row["right"] = 1
+    new["table"] = [row for row in new["table"] if row["method"] == "default"]
+    new["results"] = [one for one in new["results"] if one["method"] == "default"]
+    both = paper_experiment.joined(new, earlier)
+    assert len(both["table"]) == len(earlier["table"])
+    assert {row["method"] for row in both["table"] if row["right"] == 1} == {"default"}
+    assert len(both["results"]) == len(earlier["results"])
+    assert both["several"].keys() == earlier["several"].keys()
+    left = paper_experiment.planned(earlier, [Step(("default", "paper-cnn"), ("lopo",), (1,), 1)])
+    assert (
+        {row["method"] for row in left["table"]}
+        == left["confusion"].keys()
+        == {"default", "paper-cnn"}
+    )
+    with pytest.raises(FormatError, match="a quick run and a whole one cannot be joined"):
+        paper_experiment.joined(new, earlier | {"quick": True})
+
+
+def test_only_methods_of_the_plan_are_run():
+    """Steps without any of them are left out; an unknown one is named."""
+    steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["default", "H-svm"])
+    assert [step.methods for step in steps] == [("H-svm",), *[("default",)] * 3]
+    with pytest.raises(
+        FormatError, match="method 'quant' is not in the paper's experiment; use some of L-gauss"
+    ):
+        paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["quant"])
+
+
+def test_plans_name_methods_and_parts_that_exist():
+    """Full and quick: every step's methods are known, its parts planned, and both hold every kind
+    of figure.
+
+    The paper's experiment leaves out the other sizes of our own network, its CNN in the form that
+    is not printed, and what the pages of development sets and the chart compare instead.
+    """
+    known = set(paper_experiment.methods.every())
+    for parts, steps in (
+        (paper_experiment.FULL, paper_experiment.FULL_STEPS),
+        (paper_experiment.QUICK, paper_experiment.QUICK_STEPS),
+    ):
+        ran = {
+            (part, m + step.means_removed * paper_values.CENTRED)
+            for step in steps
+            for part in step.parts
+            for m in step.methods
+        }
+        left = known ^ {m.removesuffix(paper_values.CENTRED) for _, m in ran}
+        newer = {
+            "compact",
+            "multirocket-hydra",
+            "quant",
+            "minirocket-augmented",
+            "ds-cnn",
+            "lite",
+            "edge-spectral",
+        }
+        assert (
+            left == {m for m in known if m.startswith("compact-")} | {"paper-cnn-centred"} | newer
+        )
+        assert {part for part, _ in ran} == set(parts) == set(paper_report.TITLES)
+        cnn = {(p, m) for p in paper_values.ACCURACY for m in paper_values.CNNS}
+        assert {
+            (p, m) for p in paper_values.ACCURACY for m in paper_values.ACCURACY[p]
+        } - cnn <= ran
+        assert {
+            ("lopo", paper_values.CNNS[1]),
+            ("hard", paper_values.CNNS[0]),
+            ("hard", paper_values.CNNS[1]),
+        } <= ran
+
+
+@pytest.mark.slow
+def test_run_writes_everything_and_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives
+    the same figures."""
+    real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
+    parts = {
+        "lopo": PaperPart((real,), "leave:position", 2, one),
+        "hard": PaperPart((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", 1, one),
+        "lab": PaperPart(("sim:T-LAB:100{w}:2",), "random:2", 2),
+        "random": PaperPart((real,), "random:2", 2, one),
+    }
+    monkeypatch.setattr(paper_experiment, "QUICK", parts)
+    monkeypatch.setattr(
+        paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),)
+    )
+    where, lines = Where(jobs=1, cache=tmp_path / "cache"), []
+    made = paper_experiment.run(tmp_path / "a", True, where, lines.append)
+    assert made == tmp_path / "a" / "index.html"
+    assert 'class="stop"' in made.read_text()
+    results = json.loads((tmp_path / "a" / "results.json").read_text())
+    assert {p.stem for p in made.parent.glob("*.svg")} == {
+        f"figure-{n}" for n in (4, 5, 6, 7, 13)
+    } | {"methods"}
+    assert len(results["results"]) == 8
+    assert len(lines) == 14
+    assert "4/4 random, world 1" in lines[-1]
+    assert all(" left" in line for line in lines)
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
+    paper_experiment.run(tmp_path / "b", True, where)
+    assert kept == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
+    again = json.loads((tmp_path / "b" / "results.json").read_text())
+    assert results == again

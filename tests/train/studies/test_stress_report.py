@@ -1,0 +1,174 @@
+"""The stress page: what breaks first, in which order, told apart from what does not, and what the
+box makes of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from appliance.core.errors import FormatError
+from tests.factories import rendered, stress_data
+from tests.factories.page_reader import PageReader
+from train.reports import formatting, html
+from train.studies import stress_plots, stress_report
+from train.studies.command import main
+from train.studies.method_names import plain_name
+
+OURS, EARLIER = plain_name("default"), plain_name("compact")
+CURVES = {
+    plain_name(name): entry["curves"]
+    for name, entry in stress_data.figures()["methods"].items()
+    if entry["curves"]
+}
+
+
+def words(svg: str) -> list[str]:
+    """All texts of a picture."""
+    return [
+        node.text or ""
+        for node in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
+    ]
+
+
+def test_what_breaks_first_needs_the_smallest_part_of_its_range():
+    """Hum at .625 of 2, dead taxels at 1.19 of 2, more gain never; a part of a taxel is one."""
+    assert stress_report.first(CURVES[OURS]) == (
+        ["50 Hz hum: 0.62 deviations", "dead taxels: 2 taxels"],
+        2,
+    )
+    assert stress_report.first(CURVES[plain_name("L-knn")]) == (["higher gain: 22 %"], 1)
+    assert stress_report.first(CURVES[plain_name("H-svm")]) == ([], 0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "severity", "shown"),
+    [
+        ("share", 0.35, "35 %"),
+        ("of full load", 0.029, "2.9 % of full load"),
+        ("taxels", 0.2, "1 taxel"),
+        ("taxels", 1.5, "2 taxels"),
+        ("fewer than 8", 3.7, "3.7 bits fewer"),
+        ("rows", 1.0, "1 row"),
+        ("deviations", 1.0, "1 deviation"),
+        ("rows", 0.7, "0.7 rows"),
+    ],
+)
+def test_a_severity_has_its_unit(unit: str, severity: float, shown: str):
+    """Shares are per cent, and there is no part of a taxel."""
+    assert formatting.level({"unit": unit}, severity) == shown
+
+
+def test_nowhere_a_point_below_the_recipe_before():
+    """Of three lines one is two points below: it counts, and is bold; without the earlier recipe
+    nothing was wanted."""
+    (line,) = stress_report.targets(CURVES, OURS)
+    assert (line["here"], line["target"], line["met"]) == ("2 of 3", "3 of 3", False)
+    lines = {line["what"]: line for line in stress_report.target_lines(CURVES, OURS, {})}
+    assert [line["missed"] for line in lines.values()] == [True, False, False]
+    assert lines["dead taxels, 1 taxel"]["difference"] == "−2.0"
+    assert lines["50 Hz hum, 1 deviation"]["difference"] == "+5.0"
+    assert stress_report.targets({OURS: CURVES[OURS]}, OURS) == []
+
+
+def test_five_methods_are_drawn():
+    """The sixth is in the tables alone; what breaks only it has no picture."""
+    shown = words(stress_plots.methods(CURVES))
+    assert set(map(plain_name, ("default", "minirocket", "compact", "H-svm", "L-svm"))) <= set(
+        shown
+    )
+    assert plain_name("L-knn") not in shown
+    assert [text for text in shown if text in ("50 Hz hum", "dead taxels", "higher gain")] == [
+        "50 Hz hum",
+        "dead taxels",
+    ]
+    assert stress_report.missing(CURVES, OURS) == ["higher gain"]
+
+
+def test_the_box_is_shown_where_it_falls_silent_or_names_wrongly():
+    """Dead taxels and hum cost it answers; higher gain gives it seven wrong names of a hundred."""
+    box = stress_data.figures()["box"]["curves"]
+    shown = words(stress_plots.box(box))
+    assert {
+        "named rightly",
+        "named wrongly",
+        "refused",
+        "50 Hz hum",
+        "dead taxels",
+        "higher gain",
+    } <= set(shown)
+    quiet = box | {
+        "wrongly": box["wrongly"] | {"gain-up": box["wrongly"]["gain-up"] | {"accuracy": [0, 0, 0]}}
+    }
+    assert "higher gain" not in words(stress_plots.box(quiet))
+    assert stress_report.most_wrong(box["wrongly"])["share"][0] == 0.07
+
+
+def test_the_page_holds_the_figures():
+    """Headline, table, box, origin; tags closed, no braces, nothing from elsewhere; a refused
+    method has its reason."""
+    page, pictures = stress_report.render(stress_data.figures())
+    reader = PageReader(page)
+    assert (reader.wrong, reader.open) == ([], [])
+    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Undefined", reader.text)
+    assert all(html.picture(svg) in page for svg in pictures.values())
+    for fact in (
+        f"{OURS} names 98.0 % of undisturbed sweeps rightly",
+        "Of 3 things that can go wrong, 2 cost it 5 percentage points",
+        "first 50 Hz hum: 0.62 deviations",
+        "then dead taxels: 2 taxels",
+        "All sweeps are simulated",
+        "It gives most wrong names with higher gain, 50 %: 7.0 % [2.0, 8.0]",
+        "for a skin that is taken off and put back",
+        "QUANT: needs aeon",
+        "540 sweeps of sim:T-REAL:1 (aa11)",
+        "bundle six 3, 8933e0d5",
+        "silent 6 answer no-contact",
+        "Commit c0ffee, abacus, 2 cores",
+        f"more than a point below {EARLIER}",
+    ):
+        assert fact in reader.text, fact
+
+
+def test_without_a_box_and_with_nothing_that_breaks():
+    """A set that the packaged bundle cannot answer: its columns and picture are missing; a method
+    that nothing breaks says so."""
+    figures = stress_data.figures()
+    figures["box"]["curves"] = {}
+    figures["methods"] = {"H-svm": figures["methods"]["H-svm"]}
+    page, pictures = stress_report.render(figures)
+    text = PageReader(page).text
+    assert set(pictures) == {"curves"}
+    assert "None of 3 things that can go wrong costs it 5 percentage points" in text
+    assert "As the box answers" not in text
+    assert "box, rightly" not in text
+    figures["methods"] = {}
+    with pytest.raises(FormatError, match="no method has a result; run the command without --kept"):
+        stress_report.render(figures)
+
+
+def test_the_page_is_drawn_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """--draw makes page and pictures of results.json alone, and says where there is none."""
+    assert main(["stress", "--draw", "--out", str(tmp_path / "none")]) == 65
+    assert "run it without --draw" in capsys.readouterr().err
+    stress_report.write(stress_data.figures(), tmp_path)
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(made) == {"results.json", "index.html", "README.md", "curves.svg", "box.svg"}
+    (tmp_path / "index.html").unlink()
+    assert main(["stress", "--draw", "--out", str(tmp_path)]) == 0
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == made
+    assert json.loads(made["results.json"])["test_sweeps"] == 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+def test_a_reader_sees_all_of_it(browser: Any, tmp_path: Path, width: int, scheme: str):
+    """On a phone and on a wide screen, light and dark: nothing is cut off, every axis has a title,
+    all can be read."""
+    page = stress_report.write(stress_data.figures(), tmp_path)
+    assert rendered.faults(browser, rendered.address(page), width, scheme) == {}

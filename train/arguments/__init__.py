@@ -1,0 +1,1 @@
+"""Options that the commands of `palpate-train` and of the studies share."""

@@ -1,0 +1,237 @@
+"""Options that several commands share. In: a parser, or the arguments it parsed. Out: options, or
+their values."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import json
+import shlex
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from appliance.core.errors import FormatError
+from train.arguments import numbers
+from train.data import labels, sets
+from train.data.progress import ProgressLine
+from train.data.summary import warnings_of
+from train.evaluation import evaluate
+from train.models import methods
+
+SET = "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME; several are joined"
+LOG_EVERY_S = 30
+
+
+def add_set(command: argparse.ArgumentParser, usual: str = "") -> None:
+    """--set and --only. usual: where none is given; without it one must be."""
+    told = f"{SET} ({usual})" if usual else SET
+    command.add_argument(
+        "--set", action="append", required=not usual, metavar="SET", dest="sets", help=told
+    )
+    command.set_defaults(usual_set=usual)
+    command.add_argument(
+        "--only",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="keep these sweeps: force=100,150, force<=180, material=Canvas,Linen",
+    )
+    add_rename(command)
+
+
+def add_rename(command: argparse.ArgumentParser) -> None:
+    """--rename."""
+    command.add_argument(
+        "--rename",
+        action="append",
+        default=[],
+        metavar="OLD=NEW",
+        help="give a material another name, before --only; two that get the same become one",
+    )
+
+
+def add_effort(command: argparse.ArgumentParser) -> None:
+    """Options for how long networks are trained."""
+    usual = methods.FULL_EFFORT
+    command.add_argument(
+        "--effort",
+        type=numbers.above_zero("--effort"),
+        default=usual.share,
+        metavar="SHARE",
+        help="of the networks' usual iterations (1)",
+    )
+    command.add_argument(
+        "--paper-steps",
+        type=numbers.whole("--paper-steps", 1),
+        metavar="N",
+        help="iterations of the paper's CNN (4000 on a GPU, fewer on a processor)",
+    )
+    command.add_argument(
+        "--bfloat16",
+        action="store_true",
+        help="compute the paper's CNN in bfloat16 where that helps",
+    )
+
+
+def add_where(command: argparse.ArgumentParser) -> None:
+    """Options for where tasks run and where their results are kept."""
+    add_jobs(command)
+    command.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks"
+    )
+    command.add_argument(
+        "--cache",
+        type=Path,
+        default=evaluate.CACHE,
+        metavar="DIR",
+        help=f"where finished folds are kept, so that an interrupted run continues ({evaluate.CACHE})",
+    )
+
+
+def add_jobs(command: argparse.ArgumentParser) -> None:
+    """--jobs."""
+    command.add_argument(
+        "--jobs", type=jobs, default=-1, metavar="N", help="processes (one for each core)"
+    )
+
+
+def jobs(text: str) -> int:
+    """Reads --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
+    return -1 if text == "-1" else numbers.whole("--jobs", 1)(text)
+
+
+def writable(path: Path, option: str = "--out") -> None:
+    """Make the folders above `path`, before hours of work. Raises FormatError where nothing can be
+    written there."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as e:
+        raise FormatError(
+            f"{option} {path}: cannot be written there: {e.strerror}; name another place"
+        ) from e
+
+
+def writable_file(path: Path, option: str = "--out") -> None:
+    """As `writable`; raises FormatError also where `path` is a folder."""
+    if path.is_dir():
+        raise FormatError(f"{option} {path} is a folder; name a file")
+    writable(path, option)
+
+
+def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
+    """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated
+    ones that name none.
+
+    Warns of materials without a sweep, which are left out, and of taxels that never change.
+    """
+    pairs = labels.renames(args.rename)
+    loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
+    labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
+    whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
+    part = whole.select(args.only)
+    for line in warnings_of(part if args.only else whole):
+        print(f"palpate-train: {line}", file=sys.stderr)
+    return part
+
+
+def report_line(what: Path, sweeps: str = "") -> str:
+    """How to get a page about a fit or a bundle. sweeps: the set to judge it on, where one is
+    known."""
+    words = ["palpate-train", "report", str(what), "--set", sweeps or "SET", "--out", "report.html"]
+    return f"a page about it, with what breaks it: {shlex.join(words)}"
+
+
+def names(args: argparse.Namespace) -> tuple[str, ...]:
+    """The methods of --method."""
+    return tuple(methods.every()) if args.method == "all" else tuple(args.method.split(","))
+
+
+def seeds(args: argparse.Namespace) -> range:
+    """1 to --seeds. Raises FormatError where that is below 1."""
+    if args.seeds < 1:
+        raise FormatError(f"--seeds {args.seeds} is none; use 1 or more")
+    return range(1, args.seeds + 1)
+
+
+def effort(args: argparse.Namespace) -> methods.Effort:
+    """How long networks are trained."""
+    return methods.Effort(args.effort, args.paper_steps, args.bfloat16)
+
+
+def where(args: argparse.Namespace) -> evaluate.Where:
+    """Where tasks run and where their results are kept."""
+    return evaluate.Where(args.jobs, args.scheduler, args.cache, getattr(args, "kept", False))
+
+
+class Log:
+    """Shows progress on the error stream: on a terminal a bar and the latest line, else one line
+    every LOG_EVERY_S."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+        self._bar: Any = None
+
+    def __call__(self, line: str) -> None:
+        """Show `line`; of a ProgressLine also how much is done."""
+        if sys.stderr.isatty():
+            known = (
+                {"completed": line.done, "total": line.total}
+                if isinstance(line, ProgressLine)
+                else {"total": None}
+            )
+            self._shown().update(0, description=line, **known)
+        elif time.monotonic() - self._last > LOG_EVERY_S:
+            self._last = time.monotonic()
+            print(line, file=sys.stderr, flush=True)
+
+    def keep(self, line: str) -> None:
+        """Show `line` at once, and leave it there."""
+        print(line, file=sys.stderr, flush=True)
+
+    def _shown(self) -> Any:
+        """The bar, which goes when the process ends; what is printed meanwhile stands above it."""
+        if self._bar is None:
+            from rich import progress  # here: a tenth of a second that only a terminal needs
+            from rich.console import Console
+            from rich.table import Column
+
+            text = progress.TextColumn(
+                "{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)
+            )
+            self._bar = progress.Progress(
+                progress.SpinnerColumn(),
+                progress.BarColumn(16),
+                progress.TimeElapsedColumn(),
+                text,
+                console=Console(stderr=True),
+                transient=True,
+                redirect_stdout=sys.stdout.isatty(),
+                expand=True,
+            )
+            self._bar.add_task("")
+            self._bar.start()
+            atexit.register(self._bar.stop)
+        return self._bar
+
+
+def earlier_run(
+    path: Path, command: str, keys: set[str], advice: str, otherwise: str = ""
+) -> dict[str, Any]:
+    """What an earlier run of a command wrote, an object with these keys. advice: what to do where
+    it cannot be read; otherwise: where it has another content. Raises FormatError, with one of
+    them."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_bytes())
+        if keys <= found.keys():
+            return found
+    except OSError as e:
+        raise FormatError(f"{path} cannot be read: {e.strerror}; {advice}") from e
+    except (ValueError, AttributeError):
+        pass
+    raise FormatError(f"{path} is not what palpate-train {command} wrote; {otherwise or advice}")

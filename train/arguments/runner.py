@@ -1,0 +1,117 @@
+"""Runs one command of a program: help in groups, the command's own parser, exit codes.
+
+The names and descriptions of all commands stand in a table, so that help needs no import; the
+module of a command is imported when the command is wanted, since training takes seconds to import.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+from appliance.core.errors import ApplianceError
+from appliance.core.interrupts import INTERRUPTED, during_imports
+from train.arguments.types import Run
+
+USAGE_ERROR = 2
+"""Exit code of argparse for arguments that it refuses."""
+HELP = ("-h", "--help")
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program and its commands.
+
+    groups: by heading the commands with their descriptions. modules: the module that registers each
+    command, below `package`.
+    """
+
+    name: str
+    about: str
+    package: str
+    groups: Mapping[str, Mapping[str, str]]
+    modules: Mapping[str, tuple[str, ...]]
+
+    def descriptions(self) -> dict[str, str]:
+        """Of all commands, by name."""
+        return {name: text for group in self.groups.values() for name, text in group.items()}
+
+    def help(self) -> str:
+        """All commands in groups, without an import of any."""
+        width = max(map(len, self.descriptions()))
+        lines = [f"usage: {self.name} COMMAND [OPTIONS]", "", self.about]
+        for heading, commands in self.groups.items():
+            lines += ["", f"{heading}:"]
+            lines += [f"  {name:<{width}}  {text}" for name, text in commands.items()]
+        return "\n".join(
+            [*lines, "", f"{self.name} COMMAND --help shows the options of a command."]
+        )
+
+    def parser(self, wanted: str) -> argparse.ArgumentParser:
+        """The parser of one command; `args.run` is the function that carries it out."""
+        parser = argparse.ArgumentParser(prog=self.name, description=self.about)
+        commands = parser.add_subparsers(required=True, metavar="COMMAND")
+        descriptions = self.descriptions()
+
+        def add(name: str, run: Run) -> argparse.ArgumentParser:
+            text = descriptions[name]
+            command = commands.add_parser(
+                name, help=text, description=f"{text[0].upper()}{text[1:]}."
+            )
+            command.set_defaults(run=run)
+            return command
+
+        module = next(name for name, commands in self.modules.items() if wanted in commands)
+        import_module(f"{self.package}.{module}").register(add)
+        return parser
+
+    def run(self, argv: Sequence[str] | None = None) -> int:
+        """Run one command; its exit code. An error of this project is one line on standard error."""
+        words = sys.argv[1:] if argv is None else list(argv)
+        if not words or words[0] in HELP:
+            print(self.help())
+            return 0
+        if words[0] not in self.descriptions():
+            print(self._unknown(words[0]), file=sys.stderr)
+            return USAGE_ERROR
+        return self._run(words)
+
+    def _unknown(self, word: str) -> str:
+        near = difflib.get_close_matches(word, self.descriptions(), n=1)
+        advice = f"did you mean {near[0]!r}?" if near else f"`{self.name} --help` lists them"
+        return f"{self.name}: there is no command {word!r}; {advice}"
+
+    def _run(self, words: Sequence[str]) -> int:
+        args = argparse.Namespace()
+        try:
+            with during_imports(self.name):
+                parser = self.parser(words[0])
+                from train.metrics import score  # here: it imports onnxruntime
+            args = parser.parse_args(words)
+            score.provenance()  # read once, now: the code that runs is of this commit
+            args.run(args)
+            sys.stdout.flush()
+        except ApplianceError as e:
+            print(f"{self.name}: {e}", file=sys.stderr)
+            return e.exit_code
+        except BrokenPipeError:
+            # the reader of the output has closed it; nothing can be printed any more, not even when
+            # the process ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except OSError as e:
+            # an error of a library may name neither file nor cause
+            text = e if e.filename is None else f"{e.filename}: {e.strerror}"
+            print(f"{self.name}: {text}", file=sys.stderr)
+            return ApplianceError.exit_code
+        except KeyboardInterrupt:
+            resumes = getattr(args, "resumes", hasattr(args, "cache"))
+            kept = "goes on where it was" if resumes else "begins anew"
+            print(f"{self.name}: interrupted; the same command {kept}", file=sys.stderr)
+            return INTERRUPTED
+        return 0

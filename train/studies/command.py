@@ -1,0 +1,62 @@
+"""The command `python -m train.studies`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from train.arguments.runner import Program
+
+PROGRAM = Program(
+    "python -m train.studies",
+    "Experiments with the methods of Palpate, and the pages that publish their results.",
+    "train.studies.commands",
+    {
+        "experiments": {
+            "paper": "run the paper's experiment on the simulated skin and write a page about it",
+            "development": "evaluate methods on all development sets, and write a page about it",
+            "chart": "chart accuracy against cost: every method as a bundle, timed as on the box",
+            "fabrics": "evaluate methods on real fabrics with a condition left out, and write a"
+            " page about it",
+            "stress": "test trained methods, and a bundle, on corrupted sweeps, one corruption at"
+            " a time",
+            "certainty": "measure how far a model's probabilities can be trusted: calibration,"
+            " more sweeps, unknown materials, enrolment",
+            "alignment": "measure whether a displaced contact is flagged before accuracy is lost"
+            " (simulated)",
+            "cnn-curve": "follow the paper's CNN while it learns the simulated skin",
+            "calibrate": "compare the simulator with the twenty accuracies that the paper prints",
+            "references": "write the models that palpate bench times beside the bundle",
+        },
+        "pages": {
+            "reports": "make the project's results and pages again: the stale ones, or some by name",
+            "figures": "write the figures of results into README, manual and pages",
+            "matrix": "draw the results of evaluate: methods by protocols",
+            "overview": "draw the README's picture: a simulated sweep and the box's answers",
+        },
+    },
+    {
+        "measure": (
+            "stress",
+            "certainty",
+            "calibrate",
+            "cnn-curve",
+            "alignment",
+            "references",
+        ),
+        "publish": (
+            "reports",
+            "figures",
+            "paper",
+            "chart",
+            "development",
+            "fabrics",
+            "matrix",
+            "overview",
+        ),
+    },
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one study; its exit code."""
+    return PROGRAM.run(argv)

@@ -1,0 +1,121 @@
+"""How long a sweep takes with each method, all in turns in one process. In: methods, sweeps. Out:
+figures for results.json.
+
+What has a graph is packed and timed by the box's classifier, with its checks and features; what
+runs in a library alone is timed there, without checks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import BundleError, FormatError
+from train.data.progress import Progress
+from train.data.sets import Dataset
+from train.export import measure, model_forms
+from train.models import methods
+from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
+from train.studies.chart_report import kept_folder
+from train.studies.development_experiment import OURS
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Log = Callable[[str], None]
+SET = "sim:T-REAL:1"
+"""What all methods are trained on to be timed: sweeps of the packaged bundle's format."""
+ROUNDS = 10
+"""Of timing: the slowest methods take a hundred times as long as those of the chart."""
+EVERY, SHARE = 5, 0.25
+"""A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
+iterations: what it has learnt makes it neither slower nor quicker. Ours choose their size, so they
+are trained as always."""
+
+
+def measured(
+    names: Sequence[str],
+    sweeps: Dataset,
+    seed: int,
+    cache: Path | None,
+    log: Log,
+    effort: Effort = FULL_EFFORT,
+    rounds: int = ROUNDS,
+) -> Json:
+    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, of
+    a graph also `weights`, `macs` and `file_kb`, and what was `left_out`.
+
+    Bundles are kept in `cache`, as those of the chart are.
+    """
+    entries: list[Json] = []
+    calls: dict[str, measure.Call] = {}
+    left_out: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as work:
+        progress = Progress(len(names), log)
+        for method in [_briefly(name, effort) for name in names]:
+            progress.begin(f"{method.name} is trained for its time")
+            try:
+                for entry, call in _callable(method, sweeps, seed, cache or Path(work)):
+                    calls[str(len(entries))] = call
+                    entries.append(entry)
+            except (FormatError, BundleError) as e:
+                left_out[method.name] = str(e)
+        log(f"{len(calls)} models take turns")
+        some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
+        took = measure.timed(calls, some, rounds)
+    for entry, times in zip(entries, took.values(), strict=True):
+        entry |= {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
+    return {
+        "set": sweeps.source,
+        "format": str(sweeps.format),
+        "entries": entries,
+        "left_out": left_out,
+    }
+
+
+def _briefly(name: str, effort: Effort) -> Method:
+    """The method, with SHARE of the iterations where it is a peer and the effort is not smaller
+    anyway."""
+    return methods.find(
+        [name], effort if name in OURS else replace(effort, share=min(SHARE, effort.share))
+    )[0]
+
+
+def _callable(
+    method: Method, sweeps: Dataset, seed: int, cache: Path
+) -> list[tuple[Json, measure.Call]]:
+    """The method in each of its precisions as the box runs it, and as its own library does."""
+    if method.library:
+        some = sweeps.take(np.arange(0, len(sweeps), EVERY))
+        model = method.train(some, model_inputs(method.input, some), seed)
+        entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
+        return [(entry | {"runs_on_box": False}, partial(_alone, model))]
+    made = model_forms.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
+    return [
+        (
+            {
+                "method": one.method,
+                "form": one.form,
+                "precision": one.precision,
+                "runtime": one.runtime,
+                "runs_on_box": one.runtime == "onnx",
+                "weights": one.weights,
+                "macs": one.macs,
+                "file_kb": measure.sizes(one.folder)[0] / 1000,
+            },
+            measure.load(one.folder),
+        )
+        for one in made
+    ]
+
+
+def _alone(model: Model, counts: Array) -> Array:
+    """Logits [K] of raw counts [T, R, C]."""
+    logits: Array = model.logits(counts[None])[0]
+    return logits

@@ -1,0 +1,495 @@
+"""The paper's experiment on the simulated sets, with more methods. In: a plan. Out: a folder with
+results.json, pictures, page.
+
+The page is made by paper_report. Folds are kept by evaluate, so that an interrupted run goes on
+where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
+from appliance.sim import skin
+from train.data import sets
+from train.data.progress import spoken
+from train.data.sets import Dataset
+from train.evaluation.evaluate import Plan, Result, Where, evaluate
+from train.metrics import score
+from train.models import methods
+from train.models.methods import FULL_EFFORT, Effort
+from train.models.peers import prior_work
+from train.reports import html, provenance
+from train.studies import paper_report, paper_values
+from train.studies.chart_report import BOX_ON_HARD, box_on_hard
+
+Array = NDArray[Any]
+Log = Callable[[str], None]
+BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
+NETWORKS = ("tactnet2", "recurrent")
+OWN = ("default", "default-reattached")
+BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
+"""Tables of results.json by method."""
+CURVE = "cnn-curve.json"
+"""Beside results.json: what `python -m train.studies cnn-curve --size whole` wrote, the paper's CNN as
+printed."""
+CURVE_PARTS = {"lopo": "new", "hard": "hard"}
+"""Its sets by the part that they stand for."""
+SURE = (0.9, 0.95, 0.99)
+"""Posteriors at which no more sweeps are added."""
+SEVERAL = 3
+ATTACHMENTS = 20
+"""Seeds of T-HARD for each simulated world, 60 sweeps each."""
+COST_POINTS = 160
+
+
+@dataclass(frozen=True)
+class PaperPart:
+    """A column of the paper's results: the sets to train and test on.
+
+    sets: joined; {w} stands for the simulated world, {a} and {b} for its first and last seed of
+    T-HARD. only: of each set.
+    """
+
+    sets: tuple[str, ...]
+    protocol: str
+    folds: int
+    only: tuple[str, ...] = ()
+
+    def load(self, world: int) -> Dataset:
+        """Its sweeps."""
+        last = ATTACHMENTS * world
+        names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
+        return sets.join([sets.load(name).select(self.only) for name in names])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, to
+    estimate the time left.
+
+    means_removed: from each taxel of each sweep; the methods' names then end in
+    paper_values.CENTRED.
+    """
+
+    methods: tuple[str, ...]
+    parts: tuple[str, ...]
+    worlds: tuple[int, ...]
+    fold_s: float
+    means_removed: bool = False
+
+
+ALL = ("lopo", "hard", "lab", "random")
+FULL = {
+    "lopo": PaperPart(("sim:T-REAL:{w}",), "leave:position", 9),
+    "hard": PaperPart(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", 1),
+    "lab": PaperPart(("sim:T-LAB:{w}",), "random:10", 10),
+    "random": PaperPart(("sim:T-REAL:{w}",), "random:9", 9),
+}
+HARD, EASY = ("hard", "lopo"), ("lab", "random")
+FULL_STEPS = (
+    Step(BASELINES, ALL, (1, 2, 3, 4, 5), 1),
+    Step(NEIGHBOURS, ALL, (1, 2, 3), 1),
+    Step(("minirocket", "filter-bank", "st-hmp"), HARD, (1,), 12),
+    Step(OWN, ("hard",), (1,), 90),
+    Step(OWN, ("lopo",), (1,), 90),
+    Step(NETWORKS, HARD, (1,), 30),
+    Step(("paper-cnn",), HARD, (1,), 170, means_removed=True),
+    Step(("paper-cnn",), ("hard",), (1,), 170),
+    Step(("minirocket", "filter-bank", "st-hmp"), EASY, (1,), 12),
+    Step(OWN, EASY, (1,), 90),
+    Step(NETWORKS, EASY, (1,), 30),
+    Step(("paper-cnn",), ("lopo",), (1,), 170),
+)
+"""Hard parts come first, so that a run that was interrupted has the most important results: see
+`kept`."""
+QUICK = {
+    "lopo": PaperPart(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
+    "hard": PaperPart(
+        ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)
+    ),
+    "lab": PaperPart(("sim:T-LAB:{w}:10",), "random:3", 3),
+    "random": PaperPart(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
+}
+QUICK_STEPS = (
+    Step(BASELINES, ALL, (1, 2), 0.3),
+    Step(
+        (*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS),
+        ("lopo", "hard"),
+        (1,),
+        1,
+    ),
+    Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
+    Step(("paper-cnn",), ("hard",), (1,), 15),
+)
+QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a method in a part of a simulated world, without the sweeps: labels [n], logits
+    [n, K] of those tested.
+
+    place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that
+    has them, [iterations, 2]. about: what results.json holds of it.
+    """
+
+    part: str
+    method: str
+    world: int
+    labels: Array
+    logits: Array
+    place: Array
+    costs: list[Array] = field(repr=False)
+    about: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def of(cls, part: str, world: int, result: Result) -> Outcome:
+        """From a result of evaluate."""
+        test, sweeps = result.test, result.sweeps
+        place = sweeps.group("position")[test] + 10_000 * world
+        costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
+        method = result.method + result.means_removed * paper_values.CENTRED
+        about = result.json() | {"part": part, "world": world}
+        return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
+
+    @cached_property
+    def explorations(self) -> Array:
+        """What `objects` draws of these sweeps."""
+        return objects(self.labels, self.place, self.world)
+
+    @property
+    def right(self) -> Array:
+        """bool [n], which were named rightly."""
+        return np.asarray(self.logits.argmax(1) == self.labels)
+
+
+def run(
+    out: Path,
+    quick: bool,
+    where: Where,
+    log: Log = lambda line: None,
+    effort: Effort = FULL_EFFORT,
+    only: Sequence[str] = (),
+) -> Path:
+    """Train and test all of the plan, write results.json, the pictures and the page into `out`; the
+    page's path.
+
+    quick: a few sweeps and iterations of everything, whatever `effort` says. only: methods that are
+    run; all others stay as an earlier run left them in `out`. Raises FormatError as evaluate, and
+    where `only` has none of the plan's methods.
+    """
+    parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
+    effort = QUICK_EFFORT if quick else effort
+    outcomes = list(_outcomes(parts, narrowed(steps, only) if only else steps, where, effort, log))
+    found = summary(outcomes, parts, effort) | score.provenance() | {"quick": quick}
+    if only:
+        found = joined(found, planned(_results(out), steps))
+    put(out / "results.json", _lines(found).encode(), parents=True)
+    return draw(out)
+
+
+def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
+    """The steps with these methods alone. Raises FormatError for one that no step has."""
+    known = dict.fromkeys(m for step in steps for m in step.methods)
+    for name in only:
+        if name not in known:
+            raise FormatError(
+                f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}"
+            )
+    kept = [replace(step, methods=tuple(m for m in step.methods if m in only)) for step in steps]
+    return [step for step in kept if step.methods]
+
+
+def planned(found: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
+    """What `found` has of methods that are still in the plan."""
+    known = {m for step in steps for m in step.methods}
+    lists = {
+        key: [
+            one for one in found[key] if one["method"].removesuffix(paper_values.CENTRED) in known
+        ]
+        for key in ("table", "results")
+    }
+    tables = {
+        key: {
+            name: value
+            for name, value in found[key].items()
+            if name.removesuffix(paper_values.CENTRED) in known
+        }
+        for key in BY_METHOD
+    }
+    return found | lists | tables
+
+
+def joined(found: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """Two results.json as one: of what both have, `found` counts. Raises FormatError where one of
+    them is a quick run."""
+    if found["quick"] != earlier["quick"]:
+        raise FormatError(
+            "a quick run and a whole one cannot be joined; write the quick one to another --out"
+        )
+    lists = {
+        key: [
+            *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
+            *found[key],
+        ]
+        for key in ("table", "results")
+    }
+    tables = {k: earlier[k] | found[k] for k in BY_METHOD}
+    return earlier | found | tables | lists
+
+
+def _at(one: dict[str, Any]) -> tuple[Any, ...]:
+    """Part, method and world, or worlds, of a line."""
+    return one["part"], one["method"], one.get("means_removed"), one.get("world")
+
+
+def _results(out: Path) -> dict[str, Any]:
+    """results.json in `out`. Raises FormatError where it is not there."""
+    try:
+        results: dict[str, Any] = json.loads((out / "results.json").read_bytes())
+    except (OSError, ValueError) as e:
+        raise FormatError(
+            f"{out}/results.json is not of the paper's experiment: {e}; run all of it first"
+        ) from e
+    return results
+
+
+def as_printed(curve: dict[str, Any], parts: dict[str, PaperPart]) -> dict[str, Any]:
+    """A summary of the paper's CNN from what cnn_curve has followed so far, as its newest point."""
+    point, ran = (
+        curve["points"][-1],
+        f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50",
+    )
+    outcomes = []
+    for part, name in CURVE_PARTS.items():
+        newest = {k: np.array(v) for k, v in curve["newest"][name].items()}
+        about = {
+            "part": part,
+            "method": paper_values.CNNS[0],
+            "world": curve["about"][1],
+            "means_removed": False,
+            "ran": ran,
+            "confusion": point[f"{name} confusion"],
+            "fit_s": None,
+            "ms_p50": None,
+            "agreement": None,
+            "materials": list(skin.MATERIALS),
+            "commit": curve["commit"],
+            "machine": curve["machine"],
+        }
+        costs = (
+            [np.array([[p["step"], p["cost"]] for p in curve["points"]])] if part == "lopo" else []
+        )
+        outcomes.append(
+            Outcome(
+                part,
+                paper_values.CNNS[0],
+                curve["about"][1],
+                newest["labels"],
+                newest["logits"],
+                newest["position"],
+                costs,
+                about,
+            )
+        )
+    reached = {"step": point["step"], "steps": curve["steps"], "commit": curve["commit"]}
+    return summary(outcomes, parts, Effort(paper_steps=curve["steps"])) | {"curve": reached}
+
+
+def draw(out: Path) -> Path:
+    """The pictures and the page of results.json in `out`, which takes up CURVE where it lies there;
+    the page's path.
+
+    Raises FormatError where results.json is not there, or CURVE is of another training.
+    """
+    results = _results(out)
+    if (out / CURVE).exists():
+        curve = json.loads((out / CURVE).read_bytes())
+        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
+            raise FormatError(
+                f"{out / CURVE} is not the CNN as printed; run python -m train.studies cnn-curve --size whole"
+            )
+        results = joined(as_printed(curve, FULL) | {"quick": results["quick"]}, results)
+        put(out / "results.json", _lines(results).encode())
+    page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
+    return html.publish(out, {"index": page}, pictures, provenance.of(results))
+
+
+def _outcomes(
+    parts: dict[str, PaperPart], steps: Sequence[Step], where: Where, effort: Effort, log: Log
+) -> Iterator[Outcome]:
+    """Step by step; after each fold `log` gets the progress and an estimate of the time left."""
+    todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
+    expected = [len(step.methods) * parts[part].folds * step.fold_s for step, part, _ in todo]
+    pace = 1 / (os.cpu_count() or 1)
+    for i, (step, part, world) in enumerate(todo):
+        start, done, folds = time.monotonic(), 0, len(step.methods) * parts[part].folds
+
+        def count(line: str) -> None:
+            nonlocal done
+            done += 1
+            left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
+            where_now = f"{i + 1}/{len(todo)} {part}, world {world}"  # noqa: B023
+            log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
+
+        plan = Plan(step.methods, (parts[part].protocol,), (world,), step.means_removed, effort)
+        for result in evaluate(parts[part].load(world), plan, where, count):
+            yield Outcome.of(part, world, result)
+        took = time.monotonic() - start
+        if took > expected[i] * pace / 10:  # else it came from the cache
+            pace = took / expected[i]
+
+
+def summary(
+    outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT
+) -> dict[str, Any]:
+    """All that paper_report needs, as plain numbers."""
+    groups: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in outcomes:
+        groups.setdefault((outcome.part, outcome.method), []).append(outcome)
+    lopo = {method: those for (part, method), those in groups.items() if part == "lopo"}
+    return {
+        "parts": {
+            k: {"sets": part.sets, "only": part.only, "protocol": part.protocol}
+            for k, part in parts.items()
+        },
+        "table": [_row(*key, those) for key, those in groups.items()],
+        "costs": {
+            m: [cost.tolist() for o in lopo[m] for cost in o.costs]
+            for m in paper_values.CNNS
+            if m in lopo
+        },
+        "confusion": {
+            m: np.sum([o.about["confusion"] for o in those], 0).tolist()
+            for m, those in lopo.items()
+        },
+        "several": {m: several(those) for m, those in lopo.items()},
+        "explored": {m: explored(those) for m, those in lopo.items()},
+        "methods": {
+            name: method.about
+            for name, method in methods.every(effort).items()
+            if name in {m for _, m in groups}
+        },
+        "results": [outcome.about for outcome in outcomes],
+    }
+
+
+def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
+    """One line of the table. attachments: how many there are, and the accuracy of the worst and the
+    best of them."""
+    right, place = (
+        np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place")
+    )
+    each = [float(right[place == p].mean()) for p in np.unique(place)]
+    return {
+        "part": part,
+        "method": method,
+        "worlds": [o.world for o in those],
+        "right": int(right.sum()),
+        "total": len(right),
+        "share": estimate(right, place),
+        "printed": paper_values.ACCURACY[part].get(method),
+        "attachments": [len(each), round(min(each), 4), round(max(each), 4)],
+        "ran": those[0].about["ran"],
+        **{k: _median([o.about[k] for o in those]) for k in ("fit_s", "ms_p50")},
+    }
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """None where one was not measured."""
+    measured = [value for value in values if value is not None]
+    return round(float(np.median(measured)), 4) if len(measured) == len(values) else None
+
+
+def estimate(right: Array, place: Array) -> list[float]:
+    """Share of `right` [n] and its 95 % interval over attachments `place` [n] (score.interval)."""
+    return [round(float(right.mean()), 4), *score.interval(right, place)]
+
+
+def objects(labels: Array, place: Array, seed: int) -> Array:
+    """Explorations of one object each, indices of sweeps [n, S]: sec. V.D, sweeps of one material
+    from the test set.
+
+    Every sweep comes first once; others of its material and place follow in random order, as many
+    as every group has.
+    """
+    rng = np.random.default_rng(seed)
+    alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
+    least, rows = np.bincount(alike).min(), []
+    for i in range(len(labels)):
+        others = np.flatnonzero(alike == alike[i])
+        rows.append([i, *rng.permutation(others[others != i])[: least - 1]])
+    return np.array(rows)
+
+
+def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
+    """Estimates after one, two, three sweeps of an object, by "vote" and by "product", as the box
+    fuses."""
+    estimates: dict[str, list[list[float]]] = {}
+    for rule in ("vote", "product"):
+        for n in range(1, SEVERAL + 1):
+            right = np.concatenate([_fused(o, n, rule) for o in those])
+            estimates.setdefault(rule, []).append(
+                estimate(right, np.concatenate([o.place for o in those]))
+            )
+    return estimates
+
+
+def _fused(outcome: Outcome, n: int, rule: str) -> Array:
+    """bool [n], whether the first `n` sweeps of each exploration give its material."""
+    scores = softmax(outcome.logits)
+    drawn = outcome.explorations[:, :n]
+    named = np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn])
+    return np.asarray(named == outcome.labels)
+
+
+def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of
+    sweeps."""
+    points = []
+    for sure in SURE:
+        right, used = [], []
+        for o in those:
+            log_p = np.log(np.maximum(softmax(o.logits), LEAST_PROBABILITY))
+            ends = [prior_work.explore(log_p[row], sure) for row in o.explorations]
+            labels, counts = np.array(ends).T
+            right.append(labels == o.labels)
+            used.append(counts)
+        share = estimate(np.concatenate(right), np.concatenate([o.place for o in those]))
+        points.append(
+            {"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)}
+        )
+    return points
+
+
+def _thinned(cost: Array) -> Array:
+    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic
+    axis."""
+    ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
+    return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)
+
+
+def _lines(results: dict[str, Any]) -> str:
+    """JSON with one line for each figure and each result, so that differences can be read."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return "[\n" + ",\n".join(json.dumps(item) for item in value) + "\n]"
+        return json.dumps(value)
+
+    return "{\n" + ",\n".join(f"{json.dumps(k)}: {text(v)}" for k, v in results.items()) + "\n}\n"

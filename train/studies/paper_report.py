@@ -1,0 +1,336 @@
+"""The page of the paper's experiment, in the paper's order. In: its summary, as results.json holds
+it. Out: page, pictures.
+
+Nothing is computed here but differences. Every sentence with a number takes it from the summary, so
+that it is true of whatever was run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.reports import confusion_plot, html, provenance
+from train.reports.formatting import estimate, exact_percent, seconds
+from train.studies import TEMPLATES, plots
+from train.studies.paper_values import (
+    CNNS,
+    CONFUSION,
+    COST,
+    FIGURES,
+    SEVERAL,
+    display_name,
+    short_name,
+)
+
+TITLES = {
+    "lopo": "T-REAL, leave one position out",
+    "hard": "trained on T-REAL, tested on T-HARD",
+    "lab": "T-LAB, random folds",
+    "random": "T-REAL, random folds",
+}
+"""Hard protocols first."""
+HARD = ("lopo", "hard")
+"""The protocols that the paper is about."""
+COLUMNS = {
+    "lopo": "T-REAL\nleave position",
+    "hard": "T-HARD",
+    "lab": "T-LAB\nrandom",
+    "random": "T-REAL\nrandom",
+}
+FIVE = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+BEST = "H-svm"
+OWN = ("default-reattached", "default")
+"""Ours, that of the packaged bundle first."""
+NEAR, NEAR_ON_AVERAGE = 0.06, 0.03
+"""What the calibration aims at."""
+Row = Mapping[str, Any]
+Key = tuple[str, str]
+"""Part and method."""
+
+
+def render(
+    summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = None
+) -> tuple[str, dict[str, str]]:
+    """The page (HTML) of a summary, as paper_experiment.summary gives it, and its pictures (SVG) by
+    name.
+
+    box_on_hard: what the box answers to T-HARD's sweeps, see chart_report.box_on_hard.
+    """
+    report = PaperReport(summary)
+    pictures = report.pictures()
+    drawn = {name: html.picture(svg) for name, svg in pictures.items()}
+    return html.render(
+        "paper.html.j2",
+        TEMPLATES,
+        header=provenance.of(summary),
+        home=html.HOME,
+        pictures=drawn,
+        box_on_hard=box_on_hard,
+        **report.run(),
+        **report.figures(),
+        **report.network(),
+    ), pictures
+
+
+class PaperReport:
+    """What page and pictures show of a summary."""
+
+    def __init__(self, summary: Mapping[str, Any]) -> None:
+        self.summary = summary
+        self.rows: dict[Key, Row] = {(row["part"], row["method"]): row for row in summary["table"]}
+        self.cnns = [method for method in CNNS if ("lopo", method) in self.rows]
+        self.own = [
+            method
+            for method in OWN
+            if ("hard", method) in self.rows or ("lopo", method) in self.rows
+        ]
+
+    def pictures(self) -> dict[str, str]:
+        """All pictures by name."""
+        drawn = {f"figure-{number}": self._bars(number, part) for part, number in FIGURES.items()}
+        if self.cnns:
+            groups = {
+                TITLES[part]: [self._bar(at) for at in self._compared() if at[0] == part]
+                for part in HARD
+            }
+            names, confusion = self.summary["results"][0]["materials"], self.summary["confusion"]
+            drawn |= {
+                "figure-9": plots.curve(self._costs(), COST, "Fig. 9: cost in training"),
+                "figure-10": plots.bars(
+                    {k: v for k, v in groups.items() if v}, "Fig. 10: H-svm, the CNN and ours"
+                ),
+                "figure-11": confusion_plot.draw(
+                    np.array(confusion[self.cnns[0]]),
+                    names,
+                    "Fig. 11: confusion of the CNN",
+                    CONFUSION,
+                ),
+                "figure-12": confusion_plot.draw(
+                    np.array(confusion[BEST]), names, "Fig. 12: confusion of H-svm"
+                ),
+            }
+        several = self.summary["several"]
+        shown = {
+            short_name(m): several[m] for m in (BEST, *self.cnns[:1], *self.own[:1]) if m in several
+        }
+        printed = {short_name(m): values for m, values in SEVERAL.items()}
+        cells: dict[Key, plots.Estimate] = {
+            (display_name(method).replace("paper-cnn,", "cnn,"), COLUMNS[part]): tuple(row["share"])
+            for part in TITLES
+            for (its_part, method), row in self.rows.items()
+            if its_part == part
+        }
+        return drawn | {
+            "figure-13": plots.sweeps(shown, printed, "Fig. 13: one, two and three sweeps"),
+            "methods": plots.grid({"": cells}, "all methods on all protocols"),
+        }
+
+    def run(self) -> dict[str, Any]:
+        """What was run, and what came out in short."""
+        summary, table = self.summary, self.summary["table"]
+        sets = [
+            [
+                TITLES[k],
+                ", ".join(map(_readable, part["sets"]))
+                + (f" ({', '.join(part['only'])})" if part["only"] else ""),
+                part["protocol"],
+            ]
+            for k, part in self._ordered(summary["parts"])
+        ]
+        trained = {row["method"]: row for row in table if row["ran"] and row["method"] not in OWN}
+        return {
+            "quick": summary["quick"],
+            "commits": self._commits(),
+            "machine": summary["results"][0]["machine"],
+            "evaluations": len(summary["results"]),
+            "method_count": len({method for _, method in self.rows}),
+            "world_count": len({world for row in table for world in row["worlds"]}),
+            "sets": sets,
+            "own_seeds": any(
+                "{a}" in name for part in summary["parts"].values() for name in part["sets"]
+            ),
+            "reference": BEST,
+            "short": [TITLES[part] for part in HARD],
+            "trainings": [
+                [
+                    display_name(m),
+                    row["ran"],
+                    "–" if row["fit_s"] is None else seconds(row["fit_s"]),
+                ]
+                for m, row in trained.items()
+            ],
+            "methods": summary["methods"],
+            "overview": [self._overview(method) for method in (BEST, *self._shown())],
+            "match": self._match(),
+        }
+
+    def figures(self) -> dict[str, Any]:
+        """Figs. 4 to 7 and 13, and all methods."""
+        pairs = [
+            (self.rows["random", m], self.rows["lopo", m])
+            for m in FIVE
+            if {("random", m), ("lopo", m)} <= self.rows.keys()
+        ]
+        count, low, high = self.rows["hard", BEST]["attachments"]
+        several, explored = self.summary["several"], self.summary["explored"]
+        return {
+            "spectral": {number: self._figure(part) for part, number in FIGURES.items()},
+            "flattery": {
+                "ours": np.mean([easy["share"][0] - hard["share"][0] for easy, hard in pairs]),
+                "printed": np.mean([easy["printed"] - hard["printed"] for easy, hard in pairs]),
+            },
+            "attachments": {"count": count, "low": low, "high": high},
+            "several": [
+                [
+                    display_name(m),
+                    *(estimate(rules["product"][n], 0) for n in range(3)),
+                    estimate(rules["vote"][2], 0),
+                ]
+                for m, rules in sorted(several.items(), key=lambda item: -item[1]["product"][2][0])
+            ],
+            "probabilities": [exact_percent(e["sure"]) for e in next(iter(explored.values()))],
+            "explored": [
+                [
+                    display_name(m),
+                    *(f"{estimate(e['share'], 0)} in {e['sweeps']:.1f}" for e in those),
+                ]
+                for m, those in sorted(explored.items(), key=lambda item: -item[1][-1]["share"][0])
+            ],
+            "all_numbers": {
+                title: self._numbers([at for at in self.rows if at[0] == part])
+                for part, title in TITLES.items()
+            },
+        }
+
+    def network(self) -> dict[str, Any]:
+        """Figs. 9 to 12; `network` is empty where the paper's CNN was not run."""
+        if not self.cnns:
+            return {"network": "", "curve": None, "own": [short_name(m) for m in self.own]}
+        names, confusion, costs = (
+            self.summary["results"][0]["materials"],
+            self.summary["confusion"],
+            self._costs(),
+        )
+        steps = {row["ran"] for (_, m), row in self.rows.items() if m == self.cnns[0]}
+        return {
+            "network": display_name(self.cnns[0]),
+            "centred": self.cnns[0] != CNNS[0],
+            "curve": self.summary.get("curve"),
+            "own": [short_name(m) for m in self.own],
+            "final_cost": float(np.median([cost[-1, 1] for cost in costs])) if costs else None,
+            "folds": len(costs),
+            "iterations": sorted(steps),
+            "compared": self._numbers(self._compared()),
+            "confusions": {
+                "network": _worst(np.array(confusion[self.cnns[0]]), names),
+                "reference": _worst(np.array(confusion[BEST]), names),
+            },
+        }
+
+    def _shown(self) -> list[str]:
+        """The paper's network, or the form of it that was run, and ours."""
+        return [*self.cnns[:1], *self.own]
+
+    def _commits(self) -> list[list[str]]:
+        """Each commit, and the methods whose results are of it; the one with the most results
+        last."""
+        by_commit: dict[str, dict[str, None]] = {}
+        for result in self.summary["results"]:
+            by_commit.setdefault(result["commit"], {})[result["method"]] = None
+        return [
+            [commit, ", ".join(those)]
+            for commit, those in sorted(by_commit.items(), key=lambda item: len(item[1]))
+        ]
+
+    def _overview(self, method: str) -> dict[str, Any]:
+        """One line of the summary at the top: its result in each of HARD, None where there is
+        none."""
+        rows = [self.rows.get((part, method)) for part in HARD]
+        return {
+            "name": display_name(method),
+            "rows": rows,
+            "ran": next((row["ran"] for row in rows if row and method in CNNS), ""),
+        }
+
+    def _match(self) -> dict[str, Any]:
+        """How far the simulator is from the printed accuracies of the five classical methods."""
+        rows = [self.rows[part, m] for part in FIGURES for m in FIVE if (part, m) in self.rows]
+        away = np.array([row["share"][0] - row["printed"] for row in rows])
+        off = [
+            {"method": row["method"], "title": TITLES[row["part"]], "difference": difference}
+            for row, difference in zip(rows, away, strict=True)
+            if abs(difference) > NEAR
+        ]
+        return {
+            "count": len(rows),
+            "mean": np.abs(away).mean(),
+            "most": np.abs(away).max(),
+            "limit": NEAR,
+            "near": int(np.sum(np.abs(away) <= NEAR)),
+            "mean_limit": NEAR_ON_AVERAGE,
+            "off": off,
+        }
+
+    def _figure(self, part: str) -> dict[str, Any]:
+        """One of Figs. 4 to 7: its title and numbers, and the best of ours and of those printed."""
+        rows = [self.rows[part, m] for m in FIVE if (part, m) in self.rows]
+        return {
+            "title": TITLES[part],
+            "rows": self._numbers([(part, m) for m in FIVE]),
+            "best_ours": max(rows, key=lambda row: row["share"][0]),
+            "best_printed": max(rows, key=lambda row: row["printed"]),
+        }
+
+    def _bars(self, number: int, part: str) -> str:
+        bars = [self._bar((part, m)) for m in FIVE if (part, m) in self.rows]
+        return plots.bars({"": bars}, f"Fig. {number}: {TITLES[part]}", chance=1 / 6)
+
+    def _bar(self, at: Key) -> plots.Bar:
+        row = self.rows[at]
+        return plots.Bar(short_name(row["method"]), tuple(row["share"]), row["printed"])
+
+    def _compared(self) -> list[Key]:
+        """What Fig. 10 compares."""
+        return [
+            (part, m) for part in HARD for m in (BEST, *self._shown()) if (part, m) in self.rows
+        ]
+
+    def _costs(self) -> list[NDArray[Any]]:
+        return [np.array(cost) for cost in self.summary["costs"][self.cnns[0]]]
+
+    def _numbers(self, those: Sequence[Key]) -> list[Row]:
+        """Lines of a table of numbers, each with a name; the part is in it where there are
+        several."""
+        several_parts = len({part for part, _ in those}) > 1
+        return [
+            {
+                **self.rows[part, m],
+                "name": f"{display_name(m)}, {TITLES[part]}" if several_parts else display_name(m),
+            }
+            for part, m in those
+            if (part, m) in self.rows
+        ]
+
+    @staticmethod
+    def _ordered(parts: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+        return ((part, parts[part]) for part in TITLES if part in parts)
+
+
+def _readable(name: str) -> str:
+    """A set's name with letters for the numbers that differ from world to world."""
+    return name.format(w="W", a="A", b="B")
+
+
+def _worst(matrix: NDArray[Any], names: Sequence[str]) -> list[dict[str, Any]]:
+    """The two greatest confusions."""
+    rows = matrix / np.maximum(matrix.sum(1, keepdims=True), 1)
+    off = np.where(np.eye(len(names), dtype=bool), -1, rows)
+    order = np.argsort(off, axis=None)[::-1][:2]
+    return [
+        {"truth": names[i], "named": names[j], "share": rows[i, j]}
+        for i, j in zip(*np.unravel_index(order, off.shape), strict=True)
+    ]

@@ -1,0 +1,229 @@
+"""The page of the command stress: what breaks each method first. In: what it measured. Out:
+results.json, pictures, a page.
+
+Nothing is computed here but differences and orders. The first method is ours; five at most are
+drawn.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from train.evaluation.robustness import POINTS, TARGETS, at_targets, breaks_first
+from train.reports import html, provenance
+from train.reports.formatting import exact_percent, level, points
+from train.studies import TEMPLATES, stress_plots
+from train.studies.method_names import about, plain_name
+
+Json = Mapping[str, Any]
+EARLIER = plain_name("compact")
+"""The recipe that `fit` used before the default of today: nowhere may ours be more than NEAR below
+it."""
+NEAR = 0.01
+ROUNDING = 1e-9
+PACKAGED = "the packaged bundle, as the box answers"
+SHOWN = 3
+"""Corruptions of each method in the table of what breaks it first."""
+
+
+def write(result: Json, out: Path) -> Path:
+    """results.json, the pictures and the page in the folder `out`; the page's path. Raises
+    FormatError as `render`."""
+    page, pictures = render(result)
+    put(out / "results.json", (json.dumps(result, allow_nan=False) + "\n").encode(), parents=True)
+    return html.publish(out, {"index": page}, pictures, provenance.of(result))
+
+
+def read(out: Path) -> Json:
+    """What `write` put into the folder `out`. Raises FormatError where it is not there."""
+    try:
+        result: Json = json.loads((out / "results.json").read_bytes())
+    except (OSError, ValueError) as e:
+        raise FormatError(
+            f"{out}/results.json is not of the command stress: {e}; run it without --draw"
+        ) from e
+    return result
+
+
+def render(result: Json) -> tuple[str, dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name. Raises FormatError where no method has a
+    result."""
+    entries = {
+        plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
+    }
+    if not entries:
+        raise FormatError(
+            "no method has a result; run the command without --kept, or with other methods"
+        )
+    curves = {name: entry["curves"] for name, entry in entries.items()}
+    ours, box = next(iter(curves)), result["box"]["curves"]
+    pictures = {"curves": stress_plots.methods(curves)} | (
+        {"box": stress_plots.box(box)} if box else {}
+    )
+    page = html.render(
+        "stress.html.j2",
+        TEMPLATES,
+        header=provenance.of(result),
+        home=html.HOME,
+        r=result,
+        ours=ours,
+        points=exact_percent(POINTS).removesuffix(" %"),
+        earlier=EARLIER,
+        near=NEAR,
+        clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
+        pictures={name: html.picture(svg) for name, svg in pictures.items()},
+        headline=headline(curves[ours]),
+        targets=targets(curves, ours),
+        first=[
+            [name, *first(those)]
+            for name, those in (curves | ({PACKAGED: box["rightly"]} if box else {})).items()
+        ],
+        most_wrong=most_wrong(box["wrongly"]) if box else None,
+        lines=list(target_lines(curves, ours, box)),
+        falls=fall_lines(curves, box),
+        missing=missing(curves, ours),
+        methods=[[plain_name(name), about(name), name] for name in result["methods"]],
+        refused={
+            plain_name(name): entry["refused"]
+            for name, entry in result["methods"].items()
+            if entry["refused"]
+        },
+        trouble=trouble(entries, result["box"]["uninformative"]),
+    )
+    return page, pictures
+
+
+def headline(curves: Json) -> Json:
+    """What breaks a method first, and how many corruptions do in all."""
+    falls, broken = first(curves)
+    return {"first": falls, "broken": broken, "all": len(curves)}
+
+
+def first(curves: Json) -> tuple[list[str], int]:
+    """What breaks a method first, then next; and how many corruptions do in all."""
+    broken = breaks_first(curves)
+    return [_fall(curves[name]) for name in broken[:SHOWN]], len(broken)
+
+
+def _fall(curve: Json) -> str:
+    return f"{curve['title']}: {level(curve, curve['falls'])}"
+
+
+def _of(curve: Json, i: int) -> tuple[float, float, float]:
+    """Share and interval at one severity."""
+    return curve["accuracy"][i], curve["low"][i], curve["high"][i]
+
+
+def most_wrong(curves: Json) -> Json:
+    """Where the box gives most wrong names: the corruption, its severity, the share."""
+    name, i = max(
+        ((name, i) for name, curve in curves.items() for i in range(len(curve["accuracy"]))),
+        key=lambda at: curves[at[0]]["accuracy"][at[1]],
+    )
+    curve = curves[name]
+    return {
+        "title": curve["title"],
+        "level": level(curve, curve["severities"][i]),
+        "share": _of(curve, i),
+    }
+
+
+def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
+    """What was wanted of ours: nowhere more than NEAR below the recipe before it. Empty where that
+    was not tested."""
+    if EARLIER not in curves or ours == EARLIER:
+        return []
+    differences = [
+        at[0] - earlier[0]
+        for at, earlier in zip(
+            at_targets(curves[ours]).values(), at_targets(curves[EARLIER]).values(), strict=True
+        )
+    ]
+    near = sum(difference >= -NEAR - ROUNDING for difference in differences)
+    return [
+        {
+            "what": f"lines of the table below in which {ours} is at most one point below {EARLIER}, the recipe before it",
+            "target": f"{len(differences)} of {len(differences)}",
+            "here": f"{near} of {len(differences)}",
+            "met": near == len(differences),
+        }
+    ]
+
+
+def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
+    """A line for each of TARGETS. cells: by method; difference: of ours less EARLIER; box: rightly,
+    wrongly, network."""
+    found = {name: at_targets(those) for name, those in curves.items()}
+    answered = (
+        {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")}
+        if box
+        else {}
+    )
+    lines: list[Json] = []
+    for key in found[ours]:
+        those = [
+            (curves[ours][name], severity)
+            for name, severity in TARGETS[key]
+            if name in curves[ours]
+        ]
+        what = " or ".join(dict.fromkeys(curve["title"] for curve, _ in those))
+        pair = [found[name][key][0] for name in (ours, EARLIER) if name in found]
+        lines.append(
+            {
+                "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
+                "cells": [found[name].get(key) for name in curves],
+                "box": [at[key] for at in answered.values()],
+                "difference": points(pair[0] - pair[1], sign=True)
+                if len(pair) == 2 and ours != EARLIER
+                else "–",
+                "missed": len(pair) == 2 and pair[0] - pair[1] < -NEAR - ROUNDING,
+            }
+        )
+    return lines
+
+
+def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
+    """Of each corruption what it does, and the severity at which each method, and the box, has lost
+    five points."""
+    columns = [*curves.values(), *([box["rightly"]] if box else [])]
+    about = {name: curve for those in columns for name, curve in those.items()}
+    return [
+        [f"{curve['title']}: {curve['about']}", *(_cell(those.get(name)) for those in columns)]
+        for name, curve in about.items()
+    ]
+
+
+def _cell(curve: Json | None) -> str:
+    if curve is None:
+        return ""
+    return (
+        f"> {level(curve, curve['severities'][-1])}"
+        if curve["falls"] is None
+        else level(curve, curve["falls"])
+    )
+
+
+def missing(curves: Mapping[str, Json], ours: str) -> list[str]:
+    """Corruptions that have no picture, since they cost no drawn method five points."""
+    shown = stress_plots.shown(curves)
+    return [curve["title"] for name, curve in curves[ours].items() if name not in shown]
+
+
+def trouble(entries: Mapping[str, Json], box: Mapping[str, str]) -> list[list[str]]:
+    """Of each uninformative sweep what methods make of it, and the box."""
+    rows = []
+    for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
+        answers: Counter[str] = Counter(
+            entry["trouble"][name].split(":")[0] for entry in entries.values()
+        )
+        desktop = ", ".join(
+            f"{n} {'answer' if answer == 'finite' else answer}" for answer, n in answers.items()
+        )
+        rows.append([name, desktop, box.get(name, "–")])
+    return rows
