@@ -234,4 +234,6 @@ def earlier_run(
         raise FormatError(f"{path} cannot be read: {e.strerror}; {advice}") from e
     except (ValueError, AttributeError):
         pass
-    raise FormatError(f"{path} is not what palpate-train {command} wrote; {otherwise or advice}")
+    raise FormatError(
+        f"{path} is not what python -m train.studies {command} wrote; {otherwise or advice}"
+    )

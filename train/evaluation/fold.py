@@ -11,12 +11,14 @@ import ast
 import hashlib
 import io
 import json
+import re
+import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,7 @@ NOT_COUNTED = (
 )
 """Modules that methods use and that do not change the result of a fold: it stays valid when their
 code changes. Of the sets the data themselves count."""
+OWN = ("train", "appliance")
 COUNTED = ("train", "appliance.signal")
 """Packages whose code may change the result of a fold. `agreement` compares the box's other code
 with the desktop's."""
@@ -187,14 +190,52 @@ def key(task: FoldTask, data: str) -> str:
 
 
 def fingerprint(about: Any, *modules: str) -> str:
-    """32 hex digits of a hash of `about` (for JSON), the code of `modules` and all that they import
-    here, and the libraries."""
-    versions = [
-        version("numpy"),
-        version("scikit-learn"),
-        *([version("torch")] if find_spec("torch") else []),
-    ]
+    """32 hex digits of a hash of `about` (for JSON), of the code of `modules` and of all that they
+    import here, and of the versions of the libraries that this code uses."""
+    versions = {name: version(name) for name in libraries(modules)}
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
+
+
+@cache
+def libraries(modules: tuple[str, ...]) -> tuple[str, ...]:
+    """The installed distributions that `modules` import, directly or through other code of this
+    project, and those that compute beneath them, as SciPy does beneath scikit-learn.
+
+    The code of the box counts here too: it stays comparable with the desktop's, but the libraries
+    that it calls can change a result. A requirement of a distribution computes where it requires
+    numpy itself; all others, such as Jinja beneath PyTorch, leave a fold as it is.
+    """
+    closure = _closure(modules, OWN, NOT_COUNTED)
+    roots = {name.partition(".")[0] for module in closure for name in _import_names(module)}
+    known = packages_distributions()
+    named = [name for root in roots - sys.stdlib_module_names for name in known.get(root, ())]
+    left = [name for name in map(_normal, named) if not name.startswith("palpate")]
+    found: set[str] = set()
+    while left:
+        if (name := left.pop()) not in found and _installed(name):
+            found.add(name)
+            left += [one for one in _required(name) if "numpy" in (one, *_required(one))]
+    return tuple(sorted(found))
+
+
+def _normal(name: str) -> str:
+    """The name of a distribution in the one spelling of PEP 503."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _installed(name: str) -> bool:
+    try:
+        version(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def _required(name: str) -> list[str]:
+    """The distributions that `name` requires without its extras; none where it is not installed."""
+    lines = (requires(name) or ()) if _installed(name) else ()
+    own = [line for line in lines if not re.search(r";.*\bextra\b", line)]
+    return [_normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) for line in own]
 
 
 @cache
@@ -209,12 +250,17 @@ def _code(modules: tuple[str, ...]) -> bytes:
 def reached(modules: Sequence[str]) -> set[str]:
     """`modules` and all that these import of the packages COUNTED, directly or not, but for
     NOT_COUNTED."""
-    found, left = set(NOT_COUNTED), list(modules)
+    return _closure(modules, COUNTED, NOT_COUNTED)
+
+
+def _closure(modules: Sequence[str], packages: Sequence[str], without: Sequence[str]) -> set[str]:
+    """`modules` and all that they import of `packages`, directly or not, but for `without`."""
+    found, left = set(without), list(modules)
     while left:
         if (module := left.pop()) not in found:
             found.add(module)
-            left += _imported(module)
-    return found - set(NOT_COUNTED)
+            left += _imported(module, packages)
+    return found - set(without)
 
 
 def _file(module: str) -> Path:
@@ -224,20 +270,23 @@ def _file(module: str) -> Path:
     return Path(spec.origin)
 
 
-def _imported(module: str) -> list[str]:
-    """The modules of COUNTED that `module` imports."""
-    tree = ast.parse(_file(module).read_bytes())
-    froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    names = [
-        name
-        for node in froms
-        for name in (node.module or "", *(f"{node.module}.{a.name}" for a in node.names))
-    ]
-    return [
-        name
-        for name in names
-        if name.startswith(tuple(f"{p}." for p in COUNTED)) and _is_module(name)
-    ]
+def _imported(module: str, packages: Sequence[str]) -> list[str]:
+    """The modules of `packages` that `module` imports."""
+    ours = tuple(f"{package}." for package in packages)
+    return [name for name in _import_names(module) if name.startswith(ours) and _is_module(name)]
+
+
+@cache
+def _import_names(module: str) -> tuple[str, ...]:
+    """All names in the import statements of a module, those in its functions too: `a.b` and `a.b.c`
+    for `from a.b import c`."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(_file(module).read_bytes())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(names)
 
 
 def _is_module(name: str) -> bool:

@@ -203,7 +203,7 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
     classical = reached("L-svm")
     assert {
         "baselines",
-        "linear_head",
+        "temperature",
         "graph_builder",
         "features",
         "time_series",
@@ -214,6 +214,32 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         & classical
     )
     assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
+
+
+@pytest.mark.parametrize(
+    ("method", "used", "unused"),
+    [
+        ("L-svm", {"numpy", "scikit-learn", "scipy", "onnx", "skl2onnx", "onnxruntime"}, {"aeon"}),
+        ("minirocket", {"aeon", "numba", "scikit-learn", "onnxruntime"}, set()),
+        ("paper-cnn", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon", "skl2onnx"}),
+        ("default", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon"}),
+    ],
+)
+def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(
+    method: str, used: set[str], unused: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    """An upgrade of each of them gives the fold another name; what it does not use may change."""
+    task = fold.FoldTask(method, methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
+    plain, real = fold.key(task, "data"), fold.version
+    modules = (methods.module_of(method), "train.evaluation.fold")
+    assert used <= set(fold.libraries(modules))
+    assert not unused & set(fold.libraries(modules))
+    for name in used:
+        monkeypatch.setattr(fold, "version", lambda of, name=name: "0" if of == name else real(of))
+        assert fold.key(task, "data") != plain, name
+    for name in unused:
+        monkeypatch.setattr(fold, "version", lambda of, name=name: "0" if of == name else real(of))
+        assert fold.key(task, "data") == plain, name
 
 
 @pytest.mark.parametrize(

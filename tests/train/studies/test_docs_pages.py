@@ -92,9 +92,9 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
     assert main(["reports", "--list"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"older    stale: Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now",
-        "         palpate-train older",
+        "         python -m train older",
         "current  of today",
-        "         palpate-train current --out x",
+        "         python -m train current --out x",
         f"lacking  stale: docs/lacking/index.html: No such file or directory; left out: it needs {NEED}",
         "         python -m tests.lacking",
         "new      stale: docs/new/index.html: No such file or directory",
