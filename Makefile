@@ -6,11 +6,12 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 RUNTIME := $(VENV)/runtime.done
 FLEET := $(VENV)/fleet.done
 DESKTOP := $(VENV)/desktop.done
+SITE := $(VENV)/site.done
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(error name a box with HOST=user@box, or many with HOSTS=inventory.py)))
 
 .DEFAULT_GOAL := help
 .PHONY: help demo desktop test test-fast check machines lint types bench bundle skins reports figures chart development paper ros rig rig-shell rig-tools rig-ground test-rig test-hw systemd soak attacked load fuzz hostile flips cuts \
-  deploy install wheel lock clean
+  deploy install wheel lock clean site
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -121,6 +122,9 @@ development: $(DESKTOP) ## ours and its peers on all development sets: docs/deve
 paper: $(DESKTOP) ## the paper's experiment, run again: docs/paper/ (goes on where it was interrupted)
 	$(BIN)/python -m train.studies paper $(PAPER)
 
+site: $(SITE) ## the documents as a site, the pages of results included: build/site/index.html
+	PYTHONPATH=systemd $(BIN)/python docs/site/build.py build
+
 deploy: $(FLEET) ## put a signed BUNDLE= on a box, HOST=user@box, or on many, HOSTS=inventory.py; SHADOW=1: as the candidate
 	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
 	  $(or $(BUNDLE),$(error name the bundle with BUNDLE=its folder))
@@ -157,6 +161,11 @@ $(FLEET): $(RUNTIME)
 # The same with the desktop's pinned tools: tests, training, export.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml
 	$(PIP) install -e '.[dev]' -e 'train[minirocket,dask]'
+	@touch $@
+
+# The same with what builds the site.
+$(SITE): $(DESKTOP) pyproject.toml
+	$(PIP) install -e '.[site]'
 	@touch $@
 
 # ROS 2 with palpate_msgs, in a virtual environment of its own.

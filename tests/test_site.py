@@ -1,71 +1,81 @@
-"""The site that .github/workflows/site.yml publishes: its own steps gather the files, and every way
-between them leads somewhere."""
+"""The site: its sources hold every page, each link leads somewhere, the references are those of the
+code, and the workflow publishes what `make site` builds."""
 
 from __future__ import annotations
 
+import importlib.util
 import re
-import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from tests.factories.paths import ROOT
 
 WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
-LINK = re.compile(r'\]\(([^)#\s]+)[^)]*\)|(?:href|src)="([^"#]+)[^"]*"')
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the workflow's step gathers from a clone."""
-    clone = tmp_path_factory.mktemp("site") / "clone"
-    subprocess.run(["git", "clone", "-q", "--depth", "1", f"file://{ROOT}", clone], check=True)
-    (step,) = re.findall(r"- run: \|\n((?: {10}.*\n)+)", WORKFLOW.read_text())
-    subprocess.run(["bash", "-euo", "pipefail", "-c", step], cwd=clone, check=True)
-    return clone / "site"
+def build() -> Iterator[ModuleType]:
+    """docs/site/build.py as a module."""
+    sys.path.insert(0, str(ROOT / "systemd"))
+    path = ROOT / "docs" / "site" / "build.py"
+    spec = importlib.util.spec_from_file_location("site_build", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    sys.path.remove(str(ROOT / "systemd"))
 
 
-def leads(page: Path, link: str) -> bool:
-    """Whether a link of a page leads to something of the site, or out of it."""
-    return bool(re.match(r"[a-z]+:", link)) or (page.parent / link).exists()
+@pytest.fixture(scope="module")
+def sources(build: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The gathered sources of the site, after a check that no link is broken."""
+    out = tmp_path_factory.mktemp("site") / "src"
+    assert build.gather(out) == []
+    return out
 
 
-@pytest.mark.slow
-def test_pages_and_pictures_of_the_site_are_found(site: Path):
-    """Each relative link of a page, and each picture of README and the texts below docs/."""
-    pages = [*site.rglob("*.html"), site / "README.md", *site.glob("docs/**/*.md")]
-    assert len([page for page in pages if page.suffix == ".html"]) >= 4
-    lost = []
-    for page in pages:
-        links = [one or other for one, other in LINK.findall(page.read_text(encoding="utf-8"))]
-        shown = (
-            links
-            if page.suffix == ".html"
-            else [link for link in links if link.endswith((".svg", ".png", ".html", ".md"))]
-        )
-        lost += [f"{page.relative_to(site)}: {link}" for link in shown if not leads(page, link)]
-    assert lost == []
+def test_the_sources_hold_every_page(build: ModuleType, sources: Path):
+    """README is the first page, every other page has its place in the contents, once."""
+    names = set(build.pages()) - {"README.md"}
+    assert len(names) > 40
+    first = (sources / "index.md").read_text("utf-8")
+    listed = re.findall(r"(?m)^([\w./-]+/?[\w.-]+)$", first.partition("```{toctree}")[2])
+    assert sorted(f"{name}.md" for name in listed) == sorted(names)
+    assert all((sources / name).is_file() for name in names)
 
 
-@pytest.mark.slow
-def test_pages_of_the_site_lead_to_its_first_page(site: Path):
-    """README is the page of the site's folder: no link goes to a file that Jekyll has renamed."""
-    for page in site.rglob("*.html"):
-        assert 'href="../../README.md"' not in page.read_text(encoding="utf-8")
+def test_a_broken_link_is_named(build: ModuleType, tmp_path: Path):
+    """Its page and its target; a picture outside of the project counts as broken."""
+    lost: list[str] = []
+    text = "[a](missing.md) ![b](../../../etc/hosts) [c](README.md#x) [d](https://e.org) `[e](f)`"
+    assert "[c](index.md#x)" in build.linked(Path("README.md"), text, tmp_path, lost)
+    assert [line.split(" is not")[0] for line in lost] == [
+        "README.md: missing.md",
+        "README.md: ../../../etc/hosts",
+    ]
 
 
-def test_the_workflow_publishes_what_main_holds():
+def test_links_of_the_built_site_are_followed(build: ModuleType, tmp_path: Path):
+    """A reference that is not there is printed with its page; those out of the site are not."""
+    (tmp_path / "there.html").write_text('<a href="https://e.org"><img src="data:x">')
+    (tmp_path / "a.html").write_text('<a href="there.html#x"> <a href="gone.html"> <a href="#b">')
+    assert build.broken(tmp_path) == ["a.html: gone.html is not in the site"]
+
+
+def test_the_workflow_publishes_what_make_builds():
     """On main and by hand, with the rights that publishing needs and no more."""
     text = WORKFLOW.read_text()
     assert "branches: [main]" in text
     assert "workflow_dispatch:" in text
+    assert "- run: make site\n" in text
+    assert "path: build/site\n" in text
     assert re.findall(r"^  ([a-z-]+): (read|write)$", text, re.M) == [
         ("contents", "read"),
         ("pages", "write"),
         ("id-token", "write"),
     ]
-    assert [
-        action
-        for action in re.findall(r"uses: (\S+)@v\d+", text)
-        if not action.startswith("actions/")
-    ] == []
+    used = re.findall(r"uses: (\S+)@v\d+", text)
+    assert [action for action in used if not action.startswith("actions/")] == []

@@ -1,0 +1,179 @@
+"""Builds the site: `PYTHONPATH=systemd python docs/site/build.py build` (make site).
+
+Copies README, CHANGELOG, CONTRIBUTING and all pages below docs/ and firmware_config/ into
+build/site-src, with the files that they link to, and writes the references from the code. README
+becomes the first page. The studies write their result pages into build/site-src/results. Sphinx
+then makes build/site, with warnings as errors. Last, every link of every HTML page is followed.
+Each broken link is printed, and the exit code is 1.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote
+
+import manual
+from manual import ROOT
+
+from train.cli.main import PROGRAM
+from train.studies.command import PROGRAM as STUDIES
+
+HERE = Path(__file__).resolve().parent
+
+LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
+REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
+CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
+CHAPTERS = {
+    "Tutorials": ["docs/tutorials/first-model", "docs/tutorials/first-start"],
+    "How-to": ["docs/how-to/*", "docs/robots/README", "docs/robots/*", "docs/board-checklist"],
+    "Reference": ["docs/reference/*", "firmware_config/PROTOCOL", "firmware_config/*/README"],
+    "Explanation": [
+        "docs/explanation/*",
+        "docs/*",
+        "docs/architecture",
+        "docs/security",
+        "docs/skins",
+        "docs/faults",
+    ],
+    "Results": ["docs/*/README"],
+    "Project": ["CHANGELOG", "CONTRIBUTING", "docs/decisions/README", "docs/decisions/*"],
+}
+"""Captions of the contents, and their pages, without .md."""
+
+
+def main() -> int:
+    """Build all; the exit code."""
+    build = Path(sys.argv[1])
+    sources, site = build / "site-src", build / "site"
+    for folder in (sources, site):
+        shutil.rmtree(folder, ignore_errors=True)
+    lost = gather(sources)
+    if not lost:
+        results(sources / "results")
+        command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", "auto"]
+        command += ["-b", "html", "-d", str(build / "site-cache"), "-c", str(HERE)]
+        if code := subprocess.run([*command, sources, site], check=False).returncode:
+            return code
+        for page in sources.rglob("*.html"):
+            take_over(page.relative_to(sources), sources, site)
+        lost = broken(site)
+    print(*lost, sep="\n", end="\n" * bool(lost))
+    return bool(lost)
+
+
+def gather(out: Path) -> list[str]:
+    """Write the sources of all pages into `out`; links that lead nowhere."""
+    known = manual.references() | {"training-commands": training_commands()}
+    lost: list[str] = []
+    names = sorted(pages())
+    for name in names:
+        text = manual.filled((ROOT / name).read_text("utf-8"), known)
+        target = out / ("index.md" if name == "README.md" else name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        text = linked(Path(name), text, out, lost)
+        target.write_text(text + contents(names) * (name == "README.md"), "utf-8")
+    return lost
+
+
+def results(out: Path) -> None:
+    """Have the studies write their pages, if they are installed."""
+    if "pages" in STUDIES.descriptions():
+        subprocess.run(
+            [sys.executable, "-m", "train.studies", "pages", "--out", out], check=True, cwd=ROOT
+        )
+
+
+def take_over(page: Path, sources: Path, site: Path) -> None:
+    """Copy a page of results into the site with the files that it links to. Its link to README
+    leads to the site's first page."""
+    text = (sources / page).read_text("utf-8")
+    text = re.sub(r'href="((?:\.\./)+)README\.md"', r'href="\1index.html"', text)
+    (site / page).parent.mkdir(parents=True, exist_ok=True)
+    (site / page).write_text(text, "utf-8")
+    for target in filter(None, map(local, REFERENCE.findall(text))):
+        for root in (sources, ROOT):
+            if (file := root / page.parent / target).is_file() and file.suffix != ".html":
+                shutil.copyfile(file, site / page.parent / target)
+
+
+def local(target: str) -> str:
+    """The relative path of a link, or "" where it leads out of the site or into its own page."""
+    return "" if re.match(r"[a-z]+:|//|#", target) else unquote(re.split(r"[#?]", target)[0])
+
+
+def broken(site: Path) -> list[str]:
+    """Each relative link or picture of an HTML page of the site that is not there."""
+    lost = []
+    for page in sorted(site.rglob("*.html")):
+        for target in filter(None, map(local, REFERENCE.findall(page.read_text("utf-8")))):
+            if not (page.parent / target).exists():
+                lost.append(f"{page.relative_to(site)}: {target} is not in the site")
+    return lost
+
+
+def pages() -> Iterator[str]:
+    """Paths of all pages from ROOT."""
+    for pattern in ("*.md", "docs/**/*.md", "firmware_config/**/*.md"):
+        yield from (str(path.relative_to(ROOT)) for path in ROOT.glob(pattern))
+
+
+def training_commands() -> str:
+    """The reference of `palpate-train`."""
+    parts = []
+    for heading, commands in PROGRAM.groups.items():
+        parts.append(f"## {heading[:1].upper()}{heading[1:]}\n")
+        parts += [manual.command_sections(PROGRAM.parser(name), "###") for name in commands]
+    return "\n".join(parts)
+
+
+def linked(page: Path, text: str, out: Path, lost: list[str]) -> str:
+    """The text with its links checked: what they lead to is copied as well, and README's page is
+    `index`. Links that lead nowhere are added to `lost`."""
+
+    def follow(found: re.Match[str]) -> str:
+        begin, target, end = found.groups()
+        if re.match(r"[a-z]+:", target):
+            return found[0]
+        path = (ROOT / page.parent / target).resolve()
+        if not (path.is_file() and path.is_relative_to(ROOT)):
+            lost.append(f"{page}: {target} is not a file of this project; mend the link")
+            return found[0]
+        name = path.relative_to(ROOT)
+        if name == Path("README.md"):
+            return f"{begin}{target.removesuffix('README.md')}index.md{end}"
+        if path.suffix != ".md":
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, out / name)
+        if path.suffix == ".html":
+            return f'<a href="{target}">{begin.lstrip("!").strip("[](")}</a>'
+        return found[0]
+
+    kept = CODE.findall(text)
+    plain = LINK.sub(follow, CODE.sub("\0", text))
+    return re.sub("\0", lambda _: kept.pop(0), plain)
+
+
+def contents(names: list[str]) -> str:
+    """The contents of the site, for the margin: each page once, in the first chapter that has it."""
+    taken: set[str] = {"README.md"}
+    text = "\n"
+    for caption, patterns in CHAPTERS.items():
+        listed = [
+            name
+            for pattern in patterns
+            for name in names
+            if re.fullmatch(f"{pattern}.md".replace("*", "[^/]*"), name) and name not in taken
+        ]
+        listed = [name for name in dict.fromkeys(listed) if not taken.add(name)]  # type: ignore[func-returns-value]
+        lines = "\n".join(name.removesuffix(".md") for name in listed)
+        text += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{lines}\n```\n"
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,17 @@
+"""Settings of Sphinx for the site: pages in Markdown, warnings as errors (make site)."""
+
+from appliance import __version__
+
+project = "Palpate"
+release = __version__
+extensions = ["myst_parser"]
+root_doc = "index"
+source_suffix = {".md": "markdown"}
+myst_heading_anchors = 4
+suppress_warnings = ["misc.highlighting_failure"]  # URScript, KRL and RAPID have no lexer
+exclude_patterns = ["results/**"]
+html_theme = "furo"
+html_title = "Palpate"
+html_show_copyright = False
+html_copy_source = False
+html_show_sphinx = False

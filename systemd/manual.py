@@ -1,0 +1,214 @@
+"""The manual's references, made from the code, and the manual as one text for the box.
+
+A page below docs/ holds a marker such as `<!-- palpate: settings -->` where a reference belongs.
+The site and the text for the box replace it by tables of the settings, commands and exit codes
+that this checkout has. So no reference can be stale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from appliance.cli.main import RUNS
+from appliance.cli.parser import parser
+from appliance.core import config
+from appliance.core.schema import Key
+
+ROOT = Path(__file__).resolve().parent.parent
+BOX_PAGES = (
+    "explanation/what-it-is.md",
+    "tutorials/first-start.md",
+    "how-to/wire.md",
+    "reference/pins.md",
+    "how-to/trigger-without-lines.md",
+    "reference/timing.md",
+    "reference/sentences.md",
+    "reference/statuses.md",
+    "how-to/record.md",
+    "how-to/record-with-a-page.md",
+    "how-to/train.md",
+    "how-to/deliver.md",
+    "how-to/enrol.md",
+    "how-to/look-at-sweeps-again.md",
+    "how-to/align.md",
+    "how-to/use-your-own-skin.md",
+    "how-to/watch.md",
+    "how-to/update.md",
+    "how-to/find-a-fault.md",
+    "reference/settings.md",
+    "reference/commands.md",
+    "reference/exit-codes.md",
+    "reference/specifications.md",
+    "explanation/what-a-skin-can-sense.md",
+    "explanation/limits.md",
+    "reference/glossary.md",
+)
+"""Pages below docs/ that the box holds as one text, in this order."""
+MARKER = re.compile(r"(?m)^<!-- palpate: ([a-z-]+) -->$")
+TITLE = """\
+# Palpate: the manual
+
+For the engineer who integrates the box into a robot cell and keeps it running. Drawings are text.
+PROTOCOL.md, in the same folder, describes every field of every sentence and of the USB packets.
+Search in `less` with `/`, for example `/saturated`.
+"""
+
+
+def references() -> dict[str, str]:
+    """The text for each marker that a page of the box may hold."""
+    return {
+        "settings": settings_tables(),
+        "commands": command_sections(parser(RUNS)),
+    }
+
+
+def filled(text: str, known: Mapping[str, str]) -> str:
+    """A page's text with each marker replaced. Raises KeyError for an unknown marker."""
+    return MARKER.sub(lambda found: known[found[1]], text)
+
+
+def box_manual() -> str:
+    """All pages for the box as one Markdown text in ASCII, its drawings as text."""
+    known = references()
+    pages = [filled((ROOT / "docs" / name).read_text("utf-8"), known) for name in BOX_PAGES]
+    titles = [re.match(r"# (.*)", page)[1] for page in pages]  # type: ignore[index]
+    contents = "\n".join(f"{number}. {title}" for number, title in enumerate(titles, 1))
+    texts = (
+        re.sub(r"\A# ", f"## {number}. ", _plain(page)) for number, page in enumerate(pages, 1)
+    )
+    return "\n".join([TITLE, contents, "", *texts])
+
+
+def _plain(page: str) -> str:
+    """A page without pictures and links; headings below its title one level down."""
+    text = re.sub(r"(?s)<!-- as text:\n\n(.*?)\n*-->", r"\1", page)
+    text = re.sub(r"(?s)<!--.*?-->\n?", "", text)
+    text = re.sub(r"(?m)^!\[[^\]]*\]\([^)]*\)\n\n?", "", text)
+    text = re.sub(r"\[([^\]]+)\]\([^)]+\)", r"\1", text)
+    return re.sub(r"(?m)^(#{2,}) ", r"#\1 ", text)
+
+
+def settings_tables() -> str:
+    """A table for each section of the settings: key, default, allowed values, meaning."""
+    head = "| key | default | allowed | meaning |\n|---|---|---|---|\n"
+    parts = [
+        head + '| `board` | "" | name | which `board-NAME.toml` is read; the same as `--board` |\n'
+    ]
+    for section, group in config._SECTIONS.items():
+        about, meanings = described(group)
+        rows = "".join(
+            f"| `{name}` | {_default(key)} | {_cell(allowed(key))} "
+            f"| {_cell(meanings.get(name.partition('.')[2]) or _unnamed(name, key))} |\n"
+            for name, key in config._KEYS.items()
+            if name.startswith(f"{section}.")
+        )
+        parts.append(f"## {section}\n\n{about}\n\n{head}{rows}")
+    return "\n".join(parts)
+
+
+def described(group: Any) -> tuple[str, dict[str, str]]:
+    """What a section of the settings is about, and each key's meaning, from its docstring: text,
+    then `key: meaning.`, or `key, key: meaning.`"""
+    names = "|".join(group.__dataclass_fields__)
+    parts = re.split(
+        rf"(?:^|(?<=\s))((?:{names})(?:, (?:{names}))*): ", " ".join(group.__doc__.split())
+    )
+    meanings = {
+        name: text.strip().rstrip(".")
+        for listed, text in zip(parts[1::2], parts[2::2], strict=True)
+        for name in listed.split(", ")
+    }
+    return parts[0].strip(), meanings
+
+
+def _unnamed(name: str, key: Key) -> str:
+    """The meaning of a key that its docstring leaves out: GPIO lines are named by their signal."""
+    if "line" not in key.limits:
+        return ""
+    return f"the GPIO line {name.partition('.')[2].upper().replace('_', ' ')}"
+
+
+def _default(key: Key) -> str:
+    return f"0x{key.default:04x}" if "hex" in key.limits else json.dumps(key.default)
+
+
+def allowed(key: Key) -> str:
+    """The values that a setting may have."""
+    if "line" in key.limits:
+        return "GPIO lines" if get_origin(key.hint) is tuple else "GPIO line"
+    if get_args(key.hint):
+        return ", ".join(json.dumps(one) for one in get_args(key.hint))
+    if key.hint in (str, bool):
+        return {str: "text", bool: "true, false"}[key.hint]
+    step = f", step {key.limits['step']}" if "step" in key.limits else ""
+    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}{step}"
+
+
+def command_sections(top: argparse.ArgumentParser, level: str = "##") -> str:
+    """A section for each command of a parser: its description and its options. Options that more
+    than half of the commands share come first, once."""
+    found = list(leaves(top))
+    counts: dict[str, int] = {}
+    for _, _, command in found:
+        for option in command._actions:
+            counts[_option(option)] = counts.get(_option(option), 0) + 1
+    shared = {name for name, count in counts.items() if count > len(found) / 2 > 1}
+    parts = []
+    if shared - {_option(top._actions[0])}:
+        parts.append(f"{level} Options of most commands\n\n" + _options(found, shared.__contains__))
+    for name, text, command in found:
+        own = _options([(name, text, command)], lambda option: option not in shared)
+        about = (text or command.description or "").strip()
+        sentence = f"{about[:1].upper()}{about[1:].rstrip('.')}."
+        parts.append("\n".join(filter(None, [f"{level} {name}\n", sentence + "\n", own])))
+    return "\n".join(parts)
+
+
+def leaves(
+    top: argparse.ArgumentParser, prefix: str = ""
+) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
+    """Every command below a parser: full name, help, parser."""
+    prefix = prefix or top.prog
+    for action in top._actions:
+        if not isinstance(action, argparse._SubParsersAction):
+            continue
+        helps = {one.dest: one.help or "" for one in action._choices_actions}
+        for name, command in action.choices.items():
+            below = list(leaves(command, f"{prefix} {name}"))
+            yield from below or [(f"{prefix} {name}", helps.get(name, ""), command)]
+
+
+def _option(option: argparse.Action) -> str:
+    """An option as one writes it: its names and its value."""
+    value = option.metavar if isinstance(option.metavar, str) else option.dest.upper()
+    if not option.option_strings:
+        return str(value)
+    names = ", ".join(option.option_strings)
+    return names if option.nargs == 0 else f"{names} {value}"
+
+
+def _options(
+    found: list[tuple[str, str, argparse.ArgumentParser]], wanted: Callable[[str], bool]
+) -> str:
+    """The table of the options that are wanted, each once; "" without any."""
+    rows: dict[str, str] = {}
+    for _, _, command in found:
+        for option in command._actions:
+            name = _option(option)
+            if wanted(name) and option.dest != "help" and option.help != argparse.SUPPRESS:
+                text = option.help or ""
+                given = {**vars(option), "prog": command.prog}
+                rows[name] = text % given if "%" in text else text
+    if not rows:
+        return ""
+    lines = [f"| `{_cell(name)}` | {_cell(text)} |" for name, text in rows.items()]
+    return "\n".join(["| option | meaning |", "|---|---|", *lines, ""])
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
