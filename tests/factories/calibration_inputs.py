@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.calibration.calibrate import CalibrationInputs
 from train.calibration.displacement import AugmentedCopies
+from train.models.recipe.calibrate import CalibrationInputs
 
 
 def plain_inputs(
-    tenths: np.ndarray,
+    prefixes: np.ndarray,
     labels: np.ndarray,
     groups: np.ndarray,
     judged: np.ndarray,
     fixed: int = 0,
-    disturbed: np.ndarray | None = None,
+    faulty: np.ndarray | None = None,
 ) -> CalibrationInputs:
     """Features [N, D + 1, F] and what is known of these sweeps; disturbed: None where none is."""
-    none = AugmentedCopies(tenths[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
+    none = AugmentedCopies(prefixes[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
     return CalibrationInputs(
-        tenths,
+        prefixes,
         labels,
         groups,
         judged,
         fixed,
         none,
-        np.zeros(len(labels), bool) if disturbed is None else disturbed,
+        np.zeros(len(labels), bool) if faulty is None else faulty,
     )

@@ -9,7 +9,7 @@ from train.onnx_tools.graph_builder import TENSOR, GraphBuilder
 FORM = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
-def trunk(format: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
+def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:
     """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths,
     `tenths` [1, 10, F]."""
     g, taxels, length = GraphBuilder(), format.rows * format.cols, format.window // 10
@@ -22,8 +22,8 @@ def trunk(format: SweepFormat, tenths: bool = False) -> onnx.ModelProto:
         keepdims=0,
     )
     x = g("MatMul", g.constant(np.tri(10) / np.arange(1, 11)[:, None]), x)
-    name, shape = ("tenths", [1, 10, taxels]) if tenths else ("features", [1, taxels])
-    x = x if tenths else g("Slice", x, g.constant([9], "int64"), g.constant([10], "int64"))
+    name, shape = ("tenths", [1, 10, taxels]) if prefixes else ("features", [1, taxels])
+    x = x if prefixes else g("Slice", x, g.constant([9], "int64"), g.constant([10], "int64"))
     g("Reshape", x, g.constant(shape, "int64"), output=name)
     given = onnx.helper.make_tensor_value_info(
         "sweep", TENSOR[format.dtype], [1, format.window, format.rows, format.cols]

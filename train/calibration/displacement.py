@@ -18,7 +18,6 @@ from appliance.bundle.bundle import Classes, Moved, MovedClasses
 from appliance.inference.classifier import softmax
 from train.calibration.novelty import Embedding, embed, limit
 from train.metrics.temperature import sufficient_temperature
-from train.models.recipe.augment import Augmentation
 
 Array = NDArray[Any]
 MOST_WRONG = 0.0125
@@ -54,25 +53,15 @@ class AugmentedCopies:
 
 @dataclass(frozen=True)
 class DisplacementFit:
-    """turned: the Embedding of an embedding z, fitted to copies. rule: for the manifest."""
+    """embedding: of embeddings z, fitted to those of augmented copies. rule: for the manifest."""
 
-    turned: Embedding
+    embedding: Embedding
     rule: Moved
 
     def classes(self, classes: Classes) -> Classes:
-        """`classes` of the embedding z, with those of moved sweeps."""
-        turned = self.turned
-        return replace(
-            classes,
-            moved=MovedClasses(turned.projection, turned.means - turned.offset, turned.shapes),
-        )
-
-
-def displaced(augmentation: Augmentation) -> Augmentation:
-    """What a skin that was put back elsewhere changes: an augmentation without what is no matter of
-    its place. With noise and dead taxels in them, copies are named so much worse than any moved
-    skin that certainty limited by them says nothing."""
-    return replace(augmentation, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0, clipped=0.0)
+        """`classes` of the embedding z, with those of displaced contacts."""
+        of = self.embedding
+        return replace(classes, moved=MovedClasses(of.projection, of.means - of.offset, of.shapes))
 
 
 def fit_displacement(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
 from appliance.inference.novelty import shaped_distances
-from train.models import discriminant
+from train.calibration import discriminant
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]

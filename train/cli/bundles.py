@@ -21,14 +21,12 @@ from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.calibration.calibrate import calibrate
 from train.data import labels
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.export import bundle_score, measure, pack, quantized_bundle
 from train.models import methods
-from train.models.linear_head import hold_out
 from train.models.recipe import recipe
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ
 from train.models.recipe.augment import Augmentation, default_augmentation
@@ -248,20 +246,22 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augment
 def _print_held_out(made: Fit) -> None:
     """The accuracy on the sweeps that judged the fit, and how they differ from those of --rest."""
     if made.about["held_out_by"] == "nothing":
-        try:
-            hold_out(made.train, made.about["seed"])
-        except FormatError as e:
-            print(f"nothing was held out that could judge the model, so export will refuse it: {e}")
+        print(
+            "nothing was held out that could judge the model, so export will refuse it: "
+            f"{made.uncalibrated}"
+        )
         return
     by = f"held-out {made.about['held_out_by']}"
     print(
-        f"{by}: sweeps of this set, by heads that did not see them; they helped to choose the model, so expect less of it"
+        f"{by}: sweeps of this set, by heads that did not see them; they helped to choose the "
+        "model, so expect less of it"
     )
-    try:
-        _print_figures(pack.held_out_figures(calibrate(made).held, made, by))
-    except FormatError as e:  # too few sweeps to judge by
+    if made.calibration:
+        _print_figures(made.held_out_figures(by))
+    else:  # too few sweeps to judge by
         print(
-            f"{by}, network alone: {_text(made.about['validation'])}; nothing judges the box's answers: {e}"
+            f"{by}, network alone: {_text(made.about['validation'])}; nothing judges the box's "
+            f"answers: {made.uncalibrated}"
         )
 
 

@@ -21,7 +21,6 @@ from appliance.bundle.bundle import Early
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from appliance.inference.enrolment import extended
-from train.calibration.calibrate import Calibration
 from train.calibration.early_exit import LEVELS, decide
 from train.calibration.novelty import Embedding, auroc, embed
 from train.data.sets import Dataset, digest, join
@@ -31,6 +30,7 @@ from train.evaluation.uncertainty_cases import Case, Log, cases, tasks
 from train.metrics.score import interval, provenance
 from train.models import methods
 from train.models.methods import Effort
+from train.models.recipe.calibrate import Calibration
 
 Array = NDArray[Any]
 Json = dict[str, Any]

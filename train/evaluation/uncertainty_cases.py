@@ -21,12 +21,6 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from train.calibration.calibrate import (
-    Calibration,
-    CalibrationInputs,
-    calibration_inputs,
-    fit_calibration,
-)
 from train.calibration.displacement import AugmentedCopies
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
@@ -34,7 +28,8 @@ from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.models import methods
 from train.models.methods import Effort
-from train.models.recipe.fitted import Fit
+from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
+from train.models.recipe.fitted import Fit, calibration_inputs
 from train.models.recipe.heads import HeadPlan
 from train.onnx_tools.graph_builder import run as run_graph
 
@@ -62,11 +57,11 @@ class Case:
     """The result of one training. left_out: the material it did not see. fixed: number of features
     that were not trained; they are the last ones.
 
-    seen: features [N, 10, F] of the tenths of the training sweeps, whose materials are numbered
+    seen: features [N, 10, F] of prefixes of the training sweeps, whose materials are numbered
     `seen_labels` [N] from 0 on without the one left out; seen_groups [N]: positions or recordings;
     judged: bool [N], those that the trunk did not see, which may judge. copied: features [M, F] of
     augmented copies, of copied_labels, copied_groups and copied_held [M]; see AugmentedCopies.
-    disturbed: bool [N] of the seen sweeps; see fit_calibration. new, labels, places: features
+    faulty: bool [N] of the seen sweeps; see CalibrationInputs. new, labels, places: features
     of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
     """
 
@@ -84,7 +79,7 @@ class Case:
     new: Array
     labels: Array
     places: Array
-    disturbed: Array
+    faulty: Array
     plan: str = ""
 
     def known(self) -> Array:
@@ -105,7 +100,7 @@ class Case:
             self.judged,
             self.fixed,
             copies,
-            self.disturbed,
+            self.faulty,
             plan,
         )
         return fit_calibration(given)
@@ -141,7 +136,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         task.left_out,
         task.fold,
         given.fixed,
-        given.tenths,
+        given.prefixes,
         given.labels,
         given.groups,
         given.judged,
@@ -149,10 +144,10 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         copies.labels,
         copies.groups,
         copies.held,
-        run_graph(made.trunk(tenths=True), sweeps.samples[task.test]),
+        run_graph(made.trunk(prefixes=True), sweeps.samples[task.test]),
         sweeps.labels[task.test],
         places[task.test],
-        given.disturbed,
+        given.faulty,
         json.dumps(given.plan.json()) if given.plan else "",
     )
 
@@ -177,7 +172,7 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
         fingerprint(
             [data, t.method, t.effort.share, t.seed, t.train.tolist(), t.test.tolist(), t.left_out],
             methods.module_of(t.method),
-            "train.calibration.calibrate",
+            "train.models.recipe.fitted",
         )
         for t in wanted
     ]

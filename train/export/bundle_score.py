@@ -18,6 +18,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from train.data.sets import Dataset, digest
+from train.metrics.answers import REFUSED, UNKNOWN, Answers
 from train.metrics.score import Score, interval, provenance
 
 Array = NDArray[Any]
@@ -26,7 +27,7 @@ CLUSTERS = ("position", "session", "object")
 the interval."""
 
 
-def answers(
+def verdicts(
     classifier: Classifier, sweeps: Dataset, *, fused: bool = False
 ) -> Iterator[tuple[int, Verdict]]:
     """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of
@@ -45,6 +46,32 @@ def answers(
                 Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1))
             ),
         )
+
+
+def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answers:
+    """The box's answers to `sweeps`, by sweep and by recording. logits: [N, K] of the network for
+    the same sweeps."""
+    fused, decided = labels_of(classifier, sweeps, fused=True)
+    labels, ok = labels_of(classifier, sweeps)
+    return Answers(labels, ok, np.where(decided, fused, UNKNOWN), logits.argmax(1))
+
+
+def labels_of(
+    classifier: Classifier, sweeps: Dataset, *, fused: bool = False
+) -> tuple[Array, Array]:
+    """The box's labels, int64 [N] into those of the bundle, or REFUSED or UNKNOWN; and bool [N],
+    whether their status is ok. fused: each sweep gets the answer to its whole recording."""
+    labels = classifier.bundle.manifest.labels
+    recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
+    answers, ok = np.full(len(sweeps), REFUSED), np.zeros(len(sweeps), bool)
+    for i, verdict in verdicts(classifier, sweeps, fused=fused):
+        if verdict.label:
+            answered = recording == recording[i] if fused else i
+            answers[answered] = labels.index(verdict.label)
+            ok[answered] = verdict.status is Status.OK
+        elif verdict.status is Status.UNKNOWN and not fused:
+            answers[i] = UNKNOWN
+    return answers, ok
 
 
 @dataclass(frozen=True)
@@ -153,7 +180,7 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
     given = np.empty(len(sweeps), object)
     statuses: Counter[str] = Counter()
     hinted, moved = 0, Counter[str]()
-    for i, verdict in answers(classifier, sweeps):
+    for i, verdict in verdicts(classifier, sweeps):
         statuses[str(verdict.status)] += 1
         given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
         hinted += verdict.status is Status.UNSURE and verdict.label == material[i]
@@ -198,7 +225,7 @@ def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
     if len(values) == len(sweeps):
         return None
     right = np.zeros(len(values), bool)
-    for i, verdict in answers(classifier, sweeps, fused=True):
+    for i, verdict in verdicts(classifier, sweeps, fused=True):
         if verdict.label:  # what is unknown is not fused, and leaves the answer so far
             right[member[i]] = (
                 verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]

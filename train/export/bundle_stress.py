@@ -66,7 +66,7 @@ def _answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
     """Which sweeps get each of ANSWERS: bool [N] each; the first five are of every sweep one."""
     given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
     labels = box.bundle.manifest.labels
-    for i, verdict in bundle_score.answers(box, sweeps):
+    for i, verdict in bundle_score.verdicts(box, sweeps):
         truth = sweeps.materials[sweeps.labels[i]]
         if verdict.status is Status.OK:
             answer = "rightly" if verdict.label == truth else "wrongly"

@@ -1,9 +1,8 @@
-"""Where the skin sat. In: a training set; a bundle and simulated sweeps. Out: ContactPositions;
-accuracy of a moved skin.
+"""The box's answers to simulated sweeps whose contact is displaced.
 
-The ContactPositions go into the bundle, so that the box can say how far a contact is from those of
-training. How well that predicts accuracy is measured by `python -m train.studies alignment`: the same sweeps,
-with the skin moved further and further.
+A bundle holds the contact positions of training, so the box can show how far a contact is from
+them. This module measures how well that distance predicts accuracy: the same simulated sweeps, with
+the skin moved further and further.
 """
 
 from __future__ import annotations
@@ -20,76 +19,18 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
-from appliance.signal.contact import MOST_POSITIONS, ContactPositions, centre
+from appliance.signal.contact import centre
 from appliance.sim import skin
-from train.calibration import novelty
-from train.data.sets import Dataset
 from train.evaluation.corruptions import EvaluationSweeps
-from train.export.contact_limit import ContactLimit
 from train.metrics.score import interval, provenance
 
 Array = NDArray[Any]
 Json = dict[str, Any]
-MIN_LIMIT = 1 / 8
-"""The limit is never below this share of the pitch: attaching the skin again in the same place
-moves the centre by so much (0.5 mm of 4 mm include over 95 % of the simulated attachments), even
-where few or equal positions suggest less."""
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
 """How far the skin is moved, in mm."""
 DIRECTIONS = {"rows": "dx_mm", "columns": "dy_mm"}
 LOSS = 0.05
 """Accuracy counts as lost where it is so far below that of a skin that has not moved."""
-
-
-def place_of(
-    sweeps: Dataset, loads: ContactLimit, pitch_mm: float | None = None
-) -> ContactPositions | None:
-    """The centre of contact at each position of a training set (else of each recording); None where
-    the distance of the taxels or the threshold is not known, or nothing touched them.
-
-    pitch_mm: of the skin; a simulated skin's is known. Loads are those of a box without a TARE. The
-    limit keeps 97 % of positions whose own sweeps were left out (their farthest one counts), as
-    novelty.limit computes it; of 33 positions and fewer it keeps all.
-    """
-    if pitch_mm is None and all(part.startswith("sim:") for part in sweeps.source.split(" + ")):
-        pitch_mm = skin.PITCH_MM
-    if pitch_mm is None or loads.contact is None:
-        return None
-    found = [centre(window, loads.tare, loads.contact) for window in sweeps.samples]
-    touched = np.array([point is not None for point in found])
-    if not touched.any():
-        return None
-    points = np.array([point for point in found if point]) * pitch_mm
-    member = np.unique(
-        sweeps.groups.get("position", sweeps.group("recording"))[touched], return_inverse=True
-    )[1]
-    centres = np.stack(
-        [points[member == number].mean(axis=0) for number in range(member.max() + 1)]
-    )
-    limit = max(
-        pitch_mm * MIN_LIMIT,
-        novelty.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0,
-    )
-    kept = centres[
-        np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)
-    ].round(3)
-    return ContactPositions(
-        float(pitch_mm), tuple(kept[:, 0].tolist()), tuple(kept[:, 1].tolist()), round(limit, 3)
-    )
-
-
-def farthest(points: Array, member: Array, centres: Array) -> Array:
-    """For each position [P] the distance in mm of its farthest sweep from the nearest other
-    position.
-
-    points [N, 2] belong to the positions member [N], whose centres are [P, 2].
-    """
-    distances = np.zeros(len(centres))
-    for number in range(len(centres)):
-        others = np.delete(centres, number, axis=0)
-        nearest = np.linalg.norm(points[member == number][:, None] - others, axis=2).min(axis=1)
-        distances[number] = nearest.max()
-    return distances
 
 
 def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:

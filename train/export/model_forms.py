@@ -89,9 +89,7 @@ def _packed_forms(
         folder = work / precision
         if form:  # early answers and novelty belong to the method itself
             about = content.about | {"form": form}
-            pack.pack_to_measure(
-                replace(content, model=graph, about=about, made=None, reference=None), folder
-            )
+            pack.pack_to_measure(replace(content, model=graph, about=about, reference=None), folder)
         else:
             pack.pack_to_measure(content, folder)
         counted[form] = {

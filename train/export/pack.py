@@ -25,22 +25,18 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
-from appliance.bundle.manifest import UNSURE as LEAST_SURE
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
-from appliance.core.types import Status
-from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, softmax
+from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import shaped_distances
-from train.calibration.calibrate import HeldOut, calibrate
+from train.calibration.contact import Contacts
 from train.data.readers import counted
 from train.data.sets import Dataset
-from train.export import bundle_score, contact_limit
-from train.export.contact_positions import place_of
-from train.metrics.score import accuracy_figure, fuse
+from train.export import bundle_score
+from train.metrics.answers import REFUSED, UNKNOWN
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
-from train.models.recipe.fitted import Fit
 from train.onnx_tools.graph_builder import run, slim
 
 Array = NDArray[Any]
@@ -50,8 +46,6 @@ call unknown, which it does for about 5 % by its limit; more means that threshol
 fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
-REFUSED, UNKNOWN = -1, -2
-"""What `score` returns instead of a label."""
 FEWEST = 5
 """Training sweeps of a material, below which that is why none is recognised."""
 COARSEST = 8
@@ -60,9 +54,6 @@ Coarser ones save little more."""
 NEAR = 0.1
 """By how much rounding may move a probability of a golden sweep; so the label stays as certain as
 it was, about."""
-NETWORK = "network alone"
-"""Ends the name of the figure of the labels that the network gives, whatever the box makes of
-them."""
 
 
 class ExportRefused(BundleError):
@@ -72,14 +63,13 @@ class ExportRefused(BundleError):
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a bundle. model: `sweep` or `features` -> `logits`, and the outputs that
-    `early` and `known` need. input: as in the manifest.
+    """The content of a bundle.
 
-    train, held_out: the sweeps it was trained on and the others, split by the group `held_out_by`.
-    about: how it was made; figures: its results, both for the manifest. early, known, moved: for
-    the manifest; means: the file means.npz, where there is `known`. reference: the float form of a
-    model in int8. made: the fit of a network of the compact family, to which `pack` adds early
-    answers and novelty.
+    model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need. input:
+    as in the manifest. train, held_out: the sweeps it was trained on and the others, split by the
+    group `held_out_by`. about: how it was made; figures: its results; both for the manifest. early,
+    known, moved: for the manifest. means: the file means.npz if there is `known`. reference: the
+    float model of an int8 model. contacts: of the training sweeps; None to find them.
     """
 
     model: onnx.ModelProto
@@ -94,7 +84,7 @@ class Content:
     moved: bundle.Moved | None = None
     means: bytes = b""
     reference: onnx.ModelProto | None = None
-    made: Fit | None = None
+    contacts: Contacts | None = None
 
 
 def pack(
@@ -109,62 +99,63 @@ def pack(
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is
     replaced.
 
-    commit: of the code, for the manifest. full_scale: the sensor's highest raw count where that is
-    not the maximum of its type. pitch_mm: from taxel to taxel; without it the box cannot say how
-    far a skin has moved. Raises ExportRefused where a check fails, and BundleError where a label or
-    the target cannot be used.
+    commit: of the code, for the manifest. full_scale: the sensor's highest raw count if that is not
+    the maximum of its type. pitch_mm: distance between taxels; without it the box cannot say how
+    far a contact is from the trained positions. Raises ExportRefused if a check fails, and
+    BundleError if a label or the target cannot be used.
     """
-    train, held_out = content.train, content.held_out
-    loads = contact_limit.find(train)
-    limits = thresholds(train, loads.contact, full_scale)
-    place = place_of(train, loads, pitch_mm)
-    content = with_calibration(content, place is not None)
-    logits = run(content.model, model_inputs(content.input, train))
-    golden = golden_file(
-        content,
-        golden_sweeps(train, logits, logits_of_means(content, train) if content.known else logits),
-    )
-    files = {bundle.MODEL: slim(content.model).SerializeToString(), bundle.GOLDEN: golden}
-    files |= {bundle.MEANS: content.means} if content.known else {}
+    contacts = content.contacts or Contacts.of(content.train)
+    files = _files(content)
     manifest = bundle.Manifest(
         name=name,
         version=version,
-        format=train.format,
+        format=content.train.format,
         input=content.input,
-        labels=train.materials,
-        thresholds=limits,
-        place=place,
-        unloaded=tuple(loads.tare.ravel().tolist()) if loads.tare.any() else (),
+        labels=content.train.materials,
+        thresholds=thresholds(content.train, contacts.limit.contact, full_scale),
+        place=contacts.positions(pitch_mm),
+        unloaded=contacts.limit.known_tare(),
         runtime=RUNTIME,
         early=content.early,
         known=content.known,
         moved=content.moved,
         files={k: bundle.file_entry(v) for k, v in files.items()},
-        made={
-            "commit": commit,
-            "set": train.source,
-            "machine": platform.machine(),
-            "cpus": os.cpu_count(),
-            "torch": metadata.version("torch") if find_spec("torch") else None,
-            "onnxruntime": onnxruntime.__version__,
-        }
-        | ({"contact_unknown_because": loads.why} if loads.why else {})
-        | content.about,
+        made=_made(content, commit, contacts.limit.why),
     )
+    logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
-        for file, data in files.items():
+        for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
             (folder / file).write_bytes(data)
-        (folder / bundle.MANIFEST).write_bytes(manifest.json())
-        figures = judge(
-            folder,
-            held_out,
-            run(content.model, model_inputs(content.input, held_out)),
-            f"held-out {content.held_out_by}",
-        )
+        figures = judge(folder, content.held_out, logits, f"held-out {content.held_out_by}")
         manifest = replace(manifest, figures=figures | content.figures)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
+
+
+def _files(content: Content) -> dict[str, bytes]:
+    """The files of a bundle but its manifest, by name."""
+    logits = run(content.model, model_inputs(content.input, content.train))
+    of_means = logits_of_means(content, content.train) if content.known else logits
+    golden = golden_sweeps(content.train, logits, of_means)
+    files = {bundle.MODEL: slim(content.model).SerializeToString()}
+    files |= {bundle.GOLDEN: golden_file(content, golden)}
+    return files | ({bundle.MEANS: content.means} if content.known else {})
+
+
+def _made(content: Content, commit: str, contact_unknown_because: str) -> dict[str, Any]:
+    """The entry `made` of a manifest."""
+    made = {
+        "commit": commit,
+        "set": content.train.source,
+        "machine": platform.machine(),
+        "cpus": os.cpu_count(),
+        "torch": metadata.version("torch") if find_spec("torch") else None,
+        "onnxruntime": onnxruntime.__version__,
+    }
+    if contact_unknown_because:
+        made["contact_unknown_because"] = contact_unknown_because
+    return made | content.about
 
 
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
@@ -187,16 +178,8 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
     forms = getattr(model, "forms", {})
     reference = forms["float"].graph() if "float" in forms else None
-    made = getattr(model, "made", None)
     return model, Content(
-        model.graph(),
-        method.input,
-        train,
-        held_out,
-        held_out_by,
-        about,
-        reference=reference,
-        made=made,
+        model.graph(), method.input, train, held_out, held_out_by, about, reference=reference
     )
 
 
@@ -206,59 +189,6 @@ def pack_to_measure(
     """Pack `content` under its method's name, so that every command that measures a method measures
     the same bundle."""
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
-
-
-def with_calibration(content: Content, located: bool = True) -> Content:
-    """`content` with what is fitted on the trunk of the fit `made`: early answers, where its sweeps
-    support them, and novelty. Unchanged where nothing was held out, or not all its materials were
-    trained.
-
-    located: whether the box can say that a contact has moved. Where the held-out sweeps are the
-    fit's own, figures of them are added: of heads that did not see them, which those in the bundle
-    did.
-    """
-    made = content.made
-    if made is None or made.train.materials != content.train.materials:
-        return content
-    try:
-        done = calibrate(made)
-    except FormatError:  # too few groups to hold some out, on which it could be fitted
-        return content
-    done = done if located else replace(done, moved=None)
-    rule, own = done.rule, {}
-    if content.held_out is made.held:
-        own = held_out_figures(done.held, made, f"held-out {content.held_out_by}")
-    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
-    tenths = made.trunk(tenths=True) if rule.early else None
-    return replace(
-        content,
-        model=done.graph(made.trunk(), tenths),
-        early=rule.early,
-        known=done.known(),
-        moved=done.displacement_rule(),
-        means=done.means(),
-        about=content.about | {"early": early},
-        figures=content.figures | own,
-    )
-
-
-def held_out_figures(held: HeldOut, made: Fit, protocol: str) -> dict[str, Any]:
-    """Figures of a fit's held-out sweeps, as `figures` gives them, by heads that did not see these
-    sweeps."""
-    sweeps = made.held.take(held.numbers - len(made.train))
-    named = held.probabilities.argmax(1)
-    sure = held.probabilities.max(1) >= LEAST_SURE
-    answers = np.where(held.known, named, UNKNOWN)
-    recording, known = sweeps.group("recording"), np.flatnonzero(held.known)
-    fused = np.full(len(sweeps), UNKNOWN)
-    if len(known):
-        scores, first = fuse(
-            np.log(np.maximum(held.probabilities, LEAST_PROBABILITY))[known], recording[known]
-        )
-        decided = np.where(softmax(scores).max(1) >= LEAST_SURE, scores.argmax(1), UNKNOWN)
-        by_recording = dict(zip(recording[known][first], decided, strict=True))
-        fused = np.array([by_recording.get(number, UNKNOWN) for number in recording])
-    return _figures(answers, sure, fused, named, sweeps, protocol)
 
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
@@ -376,61 +306,6 @@ def thresholds(
     )
 
 
-def score(classifier: Classifier, sweeps: Dataset, *, fused: bool = False) -> tuple[Array, Array]:
-    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN; and bool [N], whether
-    it is sure of them.
-
-    fused: each sweep gets the box's answer after all sweeps of its recording.
-    """
-    labels = classifier.bundle.manifest.labels
-    recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
-    answers, sure = np.full(len(sweeps), REFUSED), np.zeros(len(sweeps), bool)
-    for i, verdict in bundle_score.answers(classifier, sweeps, fused=fused):
-        if verdict.label:
-            answered = recording == recording[i] if fused else i
-            answers[answered], sure[answered] = (
-                labels.index(verdict.label),
-                verdict.status is Status.OK,
-            )
-        elif verdict.status is Status.UNKNOWN and not fused:
-            answers[i] = UNKNOWN
-    return answers, sure
-
-
-def figures(
-    classifier: Classifier, sweeps: Dataset, protocol: str, logits: Array
-) -> dict[str, Any]:
-    """Accuracy as the box answers, by sweep and, where one holds several, by recording: what is
-    refused, unknown or unsure is not right. Beside it that of the network alone, whose logits [N,
-    K] name every sweep."""
-    fused, decided = score(classifier, sweeps, fused=True)
-    fused[~decided] = UNKNOWN
-    return _figures(*score(classifier, sweeps), fused, logits.argmax(1), sweeps, protocol)
-
-
-def _figures(
-    answers: Array, sure: Array, fused: Array, named: Array, sweeps: Dataset, protocol: str
-) -> dict[str, Any]:
-    """The figures of answers to sweeps, as `score` gives them, to their recordings, and of the
-    labels `named` [N]."""
-    right = (answers == sweeps.labels) & sure
-    counts = {
-        "wrong": int(((answers >= 0) & sure & ~right).sum()),
-        "unsure": int(((answers >= 0) & ~sure).sum()),
-        "unknown": int((answers == UNKNOWN).sum()),
-        "refused": int((answers == REFUSED).sum()),
-    }
-    result = {protocol: accuracy_figure(int(right.sum()), len(sweeps)) | counts}
-    result[f"{protocol}, {NETWORK}"] = accuracy_figure(
-        int((named == sweeps.labels).sum()), len(sweeps)
-    )
-    first = np.unique(sweeps.group("recording"), return_index=True)[1]
-    if len(first) < len(sweeps):
-        by_recording = (fused == sweeps.labels)[first]
-        result[f"{protocol}, by recording"] = accuracy_figure(int(by_recording.sum()), len(first))
-    return result
-
-
 def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
     """Figures of the bundle in `folder` on `held_out`, run as the box runs it; logits [N, K]: of
     the graph, on the same.
@@ -439,15 +314,15 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
     """
     box = Classifier(bundle.load(folder), SystemClock())
     box.self_test()
-    answers = score(box, held_out)[0]
-    refused, unknown = answers == REFUSED, answers == UNKNOWN
-    if other := int(np.sum((answers != logits.argmax(1)) & (answers >= 0))):
+    answers = bundle_score.answers_to(box, held_out, logits)
+    refused, unknown = answers.labels == REFUSED, answers.labels == UNKNOWN
+    if other := int(np.sum((answers.labels != answers.network) & (answers.labels >= 0))):
         raise ExportRefused(
             f"the box labels {other} of {len(held_out)} held-out sweeps otherwise than export did"
         )
     if refused.mean() > MOST_REFUSED:
         reasons = Counter(
-            str(v.status) for _, v in bundle_score.answers(box, held_out) if not v.label
+            str(v.status) for _, v in bundle_score.verdicts(box, held_out) if not v.label
         )
         raise ExportRefused(
             f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}), by status: "
@@ -458,7 +333,7 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
             f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
             f"squared distance {known.limit:.4g}); record more positions, so that it learns how sweeps vary"
         )
-    return figures(box, held_out, protocol, logits)
+    return answers.figures(held_out, protocol)
 
 
 def check_target(target: Path) -> None:

@@ -19,13 +19,13 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.sim import skin
 from train.data.sets import Dataset
+from train.export.bundle_graph import bundle_graph
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
-from train.models.linear_head import hold_out
 from train.models.methods import model_inputs
 from train.models.recipe import graph, recipe
 from train.models.recipe.bank import LEAST_FILTERS, Bank
-from train.models.recipe.fitted import Fit
+from train.models.recipe.fitted import Fit, finished
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
@@ -61,26 +61,53 @@ def export(
     full_scale: float | None = None,
     pitch_mm: float | None = None,
 ) -> bundle.Manifest:
-    """Quantize `fit`, check it, and pack it; see pack.pack. Where int8 differs too much the bundle
-    holds the float form, and `made` says why. Raises ExportRefused where another check fails."""
+    """Quantize `fit`, compare its precisions, and pack it; see pack.pack.
+
+    If int8 differs too much, the bundle holds the float model, whose trunk is calibrated for that,
+    and `made` says why. Raises FormatError if nothing was held out to judge the bundle by, and
+    ExportRefused if another check fails.
+    """
     if fit.about["held_out_by"] == "nothing":
-        hold_out(
-            fit.train, fit.about["seed"]
-        )  # says why: no sweep is left that could judge the bundle
-    reference, model = graphs(fit)
-    about = (
-        fit.about
-        if fit.architecture.pools or not fit.architecture.channels
-        else fit.about | {"torch_difference": _torch_difference(fit, reference)}
+        raise FormatError(fit.uncalibrated)
+    (reference, model), about = graphs(fit), fit.about
+    if fit.architecture.channels and not fit.architecture.pools:
+        about = about | {"torch_difference": _torch_difference(fit, reference)}
+    content = Content(
+        model, "raw", fit.train, fit.held, about["held_out_by"], about, contacts=fit.contacts
     )
-    content = Content(model, "raw", fit.train, fit.held, fit.about["held_out_by"], about, made=fit)
     try:
         content = checked(content, reference)
     except ExportRefused as e:
-        content = replace(
-            content, model=reference, made=fit.in_float(), about=about | {"float_because": str(e)}
-        )
-    return pack(content, target, name, version, commit, full_scale, pitch_mm)
+        content = replace(content, model=reference, about=about | {"float_because": str(e)})
+        fit = finished(fit.in_float())
+    return pack(
+        _calibrated(content, fit, pitch_mm), target, name, version, commit, full_scale, pitch_mm
+    )
+
+
+def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
+    """`content` with the calibration of `fit`, if it has one: heads, early answers, novelty, and
+    the figures of heads that did not see the held-out sweeps. The rule for displaced contacts needs
+    contact positions, and these need the distance between taxels."""
+    calibration = fit.calibration
+    if calibration is None:
+        return content
+    if not (fit.contacts and fit.contacts.positions(pitch_mm)):
+        calibration = replace(calibration, displacement=None)
+    rule = calibration.rule
+    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
+    figures = fit.held_out_figures(f"held-out {content.held_out_by}")
+    prefixes = fit.trunk(prefixes=True) if rule.early else None
+    return replace(
+        content,
+        model=bundle_graph(calibration, fit.trunk(), prefixes),
+        early=rule.early,
+        known=calibration.known(),
+        moved=calibration.displacement_rule(),
+        means=calibration.means(),
+        about=content.about | {"early": early},
+        figures=content.figures | figures,
+    )
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:

@@ -128,7 +128,7 @@ def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
     """How often the most probable label is right, by its probability; of answers with a label,
     `unsure` among them."""
     said, right = [], []
-    for i, verdict in bundle_score.answers(classifier, sweeps):
+    for i, verdict in bundle_score.verdicts(classifier, sweeps):
         if verdict.status.classified:
             said.append(verdict.probability)
             right.append(verdict.label == sweeps.materials[sweeps.labels[i]])

@@ -7,7 +7,6 @@ import pytest
 from appliance.bundle.bundle import Classes
 from train.calibration import displacement, novelty
 from train.calibration.displacement import AugmentedCopies, fit_displacement
-from train.models.recipe.augment import Augmentation
 
 MEANS = 8 * np.eye(4)[:3]
 
@@ -36,37 +35,17 @@ def made(n: int = 20, wrong: float = 0.0):
     return novelty.embed(x, labels, 2), fit_displacement(x, labels, held, 2, copied, logits), copied
 
 
-def test_copies_that_judge_are_moved_and_nothing_else():
-    """The skin's place, its contact and its gains change; what the sensor adds or loses does
-    not."""
-    usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
-    judging = displacement.displaced(usual)
-    assert (
-        judging.noise,
-        judging.noisy,
-        judging.silent,
-        judging.drift,
-        judging.hum,
-        judging.clipped,
-    ) == (0,) * 6
-    assert (judging.shift, judging.damped, judging.gains) == (
-        usual.shift,
-        usual.damped,
-        usual.gains,
-    )
-
-
 def test_what_the_copies_vary_in_makes_nothing_unknown():
     """Far in the copies' direction: beyond the limit in place, within that of moved sweeps; in
     another direction beyond both."""
     z, fit, _ = made()
     assert fit
     x = sweeps(50, 5, spread=10)[0]
-    turned = fit.turned.novelty(z(x))
+    turned = fit.embedding.novelty(z(x))
     assert 0.95 < np.mean(turned <= fit.rule.limit) <= 1
     assert np.mean(z.novelty(x) <= novelty.limit(z.novelty(sweeps(50, 6)[0]))) < 0.6
     x[:, 1] += 30
-    assert (fit.turned.novelty(z(x)) > fit.rule.limit).all()
+    assert (fit.embedding.novelty(z(x)) > fit.rule.limit).all()
 
 
 def test_the_box_measures_the_same_distances():
@@ -79,7 +58,7 @@ def test_the_box_measures_the_same_distances():
     x = sweeps(3, 7)[0]
     away = (z(x) @ classes.moved.turn)[:, None] - classes.moved.means
     assert (away**2).sum(axis=2) == pytest.approx(
-        fit.turned.distances(fit.turned(z(x))), rel=1e-3, abs=1e-3
+        fit.embedding.distances(fit.embedding(z(x))), rel=1e-3, abs=1e-3
     )
 
 

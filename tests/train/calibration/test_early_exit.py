@@ -15,12 +15,14 @@ from appliance.inference import early_exit as box_early
 from appliance.inference.novelty import Means
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.trunk import FORM, trunk
-from train.calibration import calibrate, early_exit
+from train.calibration import early_exit
 from train.evaluation import uncertainty
+from train.export.bundle_graph import bundle_graph
+from train.models.recipe import calibrate
 from train.onnx_tools.graph_builder import run
 
 
-def tenths(n: int, places: int = 8, seed: int = 0, strength=None):
+def prefixes(n: int, places: int = 8, seed: int = 0, strength=None):
     """Features [N, 10, 5] of n sweeps of three materials at each position, better separated with
     each tenth."""
     rng = np.random.default_rng(seed)
@@ -116,9 +118,9 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 def test_temperatures_calibrate_each_step():
     """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every
     step."""
-    x, y, at = tenths(40)
+    x, y, at = prefixes(40)
     done = calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool)))
-    new, labels, _ = tenths(60, seed=9)
+    new, labels, _ = prefixes(60, seed=9)
     p = done.probabilities(new)
     right = (p.argmax(2) == labels[:, None]).mean(0)
     assert right[0] < 0.75 < 0.99 < right[9]
@@ -128,7 +130,7 @@ def test_temperatures_calibrate_each_step():
 @pytest.mark.slow
 def test_each_step_has_its_own_temperature():
     """The last temperature is the whole sweep's, each other one its own step's."""
-    x, y, at = tenths(10, places=3, seed=3)
+    x, y, at = prefixes(10, places=3, seed=3)
     # the sweeps of a material at one position lie together: the heads are too sure of other
     # positions
     x = x + 3 * np.random.default_rng(4).standard_normal((9, 1, 5))[3 * at + y]
@@ -148,7 +150,7 @@ def test_each_step_has_its_own_temperature():
 def test_a_material_of_one_place_and_two_materials():
     """A material that only one place has is still learned; of two materials, too: nothing is
     NaN."""
-    x, y, at = tenths(20)
+    x, y, at = prefixes(20)
     keep = (y != 2) | (at == 0)
     done = calibrate.fit_calibration(
         plain_inputs(x[keep], y[keep], at[keep], np.ones(keep.sum(), bool))
@@ -176,7 +178,7 @@ def made():
         plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     )
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
-    model = done.graph(trunk(FORM), trunks)
+    model = bundle_graph(done, trunk(FORM), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
     manifest = Manifest(
         "toy",
@@ -216,8 +218,10 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
     """Without tenths: logits and embedding alone; without a rule none either."""
     done, x, counts, _, _ = made
     for model in (
-        done.graph(trunk(FORM)),
-        replace(done, rule=early_exit.EarlyRule(None, "why")).graph(trunk(FORM), trunk(FORM, True)),
+        bundle_graph(done, trunk(FORM)),
+        bundle_graph(
+            replace(done, rule=early_exit.EarlyRule(None, "why")), trunk(FORM), trunk(FORM, True)
+        ),
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
@@ -231,7 +235,8 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
     """What is left without `early` is, byte for byte, the model that was never given tenths."""
     done, _, _, _, whole = made
     assert (
-        prune(whole.model, {"logits", "embedding"}) == done.graph(trunk(FORM)).SerializeToString()
+        prune(whole.model, {"logits", "embedding"})
+        == bundle_graph(done, trunk(FORM)).SerializeToString()
     )
     assert len(prune(whole.model, {"early"})) < len(whole.model)
 

@@ -11,12 +11,12 @@ import pytest
 
 from appliance.core.errors import FormatError
 from tests.factories.calibration_inputs import plain_inputs
-from train.calibration.calibrate import fit_calibration
 from train.data.sets import Dataset
 from train.evaluation import uncertainty, uncertainty_cases
 from train.evaluation.evaluate import Where
 from train.evaluation.uncertainty_cases import NONE_LEFT_OUT, Case
 from train.models.methods import Effort
+from train.models.recipe.calibrate import fit_calibration
 from train.reports.plot_style import SCHEMES
 from train.studies import uncertainty_report
 
@@ -231,7 +231,7 @@ def test_of_two_materials_none_is_left_out():
         one.new[test],
         one.labels[test],
         one.places[test],
-        one.disturbed[two],
+        one.faulty[two],
     )
     figures = uncertainty.figures([one], NAMES[:2], 1)
     assert set(figures) == {"calibration", "sequence", "early"}

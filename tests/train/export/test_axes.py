@@ -19,7 +19,7 @@ from appliance.sim import devices, rig, script
 from tests.factories.sheared import PITCH_MM, sheared
 from tests.factories.simulated_box import Rigged
 from train.cli.main import main
-from train.export import pack
+from train.export import bundle_score
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_from_a_set_to_the_answers_of_the_box(
     assert np.abs(np.array(model.manifest.place.cols_mm) - PITCH_MM / 2).max() < 2
     unseen = sheared(1, seed=6).take(np.arange(0, 54, 3))
     unseen.save(tmp_path / "unseen.npz")
-    answers, _ = pack.score(Classifier(model, SystemClock()), unseen)
+    answers, _ = bundle_score.labels_of(Classifier(model, SystemClock()), unseen)
     labels = [model.manifest.labels[k] if k >= 0 else "" for k in answers]
     assert (
         np.mean([a == unseen.materials[k] for a, k in zip(labels, unseen.labels, strict=True)])

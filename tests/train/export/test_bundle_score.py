@@ -17,7 +17,7 @@ from appliance.inference.classifier import Classifier
 from tests.factories import toy_bundle
 from train.cli.main import main
 from train.data.sets import Dataset
-from train.export import bundle_score, pack
+from train.export import bundle_score
 from train.metrics.score import interval
 
 HERE = [(0, 0), (6, 0), (0, 6)]
@@ -74,7 +74,11 @@ def test_what_is_named_is_counted(classifier: Classifier):
     assert lines[1].endswith("95 % interval, by position (3)")
     assert "  a     2 of 3     b 1" in lines
     assert (
-        found.right == ((pack.score(classifier, s)[0] == s.labels) & pack.score(classifier, s)[1])
+        found.right
+        == (
+            (bundle_score.labels_of(classifier, s)[0] == s.labels)
+            & bundle_score.labels_of(classifier, s)[1]
+        )
     ).all()
 
 
@@ -146,7 +150,7 @@ def test_sweeps_outside_the_trained_positions_are_told(
     nothing where there are none."""
     s = sweeps(*HERE, (0, 0), labels=[0, 1, 2, 0])
     assert "trained positions" not in bundle_score.score(classifier, s).text()
-    given = bundle_score.answers
+    given = bundle_score.verdicts
     words = {
         0: "moved 2.1 mm too far towards row 6",
         2: "moved 2.1 mm too far towards row 6",
@@ -154,7 +158,7 @@ def test_sweeps_outside_the_trained_positions_are_told(
     }
     monkeypatch.setattr(
         bundle_score,
-        "answers",
+        "verdicts",
         lambda *args, **more: (
             (i, replace(verdict, moved=words.get(i, ""))) for i, verdict in given(*args, **more)
         ),

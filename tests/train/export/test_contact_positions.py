@@ -7,93 +7,24 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.inference.classifier import Classifier
-from appliance.signal.contact import ContactPositions, centre
-from appliance.sim import skin
-from tests.factories.contacts import MIDDLE, TARE, counts, patch
+from appliance.signal.contact import ContactPositions
+from tests.factories.contacts import MIDDLE
 from tests.factories.paths import ROOT
-from train.data import sets
-from train.data.sets import Dataset
 from train.export import contact_positions
-from train.export.contact_limit import ContactLimit
 from train.studies import contact_plot, contact_table
 from train.studies.command import main as study
-
-LOADS = ContactLimit(5.0, TARE)
 
 
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
     return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
-
-
-def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
-    """A set with `each` sweeps at each of these places, in taxels."""
-    samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(
-        np.float32
-    )
-    n = len(samples)
-    numbers = {group: 7 + 2 * (np.arange(n) // each)}
-    return Dataset(samples, np.arange(n) % 2, ("a", "b"), 100.0, numbers, "recorded")
-
-
-def test_the_places_of_a_training_set():
-    """One entry per position, in mm; without numbered positions per recording; without both per
-    sweep."""
-    at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
-    for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
-        found = contact_positions.place_of(
-            trained(*at, group=group, each=each), LOADS, pitch_mm=2.0
-        )
-        assert (found.pitch_mm, len(found.rows_mm)) == (2.0, entries)
-        every = [at[i * len(at) // entries] for i in range(entries)]
-        want = [centre(counts(patch(*one)), TARE, 5.0) for one in every]
-        assert np.stack([found.rows_mm, found.cols_mm], 1) == pytest.approx(
-            2.0 * np.array(want), abs=1e-3
-        )
-
-
-def test_the_limit_leaves_each_position_out():
-    """It is the largest distance of a sweep from the other positions; with one position an eighth
-    of the pitch."""
-    found = contact_positions.place_of(
-        trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), LOADS, pitch_mm=4.0
-    )
-    assert found.limit_mm == pytest.approx(found.cols_mm[2] - found.cols_mm[1], abs=0.01)
-    for positions in ([(1.5, 1.5)], [(1.5, 1.5)] * 3):
-        assert contact_positions.place_of(trained(*positions), LOADS, pitch_mm=4.0).limit_mm == 0.5
-
-
-def test_many_positions_are_thinned():
-    """A bundle has at most a thousand; of more, evenly spaced ones."""
-    found = contact_positions.place_of(
-        trained(*[(1.5, 1 + i / 1100) for i in range(1100)], each=1), LOADS, pitch_mm=4.0
-    )
-    assert len(found.rows_mm) == 1000
-    assert np.median(np.diff(found.cols_mm)) < 0.02
-    assert found.cols_mm[0] == 4.0
-    assert found.cols_mm[-1] > 7.9
-
-
-def test_sets_without_positions():
-    """Without a pitch, or without contact, there are none; simulated sets have theirs."""
-    assert contact_positions.place_of(trained((1.5, 1.5)), LOADS) is None
-    assert (
-        contact_positions.place_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0)
-        is None
-    )
-    both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
-    found = contact_positions.place_of(both, LOADS)
-    assert found.pitch_mm == skin.PITCH_MM
-    assert len(found.rows_mm) == 2
-    assert np.stack([found.rows_mm, found.cols_mm]) == pytest.approx(np.full((2, 2), 6.0), abs=1.5)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.inference.classifier import Classifier, softmax
 from tests.factories.sweep_sets import tones
 from train.cli.main import main
-from train.export import pack
+from train.export import bundle_score, pack
 from train.models import methods
 
 pytestmark = pytest.mark.slow
@@ -40,7 +40,7 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
         content.train, methods.model_inputs(METHODS[name].input, content.train), 1
     )
     want = model.logits(methods.model_inputs(METHODS[name].input, content.held_out)).argmax(1)
-    assert (pack.score(it, content.held_out)[0] == want).all()
+    assert (bundle_score.labels_of(it, content.held_out)[0] == want).all()
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - ON_THE_BOX))

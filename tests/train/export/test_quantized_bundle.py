@@ -26,17 +26,17 @@ from appliance.inference.session import session
 from appliance.sim import skin
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
-from train.calibration.calibrate import calibrate
 from train.cli.main import main
 from train.data import sets
-from train.export import pack, quantized_bundle
+from train.export import bundle_score, pack, quantized_bundle
 from train.export.pack import ExportRefused
+from train.metrics.answers import REFUSED
 from train.models import methods
 from train.models.linear_head import closed_form_head, hold_out
 from train.models.peers import paper_cnn
 from train.models.recipe import stages
 from train.models.recipe.architectures import ARCHITECTURES
-from train.models.recipe.fitted import Fit
+from train.models.recipe.fitted import Fit, finished
 from train.models.recipe.network import Compact
 from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import cost, graph_builder, parity
@@ -169,7 +169,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
         "0123abcd",
         1,
     )
-    assert np.mean(pack.score(it, easy(seed=5))[0] == easy(seed=5).labels) > 0.9
+    assert np.mean(bundle_score.labels_of(it, easy(seed=5))[0] == easy(seed=5).labels) > 0.9
 
 
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
@@ -192,19 +192,27 @@ def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
     wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
     spoilt = replace(fitted, held=wrong)
     honest, misled = (
-        pack.held_out_figures(calibrate(one).held, one, "x")["x, network alone"]["accuracy"]
+        finished(one).held_out_figures("x")["x, network alone"]["accuracy"]
         for one in (fitted, spoilt)
     )
     assert honest > 0.9
     assert misled < 0.1
 
 
-def test_the_same_fit_gives_the_same_bytes(fitted: Fit, packed: Path, tmp_path: Path):
-    """Every file, the zip of golden sweeps included."""
-    quantized_bundle.export(fitted, tmp_path / "again", "easy", "1", "0123abcd")
-    for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
-        assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
-    assert [f.name for f in tmp_path.iterdir()] == ["again"]
+def test_the_same_fit_gives_the_same_bytes(
+    fitted: Fit, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Every file, the zip of golden sweeps included; also from the file of the fit, which keeps the
+    calibration and the contacts, so that export finds neither again."""
+    fitted.save(tmp_path / "fit.npz")
+    monkeypatch.setattr(quantized_bundle, "finished", None)
+    for made in (fitted, Fit.load(tmp_path / "fit.npz")):
+        assert made.calibration
+        assert made.contacts
+        quantized_bundle.export(made, tmp_path / "again", "easy", "1", "0123abcd")
+        for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
+            assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["again", "fit.npz"]
 
 
 def test_scores_are_fused_by_recording(packed: Path):
@@ -213,13 +221,13 @@ def test_scores_are_fused_by_recording(packed: Path):
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
-    alone, fused = pack.score(it, s)[0], pack.score(it, s, fused=True)[0]
-    assert np.flatnonzero(alone == pack.REFUSED).tolist() == [3]
+    alone, fused = bundle_score.labels_of(it, s)[0], bundle_score.labels_of(it, s, fused=True)[0]
+    assert np.flatnonzero(alone == REFUSED).tolist() == [3]
     assert alone[9] != fused[9]
     p = softmax(np.stack([it.logits(x) for x in s.samples]))
     for recording in np.unique(s.groups["recording"]):
         member = s.groups["recording"] == recording
-        assert set(fused[member]) == {np.log(p[member & (alone != pack.REFUSED)]).sum(0).argmax()}
+        assert set(fused[member]) == {np.log(p[member & (alone != REFUSED)]).sum(0).argmax()}
 
 
 def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
@@ -442,7 +450,7 @@ def test_the_default_bundle_is_what_the_box_needs():
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
     assert sum(f.stat().st_size for f in bundle.DEFAULT.iterdir()) <= 128_000
     unseen = sets.load("sim:T-REAL:1900:3")
-    assert np.mean(pack.score(it, unseen)[0] == unseen.labels) > 0.9
+    assert np.mean(bundle_score.labels_of(it, unseen)[0] == unseen.labels) > 0.9
     assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
 
 
@@ -595,7 +603,7 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
         128,
     )
     logits = np.stack([it.logits(counts) for counts in rest.samples])
-    result = pack.figures(it, rest, "unseen", logits)
+    result = bundle_score.answers_to(it, rest, logits).figures(rest, "unseen")
     assert result["unseen"]["accuracy"] > 0.9
     assert (
         result["unseen, by recording"]["accuracy"] > 0.9

@@ -4,9 +4,7 @@ is `no-contact`."""
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,6 @@ from appliance.sim import devices, rig, skin
 from appliance.sim.skins.sweeps import SCALES, view
 from tests.factories.simulated_box import Rigged
 from train.cli.main import main
-from train.data.sets import Dataset
-from train.export import contact_limit
 
 FORM = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
 SEEN, REST = view("xela-can", FORM), SCALES["xela-can"].rest
@@ -133,69 +129,3 @@ def test_the_whole_way(
     )
     (verdict,) = answered(rigged, [act("", None, rng)], model=model)
     assert verdict.status is not Status.NO_CONTACT
-
-
-def known(drift: float = 0.0, load: float = 1000.0) -> Dataset:
-    """Eight sweeps [50, 2, 2] whose strongest taxel reads `load` above the unloaded skin, which
-    rises by `drift` from each to the next."""
-    rng, n = np.random.default_rng(7), 8
-    rest = REST + drift * np.arange(n).reshape(-1, 1, 1, 1)
-    samples = rest + rng.normal(0, 3, (n, 50, 2, 2))
-    samples[:, :, 0, 0] += load
-    unloaded = np.concatenate(
-        [np.broadcast_to(rest, (n, 1, 2, 2)), np.full((n, 1, 2, 2), 3.0)], axis=1
-    )
-    return Dataset(
-        np.rint(samples).astype(np.uint16),
-        np.arange(n) % 2,
-        ("a", "b"),
-        50.0,
-        {},
-        "known",
-        unloaded,
-    )
-
-
-def test_a_load_is_above_the_unloaded_skin():
-    """A tenth of the weakest contact; at least what the unloaded skin differs by, between
-    recordings and by its noise. Sweeps of which it is not known do not count."""
-    found = contact_limit.find(known())
-    assert found.contact == pytest.approx(100, abs=1)
-    assert found.tare.tolist() == np.full((2, 2), REST).tolist()
-    assert contact_limit.find(known(load=100)).contact == 5 * 3.0
-    assert contact_limit.find(known(drift=40)).contact == pytest.approx(3.5 * 40 + 5 * 3)
-    some = known()
-    some.samples[0] = round(REST)
-    some.unloaded[0] = np.nan
-    assert contact_limit.find(some).contact == pytest.approx(100, abs=1)
-
-
-@pytest.mark.parametrize(
-    "how", [{"load": 12.0}, {"drift": 400.0}, {"load": -1000.0}], ids=["weak", "drift", "falling"]
-)
-def test_what_does_not_separate_is_said(how: dict[str, float]):
-    """Contacts as weak as noise, a rest that moves by more than a contact, counts that fall: no
-    threshold, and why."""
-    found = contact_limit.find(known(**how))
-    assert found.contact is None
-    assert not found.tare.any()
-    assert re.fullmatch(
-        r"the weakest sweep reads -?[\d.]+ counts above .* differs by up to [\d.]+; send TARE .*",
-        found.why,
-    )
-
-
-def test_a_baseline_of_which_nothing_is_known_is_said():
-    """Where counts can be loads they are taken for them, as ever; where no taxel is ever near 0
-    nothing is guessed. One taxel alone has none to compare it with."""
-    high = replace(known(), unloaded=None)
-    found = contact_limit.find(high)
-    assert found.contact is None
-    assert "no taxel reads less than 199" in found.why
-    assert "; record with palpate record, and send TARE" in found.why
-    every = np.full_like(known().unloaded, np.nan)
-    assert contact_limit.find(replace(high, unloaded=every)).why == found.why
-    low = replace(high, samples=high.samples - np.uint16(REST - 100))
-    assert contact_limit.find(low).contact == pytest.approx(110, abs=1)
-    one = replace(high, samples=high.samples[:, :, :1, :1])
-    assert contact_limit.find(one).contact == pytest.approx((REST + 1000) / 10, rel=0.01)

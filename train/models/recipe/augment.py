@@ -8,7 +8,7 @@ at 0 draws and changes nothing. Neither PyTorch nor double precision is needed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import numpy as np
@@ -72,6 +72,14 @@ class Augmentation:
     clipped: float = 0.0
     """Share of the taxels that are clipped from above, anywhere within two of their own deviations
     of their mean."""
+
+    def displaced(self) -> Augmentation:
+        """The effects of another position of the skin alone, without those of its electronics.
+
+        Noise and silent taxels make copies so much harder to name than any displaced skin is that
+        an error rate of such copies says nothing about it.
+        """
+        return replace(self, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0, clipped=0.0)
 
 
 SLOW = Augmentation(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)

@@ -176,7 +176,7 @@ class Pooling:
 
     int8: bool
     shares: bool
-    tenths: bool = False
+    prefixes: bool = False
     rowwise: bool = False
 
 
@@ -222,7 +222,7 @@ def pooled(
     """Taxels as for `responses` -> log mean magnitudes [1, 1 or TENTHS, F], and where shares are
     wanted, those above the thresholds in the same shape."""
     y, stages = responses(g, format, bank, x, step, how.int8)
-    counts = np.array([nodes.known_steps(shape, format.window, how.tenths) for shape in stages]).T
+    counts = np.array([nodes.known_steps(shape, format.window, how.prefixes) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
 
     def mean(z: str) -> str:

@@ -32,7 +32,7 @@ def train(
     Raises FormatError as recipe.fit, and where only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
-    fit = recipe.fit(known, seed, settings, log)
+    fit = recipe.fit(known, seed, replace(settings, calibrate=False), log)
     present = np.unique(sweeps.labels)
     heads = {
         name: expanded_head(

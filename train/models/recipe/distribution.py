@@ -99,7 +99,7 @@ def pooled(
     x: str,
     step: float,
     int8: bool,
-    tenths: bool = False,
+    prefixes: bool = False,
 ) -> str:
     """Taxels [n, R * C, T], which are scaled counts once they are multiplied by `step`, n being 1
     or TENTHS -> shares [1, 1 or TENTHS, len(some)]: of each signal, taxel and level. int8: whether
@@ -107,8 +107,8 @@ def pooled(
     if len(some.taxels) < format.channels:
         x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
     looked, taxels = _looked(format.window), len(some.taxels)
-    counts = nodes.known_steps(looked, format.window, tenths)
-    total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=tenths)
+    counts = nodes.known_steps(looked, format.window, prefixes)
+    total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=prefixes)
     older, newer = (
         g(
             "Slice",
@@ -120,10 +120,10 @@ def pooled(
     changes, older = (
         g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older)
     )
-    if tenths:  # each tenth has means of its own
+    if prefixes:  # each tenth has means of its own
         changes = g("Expand", changes, g.constant([TENTHS, looked.steps, taxels], "int64"))
     about = g(
-        "Sub", older, g("Mul", total(older), nodes.mean_factors(g, 1.0, counts, taxels, tenths))
+        "Sub", older, g("Mul", total(older), nodes.mean_factors(g, 1.0, counts, taxels, prefixes))
     )
     y = g("Transpose", nodes.side_by_side(g, [about, changes]), perm=[0, 2, 1])
     # a level is compared with a whole row of frames, which is four times as fast as a frame with a
@@ -137,5 +137,5 @@ def pooled(
     )
     above = total(above, integers=int8, time_last=True)
     shares = g("Cast", above, to=FLOAT) if int8 else above
-    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, len(some), tenths))
-    return g("Reshape", shares, g.constant([1, TENTHS, -1], "int64")) if tenths else shares
+    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, len(some), prefixes))
+    return g("Reshape", shares, g.constant([1, TENTHS, -1], "int64")) if prefixes else shares

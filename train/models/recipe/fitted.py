@@ -1,7 +1,8 @@
-"""A Fit: a trunk with its heads, and the sweeps that these were fitted to. In: a file. Out: the
-Fit, and its graphs.
+"""A finished model: a trunk, its heads, its calibration, the contact positions, and the sweeps that
+all of it was fitted to.
 
-PyTorch is needed for `network` alone.
+`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is needed for
+`network` alone.
 """
 
 from __future__ import annotations
@@ -17,13 +18,18 @@ import onnx
 from numpy.typing import NDArray
 from onnx import checker, shape_inference
 
-from appliance.core.errors import FormatError
+from appliance.core.errors import BundleError, FormatError
 from appliance.core.sweep_set import read
+from train.calibration.contact import Contacts
+from train.calibration.displacement import AugmentedCopies
 from train.data.sets import Dataset
+from train.models.linear_head import hold_out
 from train.models.methods import Cost, Model
 from train.models.recipe import graph, spectrum
 from train.models.recipe.architectures import Architecture
 from train.models.recipe.augment import Augmentation
+from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
+from train.models.recipe.copies import COPIES, copies
 from train.models.recipe.heads import HeadPlan
 from train.onnx_tools.graph_builder import run, with_head
 
@@ -31,18 +37,40 @@ if TYPE_CHECKING:
     from train.models.recipe.network import Compact
 
 Array = NDArray[Any]
+Json = dict[str, Any]
+WHAT = "a fit (made by palpate-train fit)"
+HELD_COPIES_SEED, FAULTS_SEED = 1, 2
+"""Added to a fit's seed for the copies of its held-out sweeps, and for the copies with faults."""
+FAULTS = Augmentation(
+    moved=0.0,
+    gain=0.1,
+    gains=0.05,
+    silent=0.06,
+    damped=0.0,
+    colour=0.0,
+    noise=0.4,
+    hum=0.3,
+    drift=0.1,
+)
+"""Changes of a known material in service: a worse amplifier, hum of the mains, a taxel that
+fails."""
+ONE_IN = 10
+"""One in this many training sweeps has a copy with faults; docs/decisions/0006 compares other
+shares."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained network. weights: the state of a fused Compact with its LDA head, the temperature
-    folded in, and a second head, `int8.weight` [K, F] and `int8.bias` [K], fitted to what the int8
-    trunk gives.
+    """A trained network.
 
-    architecture: cut to what the heads see. ranges: of its int8 form, None where there is none.
-    train, held: the sweeps that were trained on and those that were held out. about: JSON of how it
-    was made and validated. plan: how heads are fitted again, before a temperature. cost: (step,
-    cross entropy) of the training; the file does not keep it.
+    weights: the state of a fused Compact with its LDA head, the temperature folded in, and a second
+    head, `int8.weight` [K, F] and `int8.bias` [K], fitted to the features of the int8 trunk.
+    architecture: cut to the parts that the heads see. ranges: of int8; None for a float trunk
+    alone. train, held: the training sweeps and the held-out sweeps. about: JSON, how the fit was
+    made and validated. plan: fits the heads again, before a temperature. cost: (step, cross
+    entropy) of the training; the file does not keep it. calibration: of the int8 trunk if there is
+    one; None if the sweeps do not suffice, with the reason in `uncalibrated`. contacts: None until
+    the fit is `finished`.
     """
 
     weights: dict[str, Array]
@@ -51,9 +79,12 @@ class Fit:
     ranges: graph.Ranges | None
     train: Dataset
     held: Dataset
-    about: dict[str, Any]
+    about: Json
     plan: HeadPlan
     cost: Cost = field(default_factory=list)
+    calibration: Calibration | None = None
+    uncalibrated: str = ""
+    contacts: Contacts | None = None
 
     @property
     def keep_means(self) -> bool:
@@ -62,7 +93,7 @@ class Fit:
 
     @property
     def bands(self) -> int:
-        """How many of the features, the last ones, are of the spectrum and were not learned."""
+        """Number of features of the spectrum, which are the last ones and were not trained."""
         return self.architecture.spectrum * spectrum.count(self.train.format)
 
     @property
@@ -85,46 +116,59 @@ class Fit:
         model.load_state_dict(state)
         return model.eval()
 
-    def trunk(self, int8: bool = True, tenths: bool = False) -> onnx.ModelProto:
-        """`sweep` -> `features` float32 [1, F], or `tenths` float32 [1, 10, F]; see
+    def trunk(self, int8: bool = True, prefixes: bool = False) -> onnx.ModelProto:
+        """`sweep` -> `features` float32 [1, F]; with `prefixes` float32 [1, 10, F]. See
         graph.trunk_graph."""
         ranges, format = self.ranges if int8 else None, self.train.format
         return graph.trunk_graph(
-            format, self.scale, self.weights, self.architecture, ranges, tenths, self.keep_means
+            format, self.scale, self.weights, self.architecture, ranges, prefixes, self.keep_means
         )
 
     def in_float(self) -> Fit:
-        """The same without an int8 form: its float trunk and head take that one's place."""
+        """The same fit with its float trunk and float head in place of those in int8; not
+        calibrated yet."""
         head = {f"int8.{name}": self.weights[f"head.{name}"] for name in ("weight", "bias")}
-        return replace(self, weights=self.weights | head, ranges=None)
+        return replace(self, weights=self.weights | head, ranges=None, calibration=None)
 
     def int8_head(self) -> tuple[Array, Array]:
         """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
         return self.weights["int8.weight"], self.weights["int8.bias"]
 
+    def held_out_figures(self, protocol: str) -> Json:
+        """Figures of the held-out sweeps by heads that did not see them, as a manifest holds them;
+        none without a calibration."""
+        if self.calibration is None:
+            return {}
+        held = self.calibration.held
+        sweeps = self.held.take(held.numbers - len(self.train))
+        return held.answers(sweeps.group("recording")).figures(sweeps, protocol)
+
     def save(self, path: Path) -> None:
-        """Write the fit as one .npz without pickle; training and held-out sweeps are one set, the
-        first of them trained on."""
+        """Write the fit as one .npz without pickle. Training and held-out sweeps are one set, the
+        training sweeps first."""
         names = ("samples", "labels", *("unloaded",) * (self.train.unloaded is not None))
-        sets = {
-            f"set_{k}": np.concatenate([getattr(self.train, k), getattr(self.held, k)])
-            for k in names
+        sides = self.train, self.held
+        arrays = {f"weight_{k}": v for k, v in self.weights.items()}
+        arrays |= {f"set_{k}": np.concatenate([getattr(s, k) for s in sides]) for k in names}
+        arrays |= {
+            f"group_{name}": np.concatenate([s.groups[name] for s in sides])
+            for name in self.train.groups
         }
-        arrays = {f"weight_{k}": v for k, v in self.weights.items()} | sets
-        for name in self.train.groups:
-            arrays[f"group_{name}"] = np.concatenate(
-                [self.train.groups[name], self.held.groups[name]]
-            )
+        for kind, part in (("calibration", self.calibration), ("contacts", self.contacts)):
+            arrays |= {f"{kind}_{k}": v for k, v in (part.arrays() if part else {}).items()}
         meta = {
             "scale": self.scale,
-            "shape": asdict(self.architecture),
-            "reach": asdict(self.ranges) if self.ranges else None,
+            "architecture": asdict(self.architecture),
+            "ranges": asdict(self.ranges) if self.ranges else None,
             "materials": self.train.materials,
             "rate_hz": self.train.rate_hz,
             "source": self.train.source,
             "trained_on": len(self.train),
             "about": self.about,
             "plan": self.plan.json(),
+            "calibration": self.calibration.figures() if self.calibration else None,
+            "uncalibrated": self.uncalibrated,
+            "contacts": self.contacts.figures() if self.contacts else None,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("wb") as f:
@@ -132,52 +176,102 @@ class Fit:
 
     @classmethod
     def load(cls, path: Path) -> Fit:
-        """Read what `save` wrote. Raises FormatError where it is something else."""
-        what = "a fit (made by palpate-train fit)"
-        arrays = read(path, what)
+        """Read the file that `save` wrote. Raises FormatError if it is another file."""
+        arrays = read(path, WHAT)
         try:
-            meta = json.loads(str(arrays["meta"]))
-            weights, groups = (
-                {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)}
-                for p in ("weight_", "group_")
-            )
-            samples, labels, materials = (
-                arrays["set_samples"],
-                arrays["set_labels"],
-                tuple(meta["materials"]),
-            )
-            unloaded = arrays.get("set_unloaded")
-            sweeps = Dataset(
-                samples, labels, materials, meta["rate_hz"], groups, meta["source"], unloaded
-            )
-            first = np.arange(len(sweeps)) < meta["trained_on"]
-            architecture = Architecture(
-                **meta["shape"] | {"channels": tuple(meta["shape"]["channels"])}
-            )
-            reach = meta["reach"]
-            ranges = graph.Ranges(reach["digits"], tuple(reach["responses"])) if reach else None
-            train, held = sweeps.take(first), sweeps.take(~first)
-            fit = cls(
-                weights,
-                meta["scale"],
-                architecture,
-                ranges,
-                train,
-                held,
-                meta["about"],
-                HeadPlan.read(meta["plan"]),
-            )
-        except (KeyError, ValueError, TypeError) as e:
+            fit = cls._read(arrays, json.loads(str(arrays["meta"])))
+        except (KeyError, ValueError, TypeError, BundleError) as e:
             raise FormatError(
-                f"{path.name}: not {what}, or of another version; fit again: {e}"
+                f"{path.name}: not {WHAT}, or of another version; fit again: {e}"
             ) from e
         try:
             with_head(fit.trunk(), *fit.int8_head())
         except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:
             raise FormatError(
-                f"{path.name}: its weights are not those of its {architecture}; fit again"
+                f"{path.name}: its weights are not those of its {fit.architecture}; fit again"
             ) from e
         return fit
+
+    @classmethod
+    def _read(cls, arrays: Mapping[str, Array], meta: Json) -> Fit:
+        weights, groups, calibration, contacts = (
+            {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)}
+            for p in ("weight_", "group_", "calibration_", "contacts_")
+        )
+        shape, ranges = meta["architecture"], meta["ranges"]
+        sweeps = Dataset(
+            arrays["set_samples"],
+            arrays["set_labels"],
+            tuple(meta["materials"]),
+            meta["rate_hz"],
+            groups,
+            meta["source"],
+            arrays.get("set_unloaded"),
+        )
+        first = np.arange(len(sweeps)) < meta["trained_on"]
+        return cls(
+            weights,
+            meta["scale"],
+            Architecture(**shape | {"channels": tuple(shape["channels"])}),
+            ranges and graph.Ranges(ranges["counts"], tuple(ranges["responses"])),
+            sweeps.take(first),
+            sweeps.take(~first),
+            meta["about"],
+            HeadPlan.read(meta["plan"]),
+            calibration=meta["calibration"] and Calibration.of(calibration, meta["calibration"]),
+            uncalibrated=meta["uncalibrated"],
+            contacts=meta["contacts"] and Contacts.read(contacts, meta["contacts"]),
+        )
+
+
+def finished(fit: Fit) -> Fit:
+    """`fit` with its contacts, and with its calibration if there are sweeps to judge it by."""
+    contacts = fit.contacts or Contacts.of(fit.train)
+    try:
+        calibration = fit_calibration(calibration_inputs(fit))
+    except FormatError as e:  # nothing was held out, or of too few groups
+        return replace(fit, contacts=contacts, calibration=None, uncalibrated=str(e))
+    return replace(fit, contacts=contacts, calibration=calibration)
+
+
+def calibration_inputs(fit: Fit) -> CalibrationInputs:
+    """Features from the trunk of `fit`: of the training sweeps, the held-out sweeps and the copies
+    with faults, in this order, and of augmented copies of the first two. Raises FormatError if no
+    sweep was held out."""
+    train, held, by, seed = fit.train, fit.held, fit.about["held_out_by"], fit.about["seed"]
+    if by == "nothing":
+        hold_out(train, seed)  # raises, with the reason
+    shuffled = np.random.default_rng(seed + FAULTS_SEED).permutation(len(train))
+    (faulty,) = copies(train.take(shuffled[::ONE_IN]), FAULTS, seed + FAULTS_SEED, 1)
+    of_all = train, held, faulty
+    role = np.repeat(np.arange(3), [len(sweeps) for sweeps in of_all])
+    return CalibrationInputs(
+        run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
+        np.concatenate([s.labels for s in of_all]),
+        np.concatenate([s.group(by) for s in of_all]),
+        role == 1,
+        fit.bands,
+        _augmented_copies(fit, by),
+        role == 2,
+        fit.plan,
+    )
+
+
+def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
+    """Copies of the training sweeps as the heads see them, and displaced copies of the held-out
+    sweeps, in groups `by`."""
+    trunk, seed, features = fit.trunk(), fit.about["seed"], []
+    for sweeps, change, drawn in (
+        (fit.train, fit.augmentation, seed),
+        (fit.held, fit.augmentation.displaced(), seed + HELD_COPIES_SEED),
+    ):
+        features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
+    labels = [np.tile(sweeps.labels, COPIES) for sweeps in (fit.train, fit.held)]
+    groups = [np.tile(sweeps.group(by), COPIES) for sweeps in (fit.train, fit.held)]
+    is_held = np.repeat([False, True], [len(part) for part in labels])
+    return AugmentedCopies(
+        np.concatenate(features), np.concatenate(labels), np.concatenate(groups), is_held
+    )
 
 
 @dataclass(frozen=True)
@@ -196,10 +290,10 @@ class CompactModel:
     cost: Cost = field(default_factory=list)
     forms: Mapping[str, Model] = field(default_factory=dict)
 
-    def features(self, inputs: Array, tenths: bool = False) -> Array:
+    def features(self, inputs: Array, prefixes: bool = False) -> Array:
         """Raw counts [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F],
         see graph.trunk_graph."""
-        return run(self.fit.trunk(tenths=tenths), inputs)
+        return run(self.fit.trunk(prefixes=prefixes), inputs)
 
     def logits(self, inputs: Array) -> Array:
         """Raw counts [n, T, R, C] -> float32 [n, K]."""

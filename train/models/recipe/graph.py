@@ -43,10 +43,10 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Ranges:
-    """The ranges of int8. digits: of a raw count on either side of its level; raw counts that are
+    """The ranges of int8. counts: of a raw count on either side of its level; raw counts that are
     bytes do not need it. responses: of each stage, in the scaled units of the network."""
 
-    digits: float
+    counts: float
     responses: tuple[float, ...]
 
 
@@ -66,7 +66,7 @@ def trunk_graph(
     weights: Mapping[str, Array],
     architecture: Architecture,
     ranges: Ranges | None = None,
-    tenths: bool = False,
+    prefixes: bool = False,
     keep_means: bool = False,
 ) -> onnx.ModelProto:
     """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 where
@@ -85,13 +85,15 @@ def trunk_graph(
         ranges if format.dtype == "uint8" else None
     )  # a byte does not hold wider counts, see decision 11
     prepared = cache(
-        lambda some: _prepared(g, format, scale, architecture, raw, attenuation, some, tenths)
+        lambda some: _prepared(g, format, scale, architecture, raw, attenuation, some, prefixes)
     )
     if architecture.channels:
-        parts.append(_log_means(g, format, architecture, weights, prepared(ranges), ranges, tenths))
+        parts.append(
+            _log_means(g, format, architecture, weights, prepared(ranges), ranges, prefixes)
+        )
     if architecture.pools:
-        rowwise = tenths and not architecture.zero_sum(format.window)
-        asked = bank.Pooling(own is not None, architecture.pools > 1, tenths, rowwise)
+        rowwise = prefixes and not architecture.zero_sum(format.window)
+        asked = bank.Pooling(own is not None, architecture.pools > 1, prefixes, rowwise)
         parts += bank.pooled(
             g, format, bank.Bank.of(weights), prepared(own).x, prepared(own).step, asked
         )
@@ -105,21 +107,23 @@ def trunk_graph(
             else taxels.x
         )
         some = distribution.Levels.of(weights)
-        parts.append(distribution.pooled(g, format, some, x, taxels.step, own is not None, tenths))
+        parts.append(
+            distribution.pooled(g, format, some, x, taxels.step, own is not None, prefixes)
+        )
     if keep_means:
-        counts = nodes.known_steps(nodes.frames(format.window), format.window, tenths)
+        counts = nodes.known_steps(nodes.frames(format.window), format.window, prefixes)
         parts.append(
             g("Mul", _levels(g, g("Cast", raw, to=FLOAT), format, counts), g.constant(scale))
         )
     if architecture.spectrum:
         parts.append(
-            spectrum.nodes(g, raw, attenuation, format, scale, architecture.mains_hz, tenths)
+            spectrum.nodes(g, raw, attenuation, format, scale, architecture.mains_hz, prefixes)
         )
     size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
     features = nodes.side_by_side(g, parts)
-    shape = [1, TENTHS, size] if tenths else [1, size]
+    shape = [1, TENTHS, size] if prefixes else [1, size]
     output = g(
-        "Reshape", features, g.constant(shape, "int64"), output="tenths" if tenths else "features"
+        "Reshape", features, g.constant(shape, "int64"), output="tenths" if prefixes else "features"
     )
     return g.model(format, output, *shape[1:])
 
@@ -154,11 +158,11 @@ def _log_means(
     weights: Mapping[str, Array],
     taxels: Prepared,
     ranges: Ranges | None,
-    tenths: bool,
+    prefixes: bool,
 ) -> str:
     """The stages: log mean responses [1, 1 or TENTHS, sum of channels]."""
     zero_sum, sums, factors = architecture.zero_sum(format.window), [], []
-    rowwise, x, step = tenths and not zero_sum, taxels.x, taxels.step
+    rowwise, x, step = prefixes and not zero_sum, taxels.x, taxels.step
     stages, channels = architecture.stages(format.window), architecture.channels
     for i, (stage, size) in enumerate(zip(stages, channels, strict=True)):
         w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
@@ -180,7 +184,7 @@ def _log_means(
                 i < len(channels) - 1
             ):  # after the last stage nothing would use it, and onnxruntime would still run it
                 x = nodes.counts_of(g, response, step)
-        counts = nodes.known_steps(stage, format.window, tenths)
+        counts = nodes.known_steps(stage, format.window, prefixes)
         over_time = g("Transpose", response, perm=[0, 2, 1])
         sums.append(nodes.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise))
         factors.append(nodes.mean_factors(g, step, counts, size, rowwise))
@@ -198,7 +202,7 @@ def _prepared(
     raw: str,
     attenuation: str,
     ranges: Ranges | None,
-    tenths: bool,
+    prefixes: bool,
 ) -> Prepared:
     """Raw counts [1, T, R * C] -> taxels in units of what is left to the first convolution's
     weights.
@@ -213,16 +217,18 @@ def _prepared(
     x = g("Cast", raw, to=FLOAT)
     if format.dtype == "uint8" and zero_sum:
         return Prepared(g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale)
-    rowwise = tenths and not zero_sum
+    rowwise = prefixes and not zero_sum
     frames = [level_frames(format.window, architecture)]
     counts = (
-        nodes.known_steps(nodes.frames(format.window), format.window, tenths) if rowwise else frames
+        nodes.known_steps(nodes.frames(format.window), format.window, prefixes)
+        if rowwise
+        else frames
     )
     x = g("Sub", x, _levels(g, x, format, counts, rowwise))
     x = g("Mul", x, g("Mul", attenuation, g.constant(scale)))
     if ranges is None:
         return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
-    step = ranges.digits * scale / (MIDDLE - 1)
+    step = ranges.counts * scale / (MIDDLE - 1)
     return _rounded(g, nodes.quantized(g, x, step, MIDDLE), step, MIDDLE)
 
 

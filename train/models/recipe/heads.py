@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from train.models import discriminant
+from train.calibration import discriminant
 
 Array = NDArray[Any]
 Given = tuple[Array, Array, Array, Array]

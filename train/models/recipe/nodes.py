@@ -97,9 +97,9 @@ def frames(window: int) -> Stage:
     return Stage(1, 1, window, 1, 1)
 
 
-def known_steps(stage: Stage, window: int, tenths: bool) -> list[int]:
+def known_steps(stage: Stage, window: int, prefixes: bool) -> list[int]:
     """How many responses of a stage are known by the end of each tenth, or of the window."""
-    if not tenths:
+    if not prefixes:
         return [stage.steps]
     ends = [window * (d + 1) // TENTHS for d in range(TENTHS)]
     return [max((end - stage.reach) // stage.hop + 1, 0) for end in ends]

@@ -30,7 +30,7 @@ from train.models.recipe.augment import Augmentation, default_augmentation
 from train.models.recipe.bank import Bank
 from train.models.recipe.choice import HeldOutScores, ScoredPlan
 from train.models.recipe.copies import COPIES, copies
-from train.models.recipe.fitted import Fit
+from train.models.recipe.fitted import Fit, finished
 from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
 from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
@@ -55,7 +55,8 @@ class Settings:
     discriminant. unfinished: a file that keeps the training of stages from time to time, from which
     it goes on with the same bits. reattached: the skin will be taken off and put back after these
     recordings, so that all heads see augmented copies, which look so. mains_hz: see
-    Architecture."""
+    Architecture. calibrate: whether the fit is calibrated, which a bundle needs and `evaluate` does
+    not."""
 
     steps: int = 600
     augmentation: Augmentation | None = None
@@ -63,6 +64,7 @@ class Settings:
     unfinished: Path | None = None
     reattached: bool = False
     mains_hz: float = MAINS_HZ
+    calibrate: bool = True
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         "chosen": describe(trunk, plan),
         "validation": _validation(scores, judged),
     }
-    return Fit(
+    made = Fit(
         {**trunk.weights, **heads},
         trunk.scale,
         trunk.architecture,
@@ -150,6 +152,7 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
         about,
         plan=plan.uncooled(),
     )
+    return finished(made) if settings.calibrate else made
 
 
 def _tell(log: Log, parts: int, part: int, line: str) -> None:

@@ -47,7 +47,7 @@ def nodes(
     format: SweepFormat,
     scale: float,
     mains_hz: float,
-    tenths: bool,
+    prefixes: bool,
 ) -> str:
     """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1,
     rows, bands], those of the first axis first.
@@ -76,14 +76,14 @@ def nodes(
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
         power = g("Reshape", power, g.constant([SEGMENTS, count(format)], "int64"))
-    if tenths:
+    if prefixes:
         power = g(
             "MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power
         )
     else:
         power = g("ReduceMean", power, axes=[0])
     power = g("Log", g("Add", power, g.constant(QUIET)))
-    return g("Reshape", power, g.constant([1, SEGMENTS if tenths else 1, count(format)], "int64"))
+    return g("Reshape", power, g.constant([1, SEGMENTS if prefixes else 1, count(format)], "int64"))
 
 
 def _edges(length: int) -> Array:

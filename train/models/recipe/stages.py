@@ -34,7 +34,7 @@ from train.models.recipe import graph, spectrum
 from train.models.recipe.architectures import DEFAULT, Architecture
 from train.models.recipe.augment import Augmentation, augment, default_augmentation
 from train.models.recipe.copies import COPIES, copies
-from train.models.recipe.fitted import Fit
+from train.models.recipe.fitted import Fit, finished
 from train.models.recipe.heads import HeadPart, HeadPlan
 from train.models.recipe.network import Compact
 from train.models.scale import texture_scale
@@ -77,7 +77,8 @@ def fit_network(
 ) -> Fit:
     """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for
     windows too short."""
-    return fit_network_on(*hold_out(sweeps, seed), seed, recipe, log, architecture, unfinished)
+    sides = hold_out(sweeps, seed)
+    return finished(fit_network_on(*sides, seed, recipe, log, architecture, unfinished))
 
 
 def fit_network_on(

@@ -233,3 +233,23 @@ def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames
     assert now.shape == x.shape
     assert now.dtype == np.float32
     assert np.isfinite(now).all()
+
+
+def test_copies_that_judge_are_moved_and_nothing_else():
+    """The skin's place, its contact and its gains change; what the sensor adds or loses does
+    not."""
+    usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
+    judging = usual.displaced()
+    assert (
+        judging.noise,
+        judging.noisy,
+        judging.silent,
+        judging.drift,
+        judging.hum,
+        judging.clipped,
+    ) == (0,) * 6
+    assert (judging.shift, judging.damped, judging.gains) == (
+        usual.shift,
+        usual.damped,
+        usual.gains,
+    )

@@ -56,11 +56,15 @@ def small(format: SweepFormat, architecture: Architecture = BANK) -> Bank:
     return bank.fitted(some, seen, rng)
 
 
-def trunk(format: SweepFormat, filters: Bank, int8: bool, tenths: bool = False) -> onnx.ModelProto:
+def trunk(
+    format: SweepFormat, filters: Bank, int8: bool, prefixes: bool = False
+) -> onnx.ModelProto:
     """The trunk of these filters alone."""
     given = counts(format, 12)
     ranges = graph.Ranges(graph.count_range(given, BANK), ()) if int8 else None
-    return graph.trunk_graph(format, texture_scale(given), filters.weights(), BANK, ranges, tenths)
+    return graph.trunk_graph(
+        format, texture_scale(given), filters.weights(), BANK, ranges, prefixes
+    )
 
 
 @forms
@@ -100,9 +104,9 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepForma
     precise, rounded = (run(trunk(format, filters, int8), given) for int8 in (False, True))
     assert np.abs(precise - rounded).mean() < 0.03
     for int8, whole in ((False, precise), (True, rounded)):
-        tenths = run(trunk(format, filters, int8, tenths=True), given)
-        assert tenths.shape == (len(given), 10, whole.shape[1])
-        np.testing.assert_allclose(tenths[:, -1], whole, atol=1e-5)
+        prefixes = run(trunk(format, filters, int8, prefixes=True), given)
+        assert prefixes.shape == (len(given), 10, whole.shape[1])
+        np.testing.assert_allclose(prefixes[:, -1], whole, atol=1e-5)
 
 
 def test_wide_counts_keep_what_a_byte_would_round_away():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
+from train.calibration import discriminant
 from train.data.splitters import InnerPart
-from train.models import discriminant
 from train.models.recipe import choice
 from train.models.recipe.choice import HeldOutScores
 from train.models.recipe.heads import HeadData, HeadPart, HeadPlan

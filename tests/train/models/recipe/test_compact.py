@@ -149,7 +149,7 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
     """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came
     just before."""
     format = SweepFormat(2, 2, 100.0, window, dtype)
-    trunk, whole = trunks(format, tenths=True)[1 + int8], trunks(format)[1 + int8]
+    trunk, whole = trunks(format, prefixes=True)[1 + int8], trunks(format)[1 + int8]
     counts, other = drawn(format, 3), drawn(format, 3, seed=7)
     want = graph_builder.run(trunk, counts)
     assert want.shape == (3, 10, 22)
@@ -232,7 +232,7 @@ def test_tenths_are_means_of_what_was_known():
     """In float: the first half's features are those of a window of half the length, as both see the
     same responses."""
     format = SweepFormat(2, 2, 100.0, 800, "uint8")
-    model, trunk, _ = trunks(format, tenths=True)
+    model, trunk, _ = trunks(format, prefixes=True)
     counts = drawn(format, 3)
     half = graph_builder.run(trunk, counts)[:, 4]
     np.testing.assert_allclose(half, seen(model, counts[:, :400]), atol=1e-3)
@@ -305,7 +305,7 @@ def test_the_method_is_its_int8_graph():
     z = model.features(s.samples) @ weight.T + bias
     np.testing.assert_allclose(model.logits(s.samples), z, atol=1e-3)
     size = sum(model.fit.architecture.channels) + model.fit.bands
-    assert model.features(s.samples[:2], tenths=True).shape == (2, 10, size)
+    assert model.features(s.samples[:2], prefixes=True).shape == (2, 10, size)
 
 
 def test_all_sizes_share_one_recipe():
@@ -412,7 +412,7 @@ def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactMode
         graph_builder.run(bare.forms["float"].graph(), other), logits, atol=2e-3
     )
     assert np.mean(logits.argmax(1) == easy(seed=9).labels) > 0.9
-    assert bare.features(other[:2], tenths=True).shape == (2, 10, bare.fit.bands)
+    assert bare.features(other[:2], prefixes=True).shape == (2, 10, bare.fit.bands)
 
 
 def test_a_fit_without_a_convolution_survives_its_file(
@@ -430,9 +430,9 @@ def test_a_fit_without_a_convolution_survives_its_file(
     with torch.no_grad():
         x = torch.from_numpy(counts.astype(np.float32))
         assert torch.equal(again.network()(x), bare.fit.network()(x))
-    for tenths in (False, True):
-        assert again.trunk(tenths=tenths) == bare.fit.trunk(tenths=tenths)
-        assert again.trunk(int8=False, tenths=tenths) == again.trunk(tenths=tenths)
+    for prefixes in (False, True):
+        assert again.trunk(prefixes=prefixes) == bare.fit.trunk(prefixes=prefixes)
+        assert again.trunk(int8=False, prefixes=prefixes) == again.trunk(prefixes=prefixes)
 
 
 @pytest.mark.parametrize("frames", [64, 1500])
@@ -465,7 +465,7 @@ def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
         np.testing.assert_allclose(
             graph_builder.run(made.trunk(int8), s.samples)[:, first : first + 4], level, rtol=1e-5
         )
-        of_tenths = graph_builder.run(made.trunk(int8, tenths=True), s.samples)
+        of_tenths = graph_builder.run(made.trunk(int8, prefixes=True), s.samples)
         np.testing.assert_allclose(of_tenths[:, -1, first : first + 4], level, rtol=1e-5)
         assert of_tenths.shape[2] == first + 4 + made.bands
     assert (

@@ -41,11 +41,11 @@ def levels(format: SweepFormat) -> Levels:
     return distribution.fitted(given, texture_scale(given), np.random.default_rng(0))
 
 
-def trunk(format: SweepFormat, some: Levels, int8: bool, tenths: bool = False) -> onnx.ModelProto:
+def trunk(format: SweepFormat, some: Levels, int8: bool, prefixes: bool = False) -> onnx.ModelProto:
     """The trunk of the distribution alone."""
     given = counts(format, 12)
     ranges = graph.Ranges(graph.count_range(given, ALONE), ()) if int8 else None
-    return graph.trunk_graph(format, texture_scale(given), some.weights(), ALONE, ranges, tenths)
+    return graph.trunk_graph(format, texture_scale(given), some.weights(), ALONE, ranges, prefixes)
 
 
 def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
@@ -80,10 +80,12 @@ def test_the_last_tenth_is_the_whole_window(format: SweepFormat):
     """And the first depends on no later frame, where later ones repeat the newest."""
     some, given = levels(format), counts(format)
     for int8 in (False, True):
-        tenths = run(trunk(format, some, int8, tenths=True), given)
-        assert tenths.shape == (len(given), 10, len(some))
-        np.testing.assert_allclose(tenths[:, -1], run(trunk(format, some, int8), given), atol=2e-2)
-        assert np.abs(tenths[:, -1] - run(trunk(format, some, int8), given)).mean() < 1e-3
+        prefixes = run(trunk(format, some, int8, prefixes=True), given)
+        assert prefixes.shape == (len(given), 10, len(some))
+        np.testing.assert_allclose(
+            prefixes[:, -1], run(trunk(format, some, int8), given), atol=2e-2
+        )
+        assert np.abs(prefixes[:, -1] - run(trunk(format, some, int8), given)).mean() < 1e-3
 
 
 def test_the_shares_of_training_sweeps_are_evenly_spaced():

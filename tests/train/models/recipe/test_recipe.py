@@ -22,6 +22,7 @@ from train.data.sets import Dataset
 from train.data.splitters import inner_parts
 from train.models import checkpoint, training
 from train.models.recipe import choice, default, recipe
+from train.models.recipe import fitted as fitted_module
 from train.models.recipe.bank import Bank
 from train.models.recipe.fitted import Fit
 from train.models.recipe.recipe import Settings
@@ -207,8 +208,8 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
         assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
 
 
-def refused(fit: Fit) -> NoReturn:
-    """As where too few sweeps judge; it would take longer than the fit."""
+def uncalibrated(given: object) -> NoReturn:
+    """As if too few sweeps judged; a calibration would take longer than the fit."""
     raise FormatError("not here")
 
 
@@ -221,7 +222,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     monkeypatch.setattr(bundles, "CACHE", tmp_path / "cache")
-    monkeypatch.setattr(bundles, "calibrate", refused)
+    monkeypatch.setattr(fitted_module, "fit_calibration", uncalibrated)
     easy().save(tmp_path / "easy.npz")
     plain, steps = training.backward, []
 

@@ -52,10 +52,10 @@ def drawn(format: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
 
 
 def trunk(
-    format: SweepFormat, scale: float = 0.1, tenths: bool = False, mains_hz: float = 50.0
+    format: SweepFormat, scale: float = 0.1, prefixes: bool = False, mains_hz: float = 50.0
 ) -> onnx.ModelProto:
     """The graph that gives nothing but the spectrum."""
-    return graph.trunk_graph(format, scale, {}, replace(BARE, mains_hz=mains_hz), tenths=tenths)
+    return graph.trunk_graph(format, scale, {}, replace(BARE, mains_hz=mains_hz), prefixes=prefixes)
 
 
 def heard(
@@ -111,7 +111,7 @@ def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool
     counts = drawn(format)
     want = defined(format, counts, mains)
     rows, whole = (
-        graph_builder.run(trunk(format, tenths=True), counts),
+        graph_builder.run(trunk(format, prefixes=True), counts),
         graph_builder.run(trunk(format), counts),
     )
     assert rows.shape == want.shape == (2, 10, spectrum.count(format))
@@ -136,16 +136,16 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
     plain = Compact(format, 3, 0.1, norm=False, architecture=SMALL).eval()
     weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
     for ranges in (None, found):
-        for tenths in (False, True):
+        for prefixes in (False, True):
             both, alone = (
                 graph_builder.run(
-                    graph.trunk_graph(format, 0.1, weights, shape, ranges, tenths), counts
+                    graph.trunk_graph(format, 0.1, weights, shape, ranges, prefixes), counts
                 )
                 for shape in (SMALL.cut(3, True), SMALL)
             )
             np.testing.assert_array_equal(both[..., :-size], alone)
             np.testing.assert_allclose(
-                both[..., -size:], want if tenths else want[:, -1], atol=2e-3
+                both[..., -size:], want if prefixes else want[:, -1], atol=2e-3
             )
 
 
@@ -169,7 +169,7 @@ def test_the_hum_of_the_mains_changes_nothing(
         hummed = (counts + hum).astype(np.float32)
         for ask in (
             lambda format, x: heard(format, x, mains_hz=mains_hz),
-            lambda format, x: graph_builder.run(trunk(format, tenths=True, mains_hz=mains_hz), x),
+            lambda format, x: graph_builder.run(trunk(format, prefixes=True, mains_hz=mains_hz), x),
         ):
             apart = np.abs(ask(format, hummed) - ask(format, counts)).max(-1)
             assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
@@ -178,7 +178,7 @@ def test_the_hum_of_the_mains_changes_nothing(
 def test_a_fit_that_names_no_mains_is_as_before_it_could():
     """50 Hz, in every bit of the graph; another frequency changes waves and nothing else."""
     usual, fifty, sixty = (
-        graph.trunk_graph(skin.FORMAT, 0.1, {}, shape, tenths=True)
+        graph.trunk_graph(skin.FORMAT, 0.1, {}, shape, prefixes=True)
         for shape in (BARE, replace(BARE, mains_hz=50.0), replace(BARE, mains_hz=60.0))
     )
     assert usual.SerializeToString() == fifty.SerializeToString()
@@ -198,7 +198,7 @@ def test_later_frames_and_offsets_do_not_matter():
     held, late = counts.copy(), counts.copy()
     held[:, 64:], late[:, 160:] = held[:, 63:64], 91
     a, b, c, d = (
-        graph_builder.run(trunk(ODD, tenths=True), x)
+        graph_builder.run(trunk(ODD, prefixes=True), x)
         for x in (counts, held, late, counts + np.int16(300))
     )
     np.testing.assert_array_equal(a[:, :4], b[:, :4])
@@ -218,7 +218,7 @@ def test_silence_is_finite(name: str):
     for have in (
         heard(format, quiet),
         graph_builder.run(trunk(format), quiet),
-        graph_builder.run(trunk(format, tenths=True), quiet),
+        graph_builder.run(trunk(format, prefixes=True), quiet),
     ):
         np.testing.assert_allclose(have, np.log(1e-4), atol=1e-3)
 

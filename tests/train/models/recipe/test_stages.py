@@ -210,9 +210,9 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     with np.load(tmp_path / "fit.npz") as z:
         old = dict(z)
     meta = json.loads(str(old["meta"]))
-    del meta["shape"]
+    del meta["architecture"]
     np.savez(tmp_path / "old.npz", **old | {"meta": np.array(json.dumps(meta))})
-    with pytest.raises(FormatError, match=r"^old.npz: not a fit .*; fit again: 'shape'$"):
+    with pytest.raises(FormatError, match=r"^old.npz: not a fit .*; fit again: 'architecture'$"):
         Fit.load(tmp_path / "old.npz")
 
 

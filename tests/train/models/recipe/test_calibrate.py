@@ -6,8 +6,9 @@ import numpy as np
 
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.sweep_sets import easy
-from train.calibration.calibrate import ONE_IN, calibration_inputs, fit_calibration
 from train.models.recipe import recipe
+from train.models.recipe.calibrate import fit_calibration
+from train.models.recipe.fitted import ONE_IN, calibration_inputs
 
 NOISE = np.array([0.0, 0.0, 0.0, 12.0])
 """What disturbs: in the last feature, where no material differs from another."""
@@ -34,11 +35,11 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     factors = np.random.default_rng(2).uniform(-1, 1, (one.sum(), 1, 1))
     more = [np.concatenate([of[known], of[known][one]]) for of in (x, y, at)]
     more[0][known.sum() :] += factors * NOISE
-    disturbed = np.arange(len(more[0])) >= known.sum()
+    faulty = np.arange(len(more[0])) >= known.sum()
     plain = fit_calibration(
         plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
     )
-    sturdy = fit_calibration(plain_inputs(*more, ~disturbed, 1, disturbed=disturbed))
+    sturdy = fit_calibration(plain_inputs(*more, ~faulty, 1, faulty=faulty))
     shaken = x[known][:, -1] + NOISE / 3
     kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
     assert kept[0] < 0.3
@@ -54,20 +55,17 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten of them, changed, of the same materials and groups; none judges."""
     fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
     given = calibration_inputs(fit)
-    tenths, labels, groups, judged, disturbed = (
-        given.tenths,
+    prefixes, labels, groups, judged, faulty = (
+        given.prefixes,
         given.labels,
         given.groups,
         given.judged,
-        given.disturbed,
+        given.faulty,
     )
     assert (
-        len(tenths)
-        == len(labels)
-        == len(groups)
-        == len(fit.train) + len(fit.held) + disturbed.sum()
+        len(prefixes) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + faulty.sum()
     )
-    assert disturbed.sum() == -(-len(fit.train) // ONE_IN)
-    assert not (judged & disturbed).any()
-    assert not set(groups[disturbed]) & set(groups[judged])
-    assert not any((tenths[~disturbed] == row).all(axis=(1, 2)).any() for row in tenths[disturbed])
+    assert faulty.sum() == -(-len(fit.train) // ONE_IN)
+    assert not (judged & faulty).any()
+    assert not set(groups[faulty]) & set(groups[judged])
+    assert not any((prefixes[~faulty] == row).all(axis=(1, 2)).any() for row in prefixes[faulty])

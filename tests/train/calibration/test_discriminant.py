@@ -8,7 +8,7 @@ import pytest
 from sklearn.covariance import ledoit_wolf
 
 from appliance.core.errors import FormatError
-from train.models import discriminant
+from train.calibration import discriminant
 
 
 def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:

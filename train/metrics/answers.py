@@ -1,0 +1,52 @@
+"""The box's answers to labelled sweeps, and the figures of them that a manifest holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.data.sets import Dataset
+from train.metrics.score import accuracy_figure
+
+Array = NDArray[Any]
+REFUSED, UNKNOWN = -1, -2
+"""Stand for a label if the box refuses a sweep, or calls its material unknown."""
+NETWORK = "network alone"
+"""Ends the name of the accuracy of the network's most probable labels, without the box's checks."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Answers to N sweeps. labels: int [N], a label, REFUSED or UNKNOWN. ok: bool [N], whether the
+    box is certain of the label. fused: as `labels`, of the whole recording; UNKNOWN if uncertain.
+    network: int [N], the network's most probable labels."""
+
+    labels: Array
+    ok: Array
+    fused: Array
+    network: Array
+
+    def figures(self, sweeps: Dataset, protocol: str) -> dict[str, Any]:
+        """Accuracy by sweep, and by recording if a recording has several sweeps. A refused, unknown
+        or unsure sweep does not count as right. Beside it the accuracy of the network alone."""
+        named = self.labels >= 0
+        right = (self.labels == sweeps.labels) & self.ok
+        counts = {
+            "wrong": int((named & self.ok & ~right).sum()),
+            "unsure": int((named & ~self.ok).sum()),
+            "unknown": int((self.labels == UNKNOWN).sum()),
+            "refused": int((self.labels == REFUSED).sum()),
+        }
+        network = int((self.network == sweeps.labels).sum())
+        result = {
+            protocol: accuracy_figure(int(right.sum()), len(sweeps)) | counts,
+            f"{protocol}, {NETWORK}": accuracy_figure(network, len(sweeps)),
+        }
+        first = np.unique(sweeps.group("recording"), return_index=True)[1]
+        if len(first) < len(sweeps):
+            fused = int((self.fused == sweeps.labels)[first].sum())
+            result[f"{protocol}, by recording"] = accuracy_figure(fused, len(first))
+        return result

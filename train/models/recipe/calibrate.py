@@ -1,0 +1,242 @@
+"""The calibration of a fit: all that is fitted to the features of a finished trunk.
+
+That is the head that names the material and its temperature, a head for each early answer and the
+rule for them, the embedding and the limit of known materials, and the rule for displaced contacts.
+Everything that limits an answer is fitted to held-out sweeps, by heads that did not see their
+group.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle.bundle import Early, Known, Moved
+from appliance.bundle.manifest import UNSURE
+from appliance.inference.classifier import LEAST_PROBABILITY, softmax
+from train.calibration import early_exit, novelty
+from train.calibration.displacement import AugmentedCopies, DisplacementFit, fit_displacement
+from train.calibration.early_exit import EarlyRule, Heads
+from train.calibration.novelty import Embedding
+from train.metrics.answers import UNKNOWN, Answers
+from train.metrics.score import fuse
+from train.metrics.temperature import sufficient_temperature
+from train.models.recipe.heads import HeadPart, HeadPlan
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Part = TypeVar("Part", Embedding, Heads, "HeldOut")
+NUMBERS = ("temperature", "class_mean_temperature", "limit")
+"""Attributes of a Calibration that are numbers."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Answers to the held-out sweeps, by heads, embedding and temperature that were fitted without
+    the sweep's group.
+
+    numbers: of the sweeps [n]. probabilities: [n, K], of the network. known: bool [n], whether the
+    distance is within the limit.
+    """
+
+    numbers: Array
+    probabilities: Array
+    known: Array
+
+    def answers(self, recordings: Array) -> Answers:
+        """The answers of the box. recordings: int [n], the recording of each sweep; its known
+        sweeps are fused."""
+        labels = self.probabilities.argmax(1)
+        known = np.flatnonzero(self.known)
+        fused = np.full(len(labels), UNKNOWN)
+        if len(known):
+            logs = np.log(np.maximum(self.probabilities, LEAST_PROBABILITY))
+            scores, first = fuse(logs[known], recordings[known])
+            decided = np.where(softmax(scores).max(1) >= UNSURE, scores.argmax(1), UNKNOWN)
+            by_recording = dict(zip(recordings[known][first], decided, strict=True))
+            fused = np.array([by_recording.get(number, UNKNOWN) for number in recordings])
+        ok = self.probabilities.max(1) >= UNSURE
+        return Answers(np.where(self.known, labels, UNKNOWN), ok, fused, labels)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The calibration of a trunk.
+
+    weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
+    class_mean_temperature: of logits that the box computes from class means. steps: heads of the
+    early answers, with their temperatures. limit: largest squared distance of a known material, see
+    novelty. displacement: for displaced contacts; None if there were no copies to fit it to.
+    """
+
+    embedding: Embedding
+    weight: Array
+    bias: Array
+    temperature: float
+    class_mean_temperature: float
+    steps: Heads
+    rule: EarlyRule
+    limit: float
+    displacement: DisplacementFit | None
+    held: HeldOut
+
+    def logits(self, features: Array) -> Array:
+        """Features [..., F] of whole sweeps -> logits [..., K] whose softmax is calibrated."""
+        logits: Array = np.asarray(features, np.float64) @ self.weight + self.bias
+        return logits
+
+    def probabilities(self, prefixes: Array) -> Array:
+        """Features [n, D + 1, F] of prefixes of the window -> probabilities [n, D + 1, K] after
+        each of them."""
+        steps = self.steps.logits(self.embedding(prefixes))
+        return softmax(np.concatenate([steps, self.logits(prefixes[:, -1])[:, None]], axis=1))
+
+    def known(self) -> Known:
+        """The entry `known` of a manifest."""
+        return Known(self.limit, self.class_mean_temperature)
+
+    def displacement_rule(self) -> Moved | None:
+        """The entry `moved` of a manifest."""
+        return self.displacement.rule if self.displacement else None
+
+    def means(self) -> bytes:
+        """The file means.npz of a bundle."""
+        packed, classes = io.BytesIO(), self.embedding.classes()
+        classes = self.displacement.classes(classes) if self.displacement else classes
+        np.savez_compressed(packed, allow_pickle=False, **classes.arrays())
+        return packed.getvalue()
+
+    def arrays(self) -> dict[str, Array]:
+        """The arrays that the file of a fit keeps."""
+        parts: Json = {"embedding": self.embedding, "steps": self.steps, "held": self.held}
+        parts |= {"displaced": self.displacement.embedding} if self.displacement else {}
+        arrays = {
+            f"{of}.{k.name}": getattr(v, k.name) for of, v in parts.items() for k in fields(v)
+        }
+        return arrays | {"weight": self.weight, "bias": self.bias}
+
+    def figures(self) -> Json:
+        """The rules and temperatures that the file of a fit keeps, for JSON."""
+        return {name: getattr(self, name) for name in NUMBERS} | {
+            "rule": asdict(self.rule),
+            "displacement": asdict(self.displacement.rule) if self.displacement else None,
+        }
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array], figures: Json) -> Calibration:
+        """The calibration that gave `arrays` and `figures`. Raises KeyError or TypeError if they
+        are not of a calibration."""
+
+        def part(kind: type[Part], name: str) -> Part:
+            return kind(**{k.name: arrays[f"{name}.{k.name}"] for k in fields(kind)})
+
+        early, moved = figures["rule"]["early"], figures["displacement"]
+        early = early and Early(tuple(early["least"]), early["agree"])
+        return cls(
+            part(Embedding, "embedding"),
+            arrays["weight"],
+            arrays["bias"],
+            steps=part(Heads, "steps"),
+            rule=EarlyRule(**figures["rule"] | {"early": early}),
+            displacement=moved and DisplacementFit(part(Embedding, "displaced"), Moved(**moved)),
+            held=part(HeldOut, "held"),
+            **{name: figures[name] for name in NUMBERS},
+        )
+
+
+@dataclass(frozen=True)
+class CalibrationInputs:
+    """Features that a calibration is fitted to.
+
+    prefixes: [N, D + 1, F], features of the first tenth of the window, the first two tenths, and so
+    on to the whole window. labels: [N], 0 to K - 1. groups: int [N]. judged: bool [N], sweeps that
+    the trunk did not see; only these decide temperatures and rules. fixed: number of features, the
+    last ones, that were not trained (see novelty.embed). If there are any, most of a distance lies
+    in them; then all sweeps decide the limit, because more positions make it depend less on chance.
+    copied: augmented copies. faulty: bool [N], copies with FAULTS; the embedding and its limit see
+    them, the heads do not. plan: of the head that names the material; None for one discriminant of
+    all features.
+    """
+
+    prefixes: Array
+    labels: Array
+    groups: Array
+    judged: Array
+    fixed: int
+    copied: AugmentedCopies
+    faulty: Array
+    plan: HeadPlan | None = None
+
+    @property
+    def whole(self) -> Array:
+        """Features [N, F] of the whole window."""
+        return self.prefixes[:, -1]
+
+    def naming_head(self, seen: Array) -> tuple[Array, Array]:
+        """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
+        `seen` (bool [N]) and the copies of their groups."""
+        plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
+        seen = seen & ~self.faulty
+        also = self.copied.take(np.isin(self.copied.groups, self.groups[seen]) & ~self.copied.held)
+        given = self.whole[seen], self.labels[seen], also.features, also.labels
+        weight, bias = plan.fit(given, int(self.labels.max()) + 1)
+        return weight.T, bias
+
+
+def fit_calibration(given: CalibrationInputs) -> Calibration:
+    """Raises FormatError as novelty.embed, and if there is only one group or no sweep to judge
+    by."""
+    whole, labels, groups = given.whole, given.labels, given.groups
+    logits, numbers, class_mean_temperature = _held_out_logits(given)
+    temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups[numbers])
+    p = softmax(logits / temperatures[:, None])
+    embedding, last = novelty.embed(whole, labels, given.fixed), float(temperatures[-1])
+    steps = early_exit.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
+    distances = novelty.cross_fitted_distances(
+        whole, labels, groups, (given.judged | (given.fixed > 0)) & ~given.faulty, given.fixed
+    )
+    limit = novelty.limit(distances)
+    weight, bias = given.naming_head(np.ones(len(labels), bool))
+    return Calibration(
+        embedding,
+        weight / last,
+        bias / last,
+        last,
+        class_mean_temperature,
+        steps.cooled(temperatures[:-1]),
+        early_exit.find_rule(p, labels[numbers]),
+        limit,
+        _displacement(given, last),
+        HeldOut(numbers, p[:, -1], distances[numbers] <= limit),
+    )
+
+
+def _held_out_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
+    """Logits [n, D + 1, K] of the judged sweeps by heads that did not see their groups, at
+    temperature 1; the numbers [n] of these sweeps; the temperature of logits from class means."""
+    labels, groups = given.labels, given.groups
+    logits, numbers = early_exit.cross_fitted_logits(
+        given.prefixes, labels, groups, given.judged, given.fixed
+    )
+    temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])
+    row_of = {number: row for row, number in enumerate(numbers)}
+    for seen, judging in novelty.parts(groups, given.judged):
+        weight, bias = given.naming_head(seen)
+        present = [number for number in judging if number in row_of]
+        logits[[row_of[number] for number in present], -1] = given.whole[present] @ weight + bias
+    return logits, numbers, temperature
+
+
+def _displacement(given: CalibrationInputs, temperature: float) -> DisplacementFit | None:
+    """The rule for displaced contacts, by a head that did not see the groups of judged sweeps."""
+    copied = given.copied
+    if not copied.held.any():
+        return None
+    weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.judged]))
+    logits = (copied.features[copied.held] @ weight + bias) / temperature
+    return fit_displacement(given.whole, given.labels, given.judged, given.fixed, copied, logits)
