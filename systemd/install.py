@@ -17,6 +17,7 @@ from pathlib import Path
 
 from enrolment_key import make as make_enrolment_key
 from fleet import Failed, FleetBox, each, options, remedy
+from manual import write as write_manual
 from page_secrets import make as make_page_secrets
 from release import ROOT, ReleaseArchives
 
@@ -42,11 +43,7 @@ PATHS = {
         f"firmware_config/{f.name}": f"/etc/palpate/{f.name}"
         for f in sorted((ROOT / "firmware_config").glob("*.toml"))
     },
-    "docs/manual.md": "/usr/share/doc/palpate/manual.md",
-    "docs/manual": "/usr/share/doc/palpate/manual",
-    "docs/alignment/page.png": "/usr/share/doc/palpate/alignment/page.png",
-    "docs/watch/page.png": "/usr/share/doc/palpate/watch/page.png",
-    "docs/watch/record.png": "/usr/share/doc/palpate/watch/record.png",
+    "build/manual.md": "/usr/share/doc/palpate/manual.md",
     "firmware_config/PROTOCOL.md": "/usr/share/doc/palpate/PROTOCOL.md",
 }
 """Files of this checkout, and their paths on a box."""
@@ -107,6 +104,7 @@ def main(argv: list[str] | None = None) -> int:
     except Failed as e:
         sys.exit(f"palpate: {e}")
     signers = args.signers.read_text() if args.signers else ""
+    write_manual(ROOT / "build" / "manual.md")
     with tempfile.TemporaryDirectory() as folder:
         archives = ReleaseArchives(args.wheel, [*PATHS, SKINS], Path(folder))
         return each(

@@ -18,6 +18,7 @@ from appliance.cli.main import RUNS
 from appliance.cli.parser import parser
 from appliance.core import config
 from appliance.core.schema import Key
+from appliance.core.storage import put
 
 ROOT = Path(__file__).resolve().parent.parent
 BOX_PAGES = (
@@ -82,6 +83,12 @@ def box_manual() -> str:
         re.sub(r"\A# ", f"## {number}. ", _plain(page)) for number, page in enumerate(pages, 1)
     )
     return "\n".join([TITLE, contents, "", *texts])
+
+
+def write(path: Path) -> None:
+    """Write the manual for the box."""
+    path.parent.mkdir(exist_ok=True)
+    put(path, box_manual().encode("ascii"))
 
 
 def _plain(page: str) -> str:

@@ -309,7 +309,12 @@ def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
     steps = run("make", "--dry-run", "desktop", cwd=tmp_path)
     assert "-e 'train[minirocket,dask]'" in steps
     assert "-m pytest" not in steps  # a folder may have its name
-    for page in ("README.md", "CONTRIBUTING.md", "docs/manual.md", "docs/import.md"):
+    for page in (
+        "README.md",
+        "CONTRIBUTING.md",
+        "docs/tutorials/first-model.md",
+        "docs/how-to/import.md",
+    ):
         text = (ROOT / page).read_text()
         assert "make desktop" in text
         assert ".venv/bin/activate" in text

@@ -70,7 +70,8 @@ class TriggerConfig:
     sweep of `sweep_s` every `every_s`. new_object: its rising edge announces another object.
     active_low: inverts all three lines. bias: the inputs' resistor. glitch_us: time for which a
     level must hold to count. storm_edges: largest number of edges in one burst; more are taken for
-    a broken wire.
+    a broken wire. every_s: with "timed", seconds from one START to the next. sweep_s: with "timed",
+    seconds from START to STOP.
     """
 
     mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"

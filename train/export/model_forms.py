@@ -137,7 +137,7 @@ PEERS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
 def measured(
     models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS
 ) -> list[dict[str, Any]]:
-    """What each of the `models` costs, as chart.json names it; see docs/evaluation.md. sweeps: raw
+    """What each of the `models` costs, as chart.json names it; see docs/reference/file-formats.md. sweeps: raw
     counts [n, T, R, C].
 
     Raises BundleError where a model does not run.

@@ -29,7 +29,7 @@ PROGRAM = Program(
         },
         "pages": {
             "reports": "make the project's results and pages again: the stale ones, or some by name",
-            "figures": "write the figures of results into README, manual and pages",
+            "figures": "write the figures of results into README and pages",
             "matrix": "draw the results of evaluate: methods by protocols",
             "overview": "draw the README's picture: a simulated sweep and the box's answers",
         },

@@ -1,4 +1,4 @@
-"""Figures of results in README, manual and pages. In: files of results. Out: documents, with each
+"""Figures of results in README and pages. In: files of results. Out: documents, with each
 text between its markers.
 
 The one list of what stands where: `python -m train.studies figures` writes it all, and a test fails where a
@@ -18,7 +18,8 @@ from appliance.core.storage import put
 from train.reports import provenance
 from train.studies import bench_table, contact_table, marked_text
 
-README, MANUAL = "README.md", "docs/manual.md"
+README, ALIGN = "README.md", "docs/how-to/align.md"
+SPECIFICATIONS = "docs/reference/specifications.md"
 BENCH, ALIGNMENT, DEVELOPMENT = (
     "docs/bench.json",
     "docs/alignment/place.json",
@@ -50,9 +51,8 @@ class DocumentFigure:
 
 FIGURES = (
     DocumentFigure(README, "front", DEVELOPMENT, picture_note),
-    DocumentFigure(README, "bench", BENCH, bench_table.table),
-    DocumentFigure(MANUAL, "bench", BENCH, bench_table.table),
-    DocumentFigure(MANUAL, "moved", ALIGNMENT, contact_table.sentence),
+    DocumentFigure(SPECIFICATIONS, "bench", BENCH, bench_table.table),
+    DocumentFigure(ALIGN, "moved", ALIGNMENT, contact_table.sentence),
     DocumentFigure("docs/alignment/README.md", "alignment", ALIGNMENT, contact_table.table),
 )
 

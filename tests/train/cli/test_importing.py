@@ -1,4 +1,4 @@
-"""palpate-train import, as a user calls it: the five commands of docs/import.md, its report, its
+"""palpate-train import, as a user calls it: the five commands of docs/how-to/import.md, its report, its
 exit codes."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.factories.paths import ROOT
 from train.cli.main import main
 from train.data import sets
 
-PAGE = (ROOT / "docs" / "import.md").read_text()
+PAGE = (ROOT / "docs" / "how-to" / "import.md").read_text()
 
 
 def five() -> list[list[str]]:

@@ -1,5 +1,5 @@
-"""The one table of the box's figures, which README and manual show: they name none of its figures
-elsewhere."""
+"""The one table of the box's figures, which the specifications show: no page names its
+figures elsewhere."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from train.studies import bench_table
 
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
 FIGURES = ROOT / "docs" / "bench.json"
-DOCUMENTS = [ROOT / "README.md", ROOT / "docs" / "manual.md"]
+DOCUMENTS = [ROOT / "README.md", ROOT / "docs" / "reference" / "specifications.md"]
 MEASURED = {
     "inference": r"\binference\b[^\n]{0,80}?\d ?(ms|µs)\b",
     "latency": r"\b(last frame|sentence at the port)\b[^\n]{0,80}?\d ?ms\b",
@@ -37,8 +37,9 @@ def figures() -> dict[str, Any]:
 def running_text(path: Path) -> str:
     """The document without its table, and without what is indented or fenced as code."""
     text = path.read_text(encoding="utf-8")
-    begin, end = text.index(BEGIN), text.index(END)
-    text = re.sub(r"^```.*?^```", "", text[:begin] + text[end:], flags=re.S | re.M)
+    before, _, rest = text.partition(BEGIN)
+    after = rest.partition(END)[2]
+    text = re.sub(r"^```.*?^```", "", before + after, flags=re.S | re.M)
     return re.sub(r"^ {4}.*$", "", text, flags=re.M)
 
 
@@ -73,7 +74,7 @@ def test_documents_name_no_figure_of_the_bench_elsewhere(path: Path, figures: di
     ],
 )
 def test_a_figure_in_running_text_would_be_found(text: str, figures: dict[str, Any]):
-    """Each of those that README and manual once contradicted each other in."""
+    """Each is a sentence in which two pages once contradicted each other."""
     assert named(text, figures)
 
 

@@ -1,4 +1,4 @@
-"""What README, manual and pages say in figures: it is what the files of results hold, and what is
+"""What README and pages say in figures: it is what the files of results hold, and what is
 older says so."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from train.metrics import score
 from train.reports import provenance
 from train.studies import document_figures
 from train.studies.command import main
-from train.studies.document_figures import FIGURES
+from train.studies.document_figures import ALIGN, FIGURES, SPECIFICATIONS
 
 DOCUMENTS = sorted({figure.document for figure in FIGURES})
 MARKED = re.compile(r"<!-- (?!provenance|/)([a-z-]+) -->\n")
@@ -53,13 +53,13 @@ def test_the_command_writes_what_has_changed_and_nothing_else(
 ):
     """A changed figure changes its documents, and text beside the markers stays; a second run
     changes nothing."""
-    results, before = project / document_figures.BENCH, (project / "README.md").read_text()
+    results, before = project / document_figures.BENCH, (project / SPECIFICATIONS).read_text()
     figures = json.loads(results.read_bytes())
     figures["rss_mb"]["after_1000"] = 1234.5
     results.write_text(json.dumps(figures))
     assert main(["figures"]) == 0
-    assert capsys.readouterr().out.split() == ["README.md", "docs/manual.md"]
-    after = (project / "README.md").read_text()
+    assert capsys.readouterr().out.split() == [SPECIFICATIONS]
+    after = (project / SPECIFICATIONS).read_text()
     changed = [
         pair
         for pair in zip(before.split("\n"), after.split("\n"), strict=True)
@@ -90,9 +90,7 @@ def test_the_command_writes_what_has_changed_and_nothing_else(
             "README.md has not one pair of markers",
         ),
         (
-            lambda root: (root / "README.md").write_text(
-                "<!-- /bench --><!-- bench --><!-- front --><!-- /front -->"
-            ),
+            lambda root: (root / SPECIFICATIONS).write_text("<!-- /bench --><!-- bench -->"),
             "one pair",
         ),
         (
@@ -107,10 +105,10 @@ def test_what_is_missing_is_named_and_nothing_is_written(
 ):
     """One line with the file and what to do; no document is changed."""
     damage(project)
-    manual = (project / "docs" / "manual.md").read_bytes()
+    page = (project / ALIGN).read_bytes()
     assert main(["figures"]) == FormatError.exit_code
     assert re.search(said, capsys.readouterr().err)
-    assert (project / "docs" / "manual.md").read_bytes() == manual
+    assert (project / ALIGN).read_bytes() == page
 
 
 def test_a_picture_of_an_older_default_is_called_so():

@@ -1,15 +1,16 @@
-"""The manual and the change log beside the code: what they name is there, and what is there they
-name."""
+"""The written pages and the change log beside the code: commands, settings, statuses and figures
+that they name exist, and each that exists is described. The box holds the pages as one text."""
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
+import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from appliance import __version__
 from appliance.cli import bundle_commands, parser
 from appliance.cli.main import RUNS
 from appliance.core import config, errors, sentences
-from appliance.core.schema import Key
 from appliance.core.types import Status, Verdict
 from appliance.deployment import state
 from appliance.io import robot_link
@@ -26,21 +26,35 @@ from appliance.service import status, systemd
 from tests.factories.paths import ROOT
 
 DOCS = ROOT / "docs"
-MANUAL = (DOCS / "manual.md").read_text()
-CHANGES = (ROOT / "CHANGELOG.md").read_text()
-SECTIONS = {
-    title: text for title, text in re.findall(r"(?ms)^## \d+\. (.+?)$(.*?)(?=^## |\Z)", MANUAL)
+FOLDERS = ("tutorials", "how-to", "reference", "explanation")
+PAGES = {
+    path.relative_to(DOCS).as_posix(): path.read_text("utf-8")
+    for folder in FOLDERS
+    for path in sorted((DOCS / folder).glob("*.md"))
 }
+"""The written pages, by their paths below docs/."""
+MANUAL = "\n".join(PAGES.values())
+CHANGES = (ROOT / "CHANGELOG.md").read_text()
 BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
 """The lines of all code blocks."""
 PARSER = parser.parser(RUNS)
 PICTURES = sorted(DOCS.glob("manual/*.svg"))
 
 
-def rows(section: str, column: str) -> Iterator[list[str]]:
-    """The cells of each row of the tables of a section whose first column is headed so."""
+@pytest.fixture(scope="module")
+def manual() -> Iterator[ModuleType]:
+    """systemd/manual.py, whose folder is not a package."""
+    sys.path.insert(0, str(ROOT / "systemd"))
+    import manual
+
+    yield manual
+    sys.path.remove(str(ROOT / "systemd"))
+
+
+def rows(page: str, column: str) -> Iterator[list[str]]:
+    """The cells of each row of the tables of a page whose first column is headed so."""
     inside = False
-    for line in SECTIONS[section].splitlines():
+    for line in PAGES[page].splitlines():
         cells = (
             [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
         )
@@ -49,22 +63,21 @@ def rows(section: str, column: str) -> Iterator[list[str]]:
         inside = bool(cells) and (inside or cells[0] == column)
 
 
-def named(section: str, column: str) -> list[str]:
-    """What stands in backticks at the beginning of each row."""
-    return [re.match(r"`?([^`]*)`?", cells[0])[1] for cells in rows(section, column)]
+def named(page: str, column: str) -> list[str]:
+    """The text in backticks at the beginning of each row."""
+    return [re.match(r"`?([^`]*)`?", cells[0])[1] for cells in rows(page, column)]
 
 
 def spoken() -> list[list[str]]:
-    """The arguments of each `palpate` command of the manual's code blocks; what it prints has wide
+    """The arguments of each `palpate` command of the pages' code blocks; printed tables have wide
     gaps."""
     found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in BLOCKS)
     return [shlex.split(m[1]) for m in found if m and "   " not in m[1]]
 
 
 def test_every_status_is_explained():
-    """Section 6 has the statuses of sweep.Status, in their order, and the skin's states, each with
-    what to do."""
-    title = "Statuses, and what to do about each"
+    """All statuses of sweep.Status, in their order, and the skin's states, each with advice."""
+    title = "reference/statuses.md"
     assert named(title, "status") == [*Status]
     kinds = [
         k
@@ -79,11 +92,11 @@ def test_every_status_is_explained():
 
 def test_every_serial_command_is_named():
     """The commands of the serial line, in the order of sink.COMMANDS."""
-    assert named("Sentences and commands", "command") == [*robot_link.COMMANDS]
+    assert named("reference/sentences.md", "command") == [*robot_link.COMMANDS]
 
 
 def test_sentences_are_as_the_box_forms_and_reads_them():
-    """Each sentence of the manual has its checksum; RES, STA, ANS and REC are there; commands are
+    """Each sentence of the pages has its checksum; RES, STA, ANS and REC are there; commands are
     understood."""
     found = re.findall(r"\$PPLP,([A-Z]+)([^*`\n]*)\*([0-9A-F]{2})", MANUAL)
     kinds = set()
@@ -96,11 +109,15 @@ def test_sentences_are_as_the_box_forms_and_reads_them():
     assert kinds >= {"RES", "STA", "ANS", "REC"}
 
 
-def test_every_command_is_named_and_there():
-    """Section 10 lists the parser's commands; a command of the text is one of them."""
+def test_every_command_has_its_section(manual: ModuleType):
+    """The reference holds each command of the parser with its help; a command in a text exists."""
     assert PARSER.parse_args(["bench"]).run is RUNS["bench"]
-    listed = [name.removeprefix("palpate ") for name in named("Commands and exit codes", "command")]
-    assert sorted(listed) == sorted(RUNS)
+    text = manual.references()["commands"]
+    assert re.findall(r"(?m)^## palpate (.*)$", text) == [
+        name.removeprefix("palpate ") for name, _, _ in manual.leaves(PARSER)
+    ]
+    assert set(re.findall(r"(?m)^## palpate (.*)$", text)) == set(RUNS)
+    assert "| `--web PORT` |" in text
     assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {name.split()[0] for name in RUNS}
 
 
@@ -116,19 +133,21 @@ def test_commands_to_be_copied_are_many():
 
 
 def test_training_commands_are_there():
-    """What the manual calls of palpate-train: commands and options stand in its parsers."""
+    """Commands and options of palpate-train in the pages stand in its parsers."""
     code = "\n".join(path.read_text() for path in sorted(ROOT.glob("train/**/*.py")))
     commands = set(re.findall(r'\badd(?:_parser)?\(\s*"([a-z]+)"', code))
     lines = [*BLOCKS, *re.findall(r"`([^`]+)`", MANUAL.replace("\n", " "))]
-    called = [line.split()[1:] for line in lines if line.startswith("palpate-train ")]
+    called = [line.split("#")[0].split()[1:] for line in lines if line.startswith("palpate-train ")]
     assert len(called) >= 6
     for first, *more in called:
+        if first == "COMMAND":
+            continue
         assert {first, *more[: first == "sets"]} <= commands, first
         assert all(f'"{word}"' in code for word in more if word.startswith("--")), more
 
 
 def test_make_targets_are_there():
-    """Each `make TARGET NAME=...` of the manual is a target that uses this variable; install and
+    """Each `make TARGET NAME=...` of the pages is a target that uses this variable; install and
     deploy are among them."""
     text = (ROOT / "Makefile").read_text()
     targets = set(re.findall(r"(?m)^([a-z-]+):", text))
@@ -139,26 +158,17 @@ def test_make_targets_are_there():
         assert all(f"$({name})" in text for name in re.findall(r"([A-Z]+)=", given)), given
 
 
-def allowed(key: Key) -> str:
-    """What a setting may be, as the table has it."""
-    if "line" in key.limits:
-        return "lines" if get_origin(key.hint) is tuple else "line"
-    if get_args(key.hint):
-        return ", ".join(json.dumps(one) for one in get_args(key.hint))
-    if key.hint in (str, bool):
-        return {str: "text", bool: "true, false"}[key.hint]
-    step = f", step {key.limits['step']}" if "step" in key.limits else ""
-    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}{step}"
-
-
-def test_settings_are_those_of_the_code():
-    """Key, default and what is allowed, in the code's order; each with a word on what it is."""
-    shown = {cells[0].strip("`"): cells[1:] for cells in rows("Settings", "key")}
+def test_settings_have_default_limits_and_meaning(manual: ModuleType):
+    """Every key of the code, in its order. The docstring of its section gives each a meaning."""
+    lines = manual.settings_tables().splitlines()
+    shown = {
+        cells[1].strip(" `"): [cell.strip() for cell in cells[2:-1]]
+        for cells in (re.split(r"(?<!\\)\|", line) for line in lines if line.startswith("| `"))
+    }
     assert [*shown] == ["board", *config._KEYS]
-    assert all(about for *_, about in shown.values())
-    for name, key in config._KEYS.items():
-        default = f"0x{key.default:04x}" if "hex" in key.limits else json.dumps(key.default)
-        assert shown[name][:2] == [default, allowed(key)], name
+    assert [name for name, (*_, meaning) in shown.items() if not meaning] == []
+    assert shown["classifier.min_probability"][:2] == ["0.0", "0 to 1"]
+    assert shown["classifier.fuse"][:2] == ['"product"', '"product", "vote", "none"']
 
 
 def test_settings_of_the_text_exist():
@@ -171,7 +181,7 @@ def test_settings_of_the_text_exist():
 
 def test_exit_codes_are_those_of_the_code():
     """The codes of `palpate --help`, of the errors, and what the unit does about them."""
-    shown = {int(cells[0]): cells for cells in rows("Commands and exit codes", "exit code")}
+    shown = {int(cells[0]): cells for cells in rows("reference/exit-codes.md", "exit code")}
     assert [*shown] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
     codes = {k.exit_code for k in vars(errors).values() if isinstance(k, type)}
     assert codes <= shown.keys()
@@ -196,7 +206,7 @@ def test_wiring_is_that_of_the_board_files(board: str):
         },
         **{f"class bit {i}": name for i, name in enumerate(settings.output.class_bits)},
     }
-    shown = {cells[0]: cells[1:] for cells in rows("Wiring", "line")}
+    shown = {cells[0]: cells[1:] for cells in rows("reference/pins.md", "signal")}
     assert shown.keys() - lines.keys() == {"serial TXD", "serial RXD"}
     for role, (_, name, pin, _) in shown.items():
         assert name == lines.get(role, name)
@@ -213,29 +223,26 @@ def test_wiring_is_that_of_the_board_files(board: str):
     assert "".join(f"\n    {line}" for line in boot) + "\n\n" in MANUAL
 
 
-def test_links_and_pictures_are_there():
-    """Each link leads to a file or a place of this page; each picture of docs/manual is shown, with
-    a word for the blind."""
-    for name, text in (("docs/manual.md", MANUAL), ("CHANGELOG.md", CHANGES)):
-        for target in re.findall(r"\]\(([^)#]+)\)", text):
-            assert not target.startswith("http"), target
-            assert ((ROOT / name).parent / target).is_file(), target
-    shown = dict(re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", MANUAL))
+def test_pictures_are_shown():
+    """Each picture of docs/manual is shown, with a text for those who cannot see it. Links are
+    checked with the site (test_site.py)."""
+    shown = dict(re.findall(r"!\[([^\]]+)\]\(\.\./([^)]+)\)", MANUAL))
     assert {Path(target) for target in shown.values()} >= {p.relative_to(DOCS) for p in PICTURES}
 
 
-def test_pictures_go_to_the_box():
-    """What `make install` copies holds the manual and each of its pictures."""
-    copied = re.findall(
-        r'"(docs/[^"]+)": "/usr/share/doc/palpate/([^"]+)"',
-        (ROOT / "systemd/install.py").read_text(),
-    )
-    assert ("docs/manual.md", "manual.md") in copied
-    for target in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", MANUAL):
-        assert any(
-            f"docs/{target}".startswith(source) and target.startswith(place)
-            for source, place in copied
-        ), target
+def test_the_box_gets_the_manual(manual: ModuleType):
+    """As one text: its contents name every page, markers are filled, links and pictures are gone,
+    drawings have stayed."""
+    text = manual.box_manual()
+    titles = re.findall(r"(?m)^## \d+\. (.*)$", text)
+    assert re.findall(r"(?m)^\d+\. (.*)$", text.partition("\n## ")[0]) == titles
+    assert len(titles) == len(manual.BOX_PAGES)
+    assert "<!--" not in text
+    assert "](" not in text
+    assert "| `classifier.fuse` |" in text
+    assert len(re.findall(r"[_~]{4}", text)) >= 30
+    copied = (ROOT / "systemd" / "install.py").read_text()
+    assert '"build/manual.md": "/usr/share/doc/palpate/manual.md"' in copied
 
 
 @pytest.mark.parametrize("path", PICTURES, ids=lambda p: p.name)
@@ -253,45 +260,25 @@ def test_pictures_stand_alone(path: Path):
         assert all(m == "#" for value in values for m in re.findall(r"url\(['\"]?(.)", value))
 
 
-def test_any_terminal_shows_it():
-    """ASCII alone; drawings fit into 80 columns; the sections are those that its first page
-    lists."""
-    assert MANUAL.isascii()
+def test_any_terminal_shows_it(manual: ModuleType):
+    """ASCII alone; drawings fit into 80 columns."""
+    text = manual.box_manual()
+    assert text.isascii()
     assert CHANGES.isascii()
-    drawn = re.findall(r"(?m)^.*[_~]{4}.*$|^.*={4}.*$", MANUAL)
+    drawn = re.findall(r"(?m)^.*[_~]{4}.*$|^.*={4}.*$", text)
     assert len(drawn) >= 30
     assert max(map(len, drawn)) <= 80
-    listed = re.findall(r"(?m)^\d+\. \[(.+)\]", MANUAL.partition("\n## ")[0])
-    assert listed == [*SECTIONS]
-
-
-def place(title: str) -> str:
-    """The place in a page that GitHub gives a heading: lower case, without punctuation, a hyphen
-    for each space."""
-    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
-
-
-def test_the_contents_lead_to_their_sections():
-    """Each line of the contents, and each link to a place of the manual in another document, names
-    a heading that is there."""
-    places = {place(title) for title in re.findall(r"(?m)^#+ (.+)$", MANUAL)}
-    linked = re.findall(r"\]\(#([^)]+)\)", MANUAL)
-    assert len(linked) >= len(SECTIONS)
-    for page in (ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("*/*.md")):
-        linked += re.findall(r"\]\([^)#]*manual\.md#([^)]+)\)", page.read_text())
-    assert [name for name in linked if name not in places] == []
 
 
 def test_each_drawing_is_seen_once():
-    """Where the manual is rendered it shows the pictures, and the same as text only where it is
-    read as text: in comments, which end where they should."""
+    """Rendered pages show the pictures; the drawings made of text are in comments, for the box."""
     comments = re.findall(r"(?s)<!-- as text:\n\n(.*?)-->", MANUAL)
     rendered = re.sub(r"(?s)<!--.*?-->", "", MANUAL)
     assert len(comments) == len(PICTURES)
     for text in comments:
         assert all(line.startswith("    ") or not line for line in text.splitlines())
     assert not re.findall(r"(?m)^    .*[_~]{4}.*$", rendered)
-    assert "-->" not in rendered.replace(SECTIONS["What it is"], ""), (
+    assert "-->" not in rendered.replace(PAGES["explanation/what-it-is.md"], ""), (
         "a comment ended inside its drawing"
     )
 
@@ -375,7 +362,7 @@ def test_samples_are_what_the_box_prints():
 def test_the_trial_is_described_as_it_is():
     """Starts, sweeps and seconds are those of the program and of the default settings."""
     settings = config.StoreConfig()
-    text = SECTIONS["Record, train, sign, deliver"]
+    text = PAGES["how-to/deliver.md"]
     assert f"`store.trial_sweeps` ({settings.trial_sweeps})" in text.replace("\n", " ")
     assert f"`store.trial_s` ({settings.trial_s:.0f} s)" in text.replace("\n", " ")
     assert f" {state.MOST_STARTS} starts " in text.replace("\n", " ")
