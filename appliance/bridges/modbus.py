@@ -33,6 +33,8 @@ STATUS_CODES: Mapping[Status, int] = {status: code for code, status in enumerate
 STALE = 99
 """In place of a status while the box is not heard."""
 COILS = ("START", "STOP", "NEW", "TARE", "ABORT")
+ORDER = ("ABORT", "NEW", "TARE", "START", "STOP")
+"""Order in which the commands of one write are sent."""
 INPUTS = ("alive", "ready", "sweeping", "fault", "known", "early")
 LABEL_WORDS = 16
 IDLE_S = 60.0
@@ -186,17 +188,26 @@ class ModbusBridge:
         end = wanted.address + len(wanted.values)
         if end > len(coils):
             raise RequestRefused(ExceptionCode.ADDRESS)
-        for at, value in zip(range(wanted.address, end), wanted.values, strict=True):
-            rises, coils[at] = value and not coils[at], value
-            if rises:
-                await self._command(COILS[at])
-
-    async def _command(self, name: str) -> None:
+        addresses = range(wanted.address, end)
+        rising = {
+            COILS[at]: at
+            for at, value in zip(addresses, wanted.values, strict=True)
+            if value and not coils[at]
+        }
+        for at, value in zip(addresses, wanted.values, strict=True):
+            coils[at] = coils[at] and value
+        if not rising:
+            return
         if self._commanding.locked():
             raise RequestRefused(ExceptionCode.BUSY)
-        async with self._commanding:
-            try:
-                await asyncio.to_thread(self._source.send, name)
-            except ApplianceError as e:
-                log.warning(f"modbus: {name}: {e}")
-                raise RequestRefused(ExceptionCode.DEVICE) from e
+        async with self._commanding:  # no other peer's command comes between those of one write
+            for name in sorted(rising, key=ORDER.index):
+                await self._command(name)
+                coils[rising[name]] = True  # only now: a refused command is sent again
+
+    async def _command(self, name: str) -> None:
+        try:
+            await asyncio.to_thread(self._source.send, name)
+        except ApplianceError as e:
+            log.warning(f"modbus: {name}: {e}")
+            raise RequestRefused(ExceptionCode.DEVICE) from e
