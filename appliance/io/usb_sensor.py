@@ -35,9 +35,9 @@ STAMPS_NS = 5_000_000
 interrupt. Windows do not move by that."""
 
 PROOF_NS = 5_000_000_000
-"""A skin that announces nothing and turned out to be another one within this time after it was
-opened has to send for as long without a fault before it counts as streaming again: READY does not
-come and go with a wrong skin."""
+"""Time in which a skin that announces nothing can turn out to be the wrong one. If it does, the
+next attempt has to run this long without a fault before the skin counts as streaming: READY does
+not come and go with a wrong skin."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
@@ -100,15 +100,20 @@ class Sensor(Protocol):
         ...
 
 
+OPENED = "opened"
+"""Passed to observers when a skin was opened: a new enumeration begins. It is not a state: the
+skin keeps its former state until its first frame arrives."""
+
+
 class TransferObserver(Protocol):
-    """Observes what the sensor receives, for captures."""
+    """Observes the bytes that the sensor receives, for captures."""
 
     def transfer(self, t_ns: int, data: bytes) -> None:
         """A bulk transfer has ended."""
         ...
 
     def state(self, t_ns: int, state: str) -> None:
-        """The sensor's state has changed; `streaming` means a new enumeration."""
+        """The sensor's state has changed, or the skin was opened (OPENED)."""
         ...
 
 
@@ -248,9 +253,10 @@ class Stream:
 class LinkSensor(ABC):
     """A skin behind a link: what all skins have in common.
 
-    States: `streaming`, or `absent`, `busy`, `denied`, `mismatch`, `lost`, `silent`, where
-    `trouble` says what to do. A skin that is plugged in again is a new enumeration: its frames get
-    a new epoch in `seq` and a new clock. announced: the skin says what it sends when it is opened.
+    States: `streaming`, from the first frame on; or `absent`, `busy`, `denied`, `mismatch`, `lost`,
+    `silent`, where `trouble` says what to do. A skin that is plugged in again is a new enumeration:
+    its frames get a new epoch in `seq` and a new clock. announced: the skin says what it sends
+    when it is opened.
     """
 
     announced = True
@@ -274,9 +280,7 @@ class LinkSensor(ABC):
         self._quiet_ns = 0  # time spent reading since the last frame
         self._unheard = 0  # bytes since then
         self._opened_ns = 0
-        self._proof_ns: int | None = (
-            None  # how long it has to send before it counts as streaming; None: not at all
-        )
+        self._proof_ns = 0  # how long it has to send before it counts as streaming
 
     @property
     def clock(self) -> dict[str, float] | None:
@@ -299,15 +303,22 @@ class LinkSensor(ABC):
         # all the time
         self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
         frames, before = Frames.empty(self._format), self.counters.frames
+        wrong: SensorMismatch | None = None
         if data:
-            if self._tap:
-                self._tap.transfer(now, data)
             self._unheard += len(data)
-            frames = self._frames(data, now)
-        if self.counters.frames > before:
+            try:
+                frames = self._stream.feed(data, now)
+            except SensorMismatch as e:
+                wrong = e
+        if self.counters.frames > before and not wrong:
             self._quiet_ns = self._unheard = 0
-            if self.state != "streaming" and now - self._opened_ns >= (self._proof_ns or 0):
+            if self.state != "streaming" and now - self._opened_ns >= self._proof_ns:
                 self._set_state("streaming", None)
+        if data and self._tap:  # after the state in which its frames are used
+            self._tap.transfer(now, data)
+        if wrong:
+            early = now - self._opened_ns < PROOF_NS
+            self._drop(wrong, PROOF_NS if early and not self.announced else 0)
         self._check_silence()
         return frames if self.state == "streaming" else Frames.empty(self._format)
 
@@ -343,8 +354,8 @@ class LinkSensor(ABC):
         self._stream.restart()
         self._quiet_ns = self._unheard = 0
         self._opened_ns = self._clock.now_ns()
-        if self.announced or self._proof_ns is None:
-            self._set_state("streaming", None)
+        if self._tap:
+            self._tap.state(self._opened_ns, OPENED)
         return True
 
     def _transfer(self) -> bytes:
@@ -358,25 +369,16 @@ class LinkSensor(ABC):
             self._drop(e)
         return b""
 
-    def _frames(self, data: bytes, now_ns: int) -> Frames:
-        try:
-            return self._stream.feed(data, now_ns)
-        except SensorMismatch as e:
-            at_once = now_ns - self._opened_ns < PROOF_NS
-            self._drop(e, PROOF_NS if at_once else 0)
-            return Frames.empty(self._format)
-
     def _check_silence(self) -> None:
         """Restart a skin that is connected but has sent no complete frame in `silence_ms` of
         reading."""
         quiet_ms = self._quiet_ns // 1_000_000
         if self._link and quiet_ms > self._config.silence_ms:
-            self._drop(self._mute(quiet_ms, self._unheard), 0)
+            self._drop(self._mute(quiet_ms, self._unheard))
 
-    def _drop(self, why: SensorError, proof_ns: int | None = None) -> None:
+    def _drop(self, why: SensorError, proof_ns: int = 0) -> None:
         """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it
-        has to send before it counts as streaming again, 0 for a frame; None: nothing speaks against
-        it once it is opened."""
+        then has to send before it counts as streaming; 0: one frame is enough."""
         self.close()
         self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000

@@ -26,7 +26,7 @@ from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
 from appliance.io.skin_profile import PALPATE, SkinProfile
 from appliance.io.trigger import EdgeCounters
-from appliance.io.usb_sensor import SensorCounters
+from appliance.io.usb_sensor import OPENED, SensorCounters
 
 MAGIC = b"PPLPCAP1"
 MOST_KEPT = 99
@@ -152,6 +152,7 @@ class Playback:
                 f"{path}: the capture's head cannot be read: {e}; capture again"
             ) from e
         self.state = "absent"
+        self._opened = False  # the last STATE record was OPENED
         self.trouble: SensorError | None = None
         self.identity: Identity | None = None
         self.counters = SensorCounters()
@@ -201,10 +202,17 @@ class Playback:
                 with suppress(SensorMismatch):  # the state that followed is the next record
                     frames = self._stream.feed(data, self._now_ns)
             elif kind == RecordKind.STATE:
-                self.state = data.decode()
-                if self.state == "streaming":
-                    self._stream.restart()
+                self._enter(data.decode())
         return frames
+
+    def _enter(self, state: str) -> None:
+        """Play a STATE record. In captures of version 0.1, `streaming` was written when the skin
+        was opened; since then, OPENED is."""
+        if state == OPENED or (state == "streaming" and not self._opened):
+            self._stream.restart()
+        self._opened = state == OPENED
+        if state != OPENED:
+            self.state = state
 
     def edges(self, now_ns: int) -> list[Edge]:
         """Trigger: the edges that the box was given at this time."""

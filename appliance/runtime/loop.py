@@ -261,7 +261,7 @@ class Box:
             time_ns=self._clock.now_ns(),
             skin=sensor.state,
             trouble=str(sensor.trouble or ""),
-            streams=sensor.state == "streaming" and counters.frames > 0,
+            streams=sensor.state == "streaming",
             sweeping=self._cutter.sweeping,
             answered=self.answered,
             frames=counters.frames,

@@ -258,12 +258,14 @@ class WiredSkin:
         self.troubles: list[str] = []
 
     def seconds(self, seconds: float) -> Frames:
-        """All frames of this time."""
+        """All frames of this time. `states` gets the new states, from the first frame or trouble
+        on."""
         end_ns, parts = self.clock.now_ns() + round(seconds * SECOND), [self.sensor.read()]
         while self.clock.now_ns() < end_ns:
             before = self.clock.now_ns()
             parts.append(self.sensor.read())
-            if self.sensor.state not in self.states[-1:]:
+            opening = self.sensor.state == "absent" and not self.sensor.trouble
+            if not opening and self.sensor.state not in self.states[-1:]:
                 self.states.append(self.sensor.state)
                 self.troubles.append(str(self.sensor.trouble or ""))
             if self.clock.now_ns() == before:  # a turn takes some time

@@ -34,12 +34,13 @@ def sensor_on(simulated: SimDevices, **settings) -> UsbSensor:
 
 
 def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[Frames, set[str]]:
-    """All frames of some seconds, and the states that were seen."""
+    """All frames of some seconds, and the states from the first frame or trouble on."""
     end_ns = simulated.clock.now_ns() + round(seconds * SECOND)
     parts, states = [], set()
     while simulated.clock.now_ns() < end_ns:
         parts.append(sensor.read())
-        states.add(sensor.state)
+        if sensor.counters.frames or sensor.trouble:
+            states.add(sensor.state)
     return Frames.joined(parts), states
 
 

@@ -194,6 +194,27 @@ def test_zero_length_packets():
     assert "silent" in states
 
 
+@pytest.mark.parametrize("acm", [False, True])
+def test_a_board_that_answers_and_sends_no_frame(acm: bool):
+    """Identity and format are right, and no frame comes: silent, never streaming, until the first
+    frame."""
+    simulated = idle_devices(acm=acm)
+    sensor = sensor_on(simulated)
+    board = simulated.backend.board
+    take, board.take = board.take, lambda: (take(), b"")[1]
+    end_ns = simulated.clock.now_ns() + 5_000_000_000
+    states = set()
+    while simulated.clock.now_ns() < end_ns:
+        sensor.read()
+        states.add(sensor.state)
+    assert states == {"absent", "silent"}
+    assert sensor.identity
+    assert sensor.counters.enumerations > 3
+    board.take = take
+    assert len(read_for(sensor, simulated, 1))
+    assert sensor.state == "streaming"
+
+
 def test_overflow_loses_one_transfer():
     """A transfer larger than asked for is lost, counted, and seen in the numbers; streaming goes
     on."""

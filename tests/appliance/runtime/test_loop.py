@@ -28,6 +28,9 @@ from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
 RATE = round(skin.FORMAT.rate_hz)
 
 
+LINES = devices.READY, devices.FAULT
+
+
 def answers(box: Rigged) -> list[Answer]:
     """The RES sentences that the robot has read."""
     return [a for a in map(Answer.read, box.heard) if a]
@@ -150,6 +153,23 @@ def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
     )
     fault_line = [level for _, name, level in simulated.gpio.written if name == devices.FAULT]
     assert fault_line == [True, False]
+
+
+def test_a_board_that_sends_no_frame_is_never_ready(rigged: Callable[..., Rigged]):
+    """The board answers and sends nothing: READY stays low and FAULT high, a trigger is
+    `not-ready`, and READY rises with the first frame."""
+    simulated = quiet()
+    board = simulated.backend.board
+    take, board.take = board.take, lambda: (take(), b"")[1]
+    box = rigged(simulated)
+    box.pulse(devices.START, 2)
+    assert [v.status for v in box.seconds(5)] == [Status.NOT_READY]
+    levels = {name: [v for _, n, v in simulated.gpio.written if n == name] for name in LINES}
+    assert levels == {devices.READY: [], devices.FAULT: [True]}
+    board.take = take
+    box.seconds(1)
+    levels = {name: [v for _, n, v in simulated.gpio.written if n == name] for name in LINES}
+    assert levels == {devices.READY: [True], devices.FAULT: [True, False]}
 
 
 def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):

@@ -215,13 +215,14 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
 
 
 def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[..., Rigged]):
-    """It counts as streaming until it is found silent, but nothing of it has ever come."""
+    """The board answers and no frame comes: it is absent until it is found silent, never
+    streaming."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.mangle = lambda data: b""
     rigged(simulated, observers=[turn_log]).seconds(3)
     received = {status.split(" for ")[0] for _, status in turn_log.notes}
     assert received == {
-        "skin streaming. Sweeps answered: 0",
+        "skin absent. Sweeps answered: 0",
         "skin silent: the skin is there but sent no frame",
     }
     assert not any(ready for ready, _ in turn_log.notes)
