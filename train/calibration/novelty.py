@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import Classes
 from appliance.core.errors import FormatError
 from appliance.inference.novelty import shaped_distances
-from train.calibration import discriminant
+from train.calibration.heads import shrinkage
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
@@ -214,7 +214,7 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
         spread = own.std(axis=0)
         spread[spread <= 10 * np.finfo(float).eps * np.abs(own).max(axis=0)] = 1
         z = (own - own.mean(axis=0)) / spread
-        share, mean = discriminant.shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
+        share, mean = shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
         diagonal += len(own) / len(x) * share * mean * spread**2
         rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
     root = np.sqrt(np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT)))

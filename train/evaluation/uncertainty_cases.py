@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.displacement import AugmentedCopies
+from train.calibration.heads import HeadPlan
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
 from train.evaluation.evaluate import Where
@@ -30,7 +31,6 @@ from train.models import methods
 from train.models.methods import Effort
 from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
 from train.models.recipe.fitted import Fit, calibration_inputs
-from train.models.recipe.heads import HeadPlan
 from train.onnx_tools.graph_builder import run as run_graph
 
 Array = NDArray[Any]

@@ -7,19 +7,20 @@ take the sensor's raw counts, or features; all scaling is inside.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from appliance.core.types import SweepFormat
 from appliance.inference.session import session
 
+Array = NDArray[Any]
 TENSOR = {
     "uint8": TensorProto.UINT8,
     "int16": TensorProto.INT16,
@@ -29,6 +30,12 @@ TENSOR = {
 OPSET, IR = 17, 8
 MULTIPLYING = ("Conv", "Gemm", "MatMul")
 """Operators whose outputs people look at."""
+FLOAT = TensorProto.FLOAT
+MAX_TAP = 64
+"""Largest integer tap, seven bits: two products of eight bits overflow the 16-bit sums of an x86
+without VNNI, and the answer there would differ from that on Arm."""
+MIDDLE = 128
+"""The byte that stands for 0 where bytes have a sign."""
 
 
 class GraphBuilder:
@@ -92,7 +99,123 @@ def centred(g: GraphBuilder, format: SweepFormat) -> tuple[str, str]:
     ), sums
 
 
-def with_head(trunk: onnx.ModelProto, weight: NDArray[Any], bias: NDArray[Any]) -> onnx.ModelProto:
+def quantized(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
+    """`x` as bytes, in units of `step`."""
+    return g("QuantizeLinear", x, g.constant(step), g.constant(zero, "uint8"))
+
+
+def counts_of(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
+    """The values that bytes stand for, in units of `step`."""
+    return g("DequantizeLinear", x, g.constant(step), g.constant(zero, "uint8"))
+
+
+def channels_first(g: GraphBuilder, x: str, step: float, zero: int) -> str:
+    """Bytes [n, T, R * C] -> the values they stand for [n, R * C, T]."""
+    return counts_of(g, g("Transpose", x, perm=[0, 2, 1]), step, zero)
+
+
+def int8_weights(
+    g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool
+) -> tuple[str, str]:
+    """Weight [filters, inputs, kernel] in seven bits, a step for each filter; bias in 32 bits, in
+    the product of both steps."""
+    least = np.abs(bias) / (step * 2**30)  # a silent filter's bias must fit as well
+    steps = np.maximum(np.maximum(np.abs(weight).max(axis=(1, 2)) / MAX_TAP, least), 1e-12).astype(
+        np.float32
+    )
+    taps = (zero_sum_taps if zero_sum else np.rint)(
+        weight / steps[:, None, None].astype(np.float64)
+    )
+    zeros = np.zeros(len(weight))
+    product = steps.astype(np.float64) * step
+    return (
+        g(
+            "DequantizeLinear",
+            g.constant(taps, "int8"),
+            g.constant(steps),
+            g.constant(zeros, "int8"),
+            axis=0,
+        ),
+        g(
+            "DequantizeLinear",
+            g.constant(np.rint(bias / product), "int32"),
+            g.constant(product),
+            g.constant(zeros, "int32"),
+            axis=0,
+        ),
+    )
+
+
+def zero_sum_taps(taps: Array) -> Array:
+    """Taps [filters, taxels, kernel] rounded so that each kernel sums to zero, as it did before
+    rounding.
+
+    The sum after rounding is the surplus. As many taps, those nearest to being rounded the other
+    way, are rounded that way instead. None leaves the range: a tap at its end is whole and was not
+    rounded, and there are enough others.
+    """
+    taps = taps - taps.mean(axis=2, keepdims=True)
+    rounded = np.rint(taps)
+    surplus = rounded.sum(axis=2, keepdims=True)
+    moved = (rounded - taps) * np.sign(surplus)  # how far each was moved towards the surplus
+    rank = np.argsort(np.argsort(-moved, axis=2, kind="stable"), axis=2, kind="stable")
+    zero_sum: Array = rounded - np.sign(surplus) * (rank < np.abs(surplus))
+    return zero_sum
+
+
+def sums(
+    g: GraphBuilder,
+    x: str,
+    steps: int,
+    counts: ArrayLike,
+    integers: bool = False,
+    rowwise: bool = False,
+    time_last: bool = False,
+) -> str:
+    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, number of
+    counts, C].
+
+    rowwise: [m, steps, C], `counts` of m rows -> [m, counts in a row, C]. time_last: of [..., C,
+    steps]. The matrix of ones and zeros is computed from a few numbers when the box loads the
+    graph; as a constant it would be large.
+    """
+    at = g(
+        "Reshape",
+        g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))),
+        g.constant([1, steps], "int64"),
+    )
+    counts = np.asarray(counts)
+    known = g(
+        "Less",
+        at,
+        g.constant(counts.reshape((len(counts), -1, 1) if rowwise else (-1, 1)), "int32"),
+    )
+    ones = g("Cast", known, to=TensorProto.UINT8 if integers else FLOAT)
+    product = "MatMulInteger" if integers else "MatMul"
+    if not time_last:
+        return g(product, ones, x)
+    ones = g("Transpose", ones, perm=[0, 2, 1] if rowwise else [1, 0])
+    return g("Transpose", g(product, x, ones), perm=[0, 2, 1])
+
+
+def mean_factors(
+    g: GraphBuilder, step: float, counts: list[int], size: int, rowwise: bool = False
+) -> str:
+    """What makes means of sums over `counts`, in the shape that `_sums` gives."""
+    factors = np.array(
+        [step / max(n, 1) for n in counts]
+    )  # where nothing is known the sum is 0 as well
+    lead = (len(counts), 1) if rowwise else (1, len(counts))
+    factors = factors.reshape(*lead, 1) if len(counts) > 1 else factors[0]
+    return g("Expand", g.constant(factors), g.constant([*lead, size], "int64"))
+
+
+def side_by_side(g: GraphBuilder, parts: Sequence[str]) -> str:
+    """Values [n, m, C], their C one after another."""
+    return g("Concat", *parts, axis=2) if len(parts) > 1 else parts[0]
+
+
+def with_head(trunk: onnx.ModelProto, weight: Array, bias: Array) -> onnx.ModelProto:
     """A trunk (float or int8) and a linear head, weight [K, F] and bias [K]: `sweep` -> `logits`
     float32 [1, K]."""
     model = onnx.ModelProto()
@@ -216,7 +339,7 @@ class GraphModel:
 
     model: onnx.ModelProto
 
-    def logits(self, inputs: NDArray[Any]) -> NDArray[Any]:
+    def logits(self, inputs: Array) -> Array:
         """Raw counts or features of n sweeps -> float32 [n, K]."""
         return run(self.model, inputs)
 
@@ -225,7 +348,7 @@ class GraphModel:
         return self.model
 
 
-def run(model: onnx.ModelProto, inputs: NDArray[Any]) -> NDArray[Any]:
+def run(model: onnx.ModelProto, inputs: Array) -> Array:
     """What `model` gives for each of `inputs` (raw counts or features), float32 [n, size], in the
     box's kind of session."""
     on_the_box, name = session(model.SerializeToString()), model.graph.input[0].name

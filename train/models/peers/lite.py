@@ -24,7 +24,7 @@ from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.networks import Network, layer_constants
 from train.models.peers.ds_cnn import INT8_NODES, RECIPE
-from train.models.scale import texture_scale
+from train.models.recipe.augment import texture_scale
 from train.models.training import network_method, scale_steps
 from train.onnx_tools.graph_builder import GraphBuilder, centred
 

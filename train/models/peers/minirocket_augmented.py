@@ -18,8 +18,7 @@ from train.models.linear_head import LinearHeadModel
 from train.models.methods import Method
 from train.models.peers import minirocket
 from train.models.recipe.architectures import DEFAULT
-from train.models.recipe.augment import SLOW, Augmentation, default_augmentation
-from train.models.recipe.copies import copies
+from train.models.recipe.augment import SLOW, Augmentation, copies, default_augmentation
 
 Array = NDArray[Any]
 COPIES = 2

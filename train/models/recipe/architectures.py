@@ -12,6 +12,9 @@ from dataclasses import dataclass, replace
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 
+PREFIXES = 10
+"""Number of prefixes of a window, after each of which the box may answer early: the first tenth,
+the first two tenths, and so on to the whole window."""
 FLOOR = 0.02
 """Added to a mean response before its logarithm, so that a silent channel stays finite."""
 MIN_LAST_STEPS = 24
@@ -38,6 +41,18 @@ class Stage:
     steps: int
     reach: int
     hop: int
+
+    def known_steps(self, window: int, prefixes: bool) -> list[int]:
+        """Number of responses that are known by the end of each prefix, or of the window."""
+        if not prefixes:
+            return [self.steps]
+        ends = [window * (d + 1) // PREFIXES for d in range(PREFIXES)]
+        return [max((end - self.reach) // self.hop + 1, 0) for end in ends]
+
+
+def each_frame(window: int) -> Stage:
+    """The frames themselves, as if they were responses."""
+    return Stage(1, 1, window, 1, 1)
 
 
 @dataclass(frozen=True)

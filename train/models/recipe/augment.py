@@ -1,21 +1,26 @@
-"""Augmentation. In: prepared sweeps and an Augmentation, which says what varies. Out: the same
-sweeps, changed.
+"""Augmentation: the sweeps that a skin might have given if it had been attached anew, slid at
+another speed, or read by a worse amplifier.
 
-Each sweep becomes one that the skin might have given when attached anew, slid at another speed or
-read by a worse amplifier. Everything is drawn anew for every sweep, from one generator; a parameter
-at 0 draws and changes nothing. Neither PyTorch nor double precision is needed.
+`augment` changes prepared sweeps in the training of a network. `copies` gives raw counts, from
+which heads in closed form learn how materials vary. Every change is drawn anew for every sweep from
+one generator; a parameter of 0 draws and changes nothing. Neither needs PyTorch or double
+precision.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import pi
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import fft
+
+from train.data.sets import Dataset
 
 Array = NDArray[np.float32]
 OCTAVES = 5.0
@@ -27,6 +32,11 @@ HUMMING = 0.25
 """Share of the sweeps with hum, where there is any."""
 PIECES = 1 << 16
 """Positions in the batch's one draw of noise at which a taxel's noise may start."""
+
+COPIES = 2
+"""Number of copies of each training sweep for a head in closed form."""
+BATCH = 128
+"""Number of sweeps that are copied at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -241,3 +251,37 @@ def _normal(rng: Generator, *shape: int) -> Array:
 def _lerp(start: Array, end: Array, share: Array) -> Array:
     """`share` of the way from `start` to `end`."""
     return start + share * (end - start)
+
+
+def texture_scale(samples: NDArray[Any]) -> float:
+    """The factor that gives raw counts [N, T, R, C] a deviation of 1 after the mean of each taxel
+    over its sweep is subtracted."""
+    deviation = samples - samples.mean(axis=1, keepdims=True, dtype=np.float32)
+    return float(1 / max(np.sqrt(np.mean(deviation**2)), 1e-6))
+
+
+def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -> Iterator[Dataset]:
+    """`count` changed versions of all sweeps, in their order and of their data type."""
+    rng, scale = np.random.default_rng(seed), texture_scale(sweeps.samples)
+    for _ in range(count):
+        samples = np.empty_like(sweeps.samples)
+        for start in range(0, len(sweeps), BATCH):
+            part = slice(start, start + BATCH)
+            samples[part] = _changed(sweeps.samples[part], scale, augmentation, rng)
+        yield replace(sweeps, samples=samples)
+
+
+def _changed(
+    counts: NDArray[Any], scale: float, augmentation: Augmentation, rng: Generator
+) -> NDArray[np.float32]:
+    """Changed raw counts [B, T, R, C] or [B, T, R, C, A]; integers are rounded and clipped to the
+    range of their data type."""
+    n, frames, rows, cols = counts.shape[:4]
+    x = np.ascontiguousarray(counts.reshape(n, frames, -1).transpose(0, 2, 1), np.float32)
+    means = x.mean(axis=2, keepdims=True)
+    x = augment((x - means) * scale, rows if cols > 1 else 1, augmentation, rng) / scale + means
+    if counts.dtype.kind != "f":
+        limits = np.iinfo(counts.dtype)
+        x = np.rint(x).clip(limits.min, limits.max)
+    changed: NDArray[np.float32] = x.transpose(0, 2, 1).reshape(counts.shape)
+    return changed

@@ -21,10 +21,9 @@ from onnx import TensorProto
 
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from train.models.recipe import nodes
 from train.models.recipe.architectures import FLOOR, Stage
-from train.models.recipe.nodes import FLOAT, MIDDLE
-from train.onnx_tools.graph_builder import GraphBuilder
+from train.onnx_tools import graph_builder
+from train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
 from train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
@@ -110,7 +109,7 @@ def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -
     for factors, size in zip(across, sizes, strict=True):
         factors[rng.permutation(taxels)[size:]] = 0
     drawn = SPREAD * rng.standard_normal((len(free), 1, TAPS))
-    along = np.where(free[:, None], np.rint(drawn)[:, 0], nodes.zero_sum_taps(drawn)[:, 0])
+    along = np.where(free[:, None], np.rint(drawn)[:, 0], graph_builder.zero_sum_taps(drawn)[:, 0])
     along = _within(along)
     unit = 1 / np.maximum(np.linalg.norm(across, axis=1) * np.linalg.norm(along, axis=1), 1)
     one = np.ones(len(free), np.float32)
@@ -133,7 +132,7 @@ def _within(along: Array) -> Array:
         zero_sum = kernel.sum() == 0
         while np.abs(kernel).max() > LARGEST:
             kernel = (
-                (nodes.zero_sum_taps(kernel[None, None] / 2)[0, 0])
+                (graph_builder.zero_sum_taps(kernel[None, None] / 2)[0, 0])
                 if zero_sum
                 else np.rint(kernel / 2)
             )
@@ -194,9 +193,9 @@ def responses(
     for (numbers, dilation), shape in zip(groups(bank), stages, strict=True):
         taps, behind = _taps(g, bank.take(numbers), step, int8), [0, shape.reach - shortest]
         y = g("Conv", x, taps, dilations=[dilation], strides=[shape.stride], pads=behind)
-        y = nodes.quantized(g, y, 1 / (MIDDLE - 1), MIDDLE) if int8 else y
+        y = graph_builder.quantized(g, y, 1 / (MIDDLE - 1), MIDDLE) if int8 else y
         found.append(g("Transpose", y, perm=[0, 2, 1]))
-    return nodes.side_by_side(g, found), stages
+    return graph_builder.side_by_side(g, found), stages
 
 
 def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
@@ -219,15 +218,15 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
 def pooled(
     g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
 ) -> list[str]:
-    """Taxels as for `responses` -> log mean magnitudes [1, 1 or TENTHS, F], and where shares are
+    """Taxels as for `responses` -> log mean magnitudes [1, 1 or PREFIXES, F], and where shares are
     wanted, those above the thresholds in the same shape."""
     y, stages = responses(g, format, bank, x, step, how.int8)
-    counts = np.array([nodes.known_steps(shape, format.window, how.prefixes) for shape in stages]).T
+    counts = np.array([shape.known_steps(format.window, how.prefixes) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
 
     def mean(z: str) -> str:
         """[n, steps, F] -> means over those that each filter has."""
-        total = nodes.sums(g, z, steps, counts, integers=how.int8, rowwise=how.rowwise)
+        total = graph_builder.sums(g, z, steps, counts, integers=how.int8, rowwise=how.rowwise)
         total = g(
             "Reshape",
             g("Cast", total, to=FLOAT) if how.int8 else total,

@@ -22,11 +22,11 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.calibration import early_exit, novelty
 from train.calibration.displacement import AugmentedCopies, DisplacementFit, fit_displacement
 from train.calibration.early_exit import EarlyRule, Heads
+from train.calibration.heads import HeadPart, HeadPlan
 from train.calibration.novelty import Embedding
 from train.metrics.answers import UNKNOWN, Answers
 from train.metrics.score import fuse
 from train.metrics.temperature import sufficient_temperature
-from train.models.recipe.heads import HeadPart, HeadPlan
 
 Array = NDArray[Any]
 Json = dict[str, Any]

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.inference.classifier import softmax
+from train.calibration.heads import HeadData, HeadPart, HeadPlan
 from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
-from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
 
 Array = NDArray[Any]
 TINY = 1e-12

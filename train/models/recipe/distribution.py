@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from appliance.core.types import SweepFormat
-from train.models.recipe import nodes
-from train.models.recipe.architectures import Stage
-from train.models.recipe.nodes import FLOAT, TENTHS
-from train.onnx_tools.graph_builder import GraphBuilder
+from train.models.recipe.architectures import PREFIXES, Stage
+from train.onnx_tools import graph_builder
+from train.onnx_tools.graph_builder import FLOAT, GraphBuilder
 
 Array = NDArray[Any]
 SIGNALS = 2
@@ -102,13 +101,13 @@ def pooled(
     prefixes: bool = False,
 ) -> str:
     """Taxels [n, R * C, T], which are scaled counts once they are multiplied by `step`, n being 1
-    or TENTHS -> shares [1, 1 or TENTHS, len(some)]: of each signal, taxel and level. int8: whether
+    or PREFIXES -> shares [1, 1 or PREFIXES, len(some)]: of each signal, taxel and level. int8: whether
     frames are counted in integers."""
     if len(some.taxels) < format.channels:
         x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
     looked, taxels = _looked(format.window), len(some.taxels)
-    counts = nodes.known_steps(looked, format.window, prefixes)
-    total = partial(nodes.sums, g, steps=looked.steps, counts=counts, rowwise=prefixes)
+    counts = looked.known_steps(format.window, prefixes)
+    total = partial(graph_builder.sums, g, steps=looked.steps, counts=counts, rowwise=prefixes)
     older, newer = (
         g(
             "Slice",
@@ -121,11 +120,13 @@ def pooled(
         g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older)
     )
     if prefixes:  # each tenth has means of its own
-        changes = g("Expand", changes, g.constant([TENTHS, looked.steps, taxels], "int64"))
+        changes = g("Expand", changes, g.constant([PREFIXES, looked.steps, taxels], "int64"))
     about = g(
-        "Sub", older, g("Mul", total(older), nodes.mean_factors(g, 1.0, counts, taxels, prefixes))
+        "Sub",
+        older,
+        g("Mul", total(older), graph_builder.mean_factors(g, 1.0, counts, taxels, prefixes)),
     )
-    y = g("Transpose", nodes.side_by_side(g, [about, changes]), perm=[0, 2, 1])
+    y = g("Transpose", graph_builder.side_by_side(g, [about, changes]), perm=[0, 2, 1])
     # a level is compared with a whole row of frames, which is four times as fast as a frame with a
     # row of levels
     levels = some.levels.reshape(SIGNALS * taxels, -1, 1) / step
@@ -137,5 +138,5 @@ def pooled(
     )
     above = total(above, integers=int8, time_last=True)
     shares = g("Cast", above, to=FLOAT) if int8 else above
-    shares = g("Mul", shares, nodes.mean_factors(g, 1.0, counts, len(some), prefixes))
-    return g("Reshape", shares, g.constant([1, TENTHS, -1], "int64")) if prefixes else shares
+    shares = g("Mul", shares, graph_builder.mean_factors(g, 1.0, counts, len(some), prefixes))
+    return g("Reshape", shares, g.constant([1, PREFIXES, -1], "int64")) if prefixes else shares

@@ -22,15 +22,14 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.sweep_set import read
 from train.calibration.contact import Contacts
 from train.calibration.displacement import AugmentedCopies
+from train.calibration.heads import HeadPlan
 from train.data.sets import Dataset
 from train.models.linear_head import hold_out
 from train.models.methods import Cost, Model
 from train.models.recipe import graph, spectrum
 from train.models.recipe.architectures import Architecture
-from train.models.recipe.augment import Augmentation
+from train.models.recipe.augment import COPIES, Augmentation, copies
 from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
-from train.models.recipe.copies import COPIES, copies
-from train.models.recipe.heads import HeadPlan
 from train.onnx_tools.graph_builder import run, with_head
 
 if TYPE_CHECKING:

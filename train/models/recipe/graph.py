@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from appliance.core.types import SweepFormat
-from train.models.recipe import bank, distribution, nodes, spectrum
-from train.models.recipe.architectures import FLOOR, NOISE_LIMIT, Architecture
-from train.models.recipe.nodes import FLOAT, MIDDLE, TENTHS
-from train.onnx_tools.graph_builder import GraphBuilder
+from train.models.recipe import bank, distribution, spectrum
+from train.models.recipe.architectures import FLOOR, NOISE_LIMIT, PREFIXES, Architecture, each_frame
+from train.onnx_tools import graph_builder
+from train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
 from train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
@@ -57,7 +57,7 @@ def level_frames(window: int, architecture: Architecture) -> int:
     Kernels that sum to zero need no level, but int8 does. The first tenth is known by the time of
     every early answer.
     """
-    return max(window // TENTHS, 1) if architecture.zero_sum(window) else window
+    return max(window // PREFIXES, 1) if architecture.zero_sum(window) else window
 
 
 def trunk_graph(
@@ -72,8 +72,8 @@ def trunk_graph(
     """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 where
     `ranges` are given.
 
-    tenths: `tenths` float32 [1, TENTHS, F] instead, features of the first tenth, the first two
-    tenths and so on. Row d depends on no frame after (d + 1) / TENTHS of the window, as long as
+    tenths: `tenths` float32 [1, PREFIXES, F] instead, features of the first tenth, the first two
+    tenths and so on. Row d depends on no frame after (d + 1) / PREFIXES of the window, as long as
     later frames repeat the newest one (frames that have not come yet have no noise) or no taxel is
     attenuated. A stage that has no response by then counts as silent. The bands of the spectrum are
     the last features, in float.
@@ -102,7 +102,7 @@ def trunk_graph(
         # whole numbers, whose sums are exact in floats: all machines find the same frames above a
         # level
         x = (
-            nodes.channels_first(g, taxels.rounded, 1.0, taxels.zero)
+            graph_builder.channels_first(g, taxels.rounded, 1.0, taxels.zero)
             if taxels.rounded
             else taxels.x
         )
@@ -111,7 +111,7 @@ def trunk_graph(
             distribution.pooled(g, format, some, x, taxels.step, own is not None, prefixes)
         )
     if keep_means:
-        counts = nodes.known_steps(nodes.frames(format.window), format.window, prefixes)
+        counts = each_frame(format.window).known_steps(format.window, prefixes)
         parts.append(
             g("Mul", _levels(g, g("Cast", raw, to=FLOAT), format, counts), g.constant(scale))
         )
@@ -120,8 +120,8 @@ def trunk_graph(
             spectrum.nodes(g, raw, attenuation, format, scale, architecture.mains_hz, prefixes)
         )
     size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
-    features = nodes.side_by_side(g, parts)
-    shape = [1, TENTHS, size] if prefixes else [1, size]
+    features = graph_builder.side_by_side(g, parts)
+    shape = [1, PREFIXES, size] if prefixes else [1, size]
     output = g(
         "Reshape", features, g.constant(shape, "int64"), output="tenths" if prefixes else "features"
     )
@@ -160,7 +160,7 @@ def _log_means(
     ranges: Ranges | None,
     prefixes: bool,
 ) -> str:
-    """The stages: log mean responses [1, 1 or TENTHS, sum of channels]."""
+    """The stages: log mean responses [1, 1 or PREFIXES, sum of channels]."""
     zero_sum, sums, factors = architecture.zero_sum(format.window), [], []
     rowwise, x, step = prefixes and not zero_sum, taxels.x, taxels.step
     stages, channels = architecture.stages(format.window), architecture.channels
@@ -175,23 +175,27 @@ def _log_means(
             y = g(
                 "Conv",
                 x,
-                *nodes.int8_weights(g, w, b, step, zero_sum and not i),
+                *graph_builder.int8_weights(g, w, b, step, zero_sum and not i),
                 strides=[stage.stride],
             )
             step = ranges.responses[i] / 255
-            response = nodes.quantized(g, y, step)
+            response = graph_builder.quantized(g, y, step)
             if (
                 i < len(channels) - 1
             ):  # after the last stage nothing would use it, and onnxruntime would still run it
-                x = nodes.counts_of(g, response, step)
-        counts = nodes.known_steps(stage, format.window, prefixes)
+                x = graph_builder.counts_of(g, response, step)
+        counts = stage.known_steps(format.window, prefixes)
         over_time = g("Transpose", response, perm=[0, 2, 1])
-        sums.append(nodes.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise))
-        factors.append(nodes.mean_factors(g, step, counts, size, rowwise))
-    total = nodes.side_by_side(g, sums)
+        sums.append(
+            graph_builder.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise)
+        )
+        factors.append(graph_builder.mean_factors(g, step, counts, size, rowwise))
+    total = graph_builder.side_by_side(g, sums)
     total = g("Cast", total, to=FLOAT) if ranges else total
-    log = g("Log", g("Add", g("Mul", total, nodes.side_by_side(g, factors)), g.constant(FLOOR)))
-    return g("Reshape", log, g.constant([1, TENTHS, sum(channels)], "int64")) if rowwise else log
+    log = g(
+        "Log", g("Add", g("Mul", total, graph_builder.side_by_side(g, factors)), g.constant(FLOOR))
+    )
+    return g("Reshape", log, g.constant([1, PREFIXES, sum(channels)], "int64")) if rowwise else log
 
 
 def _prepared(
@@ -209,7 +213,7 @@ def _prepared(
 
     Bytes stay bytes where the kernels sum to zero. From other counts the level is subtracted; where
     that is the mean of the whole window, and tenths are wanted, each tenth has a level and a row of
-    its own: [TENTHS, R * C, T].
+    its own: [PREFIXES, R * C, T].
     """
     zero_sum = architecture.zero_sum(format.window)
     if format.dtype == "uint8" and zero_sum and ranges:
@@ -219,21 +223,17 @@ def _prepared(
         return Prepared(g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale)
     rowwise = prefixes and not zero_sum
     frames = [level_frames(format.window, architecture)]
-    counts = (
-        nodes.known_steps(nodes.frames(format.window), format.window, prefixes)
-        if rowwise
-        else frames
-    )
+    counts = each_frame(format.window).known_steps(format.window, prefixes) if rowwise else frames
     x = g("Sub", x, _levels(g, x, format, counts, rowwise))
     x = g("Mul", x, g("Mul", attenuation, g.constant(scale)))
     if ranges is None:
         return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
     step = ranges.counts * scale / (MIDDLE - 1)
-    return _rounded(g, nodes.quantized(g, x, step, MIDDLE), step, MIDDLE)
+    return _rounded(g, graph_builder.quantized(g, x, step, MIDDLE), step, MIDDLE)
 
 
 def _rounded(g: GraphBuilder, rounded: str, step: float, zero: int) -> Prepared:
-    return Prepared(nodes.channels_first(g, rounded, step, zero), step, rounded, zero)
+    return Prepared(graph_builder.channels_first(g, rounded, step, zero), step, rounded, zero)
 
 
 def _attenuation(g: GraphBuilder, raw: str, format: SweepFormat) -> str:
@@ -269,10 +269,12 @@ def _attenuated_bytes(
     g: GraphBuilder, raw: str, attenuation: str, format: SweepFormat, scale: float
 ) -> str:
     """Bytes [1, T, R * C] times `attenuation` [1, 1, R * C], as bytes; exact where that is 1."""
-    quantized = nodes.quantized(g, attenuation, 1 / 255)
+    quantized = graph_builder.quantized(g, attenuation, 1 / 255)
     expanded = g("Expand", quantized, g.constant([1, format.window, format.channels], "int64"))
-    product = g("Mul", nodes.counts_of(g, raw, scale), nodes.counts_of(g, expanded, 1 / 255))
-    return nodes.quantized(g, product, scale)
+    product = g(
+        "Mul", graph_builder.counts_of(g, raw, scale), graph_builder.counts_of(g, expanded, 1 / 255)
+    )
+    return graph_builder.quantized(g, product, scale)
 
 
 def _levels(
@@ -281,8 +283,8 @@ def _levels(
     """Raw counts [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C] or,
     rowwise, with a row each."""
     taxels = format.channels
-    sums = nodes.sums(g, x, format.window, counts, rowwise=rowwise)
-    return g("Mul", sums, nodes.mean_factors(g, 1.0, counts, taxels, rowwise))
+    sums = graph_builder.sums(g, x, format.window, counts, rowwise=rowwise)
+    return g("Mul", sums, graph_builder.mean_factors(g, 1.0, counts, taxels, rowwise))
 
 
 def bank_responses(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from train.calibration.heads import HeadData, HeadPart, HeadPlan
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
@@ -26,13 +27,16 @@ from train.models.linear_head import hold_out_or_all
 from train.models.methods import Log, no_log
 from train.models.recipe import bank, choice, distribution, graph, spectrum
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ, Architecture
-from train.models.recipe.augment import Augmentation, default_augmentation
+from train.models.recipe.augment import (
+    COPIES,
+    Augmentation,
+    copies,
+    default_augmentation,
+    texture_scale,
+)
 from train.models.recipe.bank import Bank
 from train.models.recipe.choice import HeldOutScores, ScoredPlan
-from train.models.recipe.copies import COPIES, copies
 from train.models.recipe.fitted import Fit, finished
-from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
-from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
 

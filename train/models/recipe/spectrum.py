@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from appliance.core.types import SweepFormat
+from train.models.recipe.architectures import PREFIXES
 from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
-SEGMENTS = 10
+SEGMENTS = PREFIXES
 """Into which a window is cut: the tenths after which a box may decide early."""
 BANDS = 24
 """Of a spectrum, at most: their edges lie evenly on a logarithmic axis, at whole half bins."""

@@ -24,6 +24,7 @@ from torch import Generator, Tensor
 from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
+from train.calibration.heads import HeadPart, HeadPlan
 from train.data.sets import Dataset
 from train.metrics.score import accuracy_figure
 from train.models import training
@@ -32,12 +33,16 @@ from train.models.methods import Cost, Log, no_log
 from train.models.networks import Network
 from train.models.recipe import graph, spectrum
 from train.models.recipe.architectures import DEFAULT, Architecture
-from train.models.recipe.augment import Augmentation, augment, default_augmentation
-from train.models.recipe.copies import COPIES, copies
+from train.models.recipe.augment import (
+    COPIES,
+    Augmentation,
+    augment,
+    copies,
+    default_augmentation,
+    texture_scale,
+)
 from train.models.recipe.fitted import Fit, finished
-from train.models.recipe.heads import HeadPart, HeadPlan
 from train.models.recipe.network import Compact
-from train.models.scale import texture_scale
 from train.models.training import Augment, batches, float_batches, learn, one_thread
 from train.onnx_tools.graph_builder import run
 

@@ -14,8 +14,7 @@ from train.data.sets import Dataset
 from train.models.peers import minirocket, minirocket_augmented
 from train.models.recipe import stages
 from train.models.recipe.architectures import DEFAULT
-from train.models.recipe.augment import SLOW, default_augmentation
-from train.models.recipe.copies import copies
+from train.models.recipe.augment import SLOW, copies, default_augmentation
 
 
 def test_copies_are_augmented_as_in_our_own_training():

@@ -13,9 +13,9 @@ from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 from train.models.recipe import bank, graph
 from train.models.recipe.architectures import FLOOR, Architecture
+from train.models.recipe.augment import texture_scale
 from train.models.recipe.bank import DILATIONS, TAPS, Bank
 from train.models.recipe.recipe import FIXED
-from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
 
 FORMATS = [

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from appliance.inference.classifier import softmax
-from train.calibration import discriminant
+from train.calibration.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
 from train.data.splitters import InnerPart
 from train.models.recipe import choice
 from train.models.recipe.choice import HeldOutScores
-from train.models.recipe.heads import HeadData, HeadPart, HeadPlan
 
 GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
 """Features: that name the material everywhere; that say nothing; that name it in one group and lie
@@ -45,9 +44,9 @@ def test_a_plan_is_the_sum_of_its_discriminants():
     given, _ = known()
     plan = HeadPlan((HeadPart(GOOD, False, factor=2.0), HeadPart((1, 2), True, factor=0.5)))
     weight, bias = plan.fit(given.given(), 3)
-    apart = discriminant.fit(given.features[:, GOOD], given.labels, 3)
+    apart = fit_discriminant(given.features[:, GOOD], given.labels, 3)
     x, y, copied, of = given.given()
-    with_copies = discriminant.fit(np.concatenate([x, copied])[:, 1:3], np.append(y, of), 3)
+    with_copies = fit_discriminant(np.concatenate([x, copied])[:, 1:3], np.append(y, of), 3)
     want = 2 * (given.features[:, GOOD] @ apart[0].T + apart[1])
     want += 0.5 * (given.features[:, 1:3] @ with_copies[0].T + with_copies[1])
     np.testing.assert_allclose(given.features @ weight.T + bias, want, rtol=1e-4, atol=1e-3)

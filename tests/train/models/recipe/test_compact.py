@@ -19,7 +19,7 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.methods import Effort
-from train.models.recipe import graph, network, nodes, spectrum, stages
+from train.models.recipe import graph, network, spectrum, stages
 from train.models.recipe import methods as compact_methods
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.recipe.augment import Augmentation
@@ -118,7 +118,7 @@ def test_no_offset_moves_a_bit_of_bytes():
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
     first = next(v for v in values.values() if v.dtype == np.int8 and v.ndim == 3)
     np.testing.assert_array_equal(first.sum(axis=2, dtype=int), 0)
-    assert np.abs(first).max() == nodes.MAX_TAP
+    assert np.abs(first).max() == graph_builder.MAX_TAP
     counts = drawn(format, 2)
     offset = np.random.default_rng(1).integers(0, 60, (2, 1, 4, 4)).astype(np.uint8)
     np.testing.assert_array_equal(
@@ -132,14 +132,14 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
     rng = np.random.default_rng(0)
     taps = rng.uniform(-60, 60, (40, 3, 6))
     taps -= taps.mean(axis=2, keepdims=True)
-    have = nodes.zero_sum_taps(taps)
+    have = graph_builder.zero_sum_taps(taps)
     np.testing.assert_array_equal(have.sum(axis=2), 0)
     ways = np.stack(np.meshgrid(*[(0, 1)] * 6, indexing="ij"), -1).reshape(-1, 6)
     rounded = np.floor(taps)[:, :, None] + ways
     cost = np.where(rounded.sum(3) == 0, np.abs(rounded - taps[:, :, None]).sum(3), np.inf).min(2)
     np.testing.assert_allclose(np.abs(have - taps).sum(2), cost, atol=1e-9)
     whole = np.array([[[64.0, -64, 3, -3]]])
-    np.testing.assert_array_equal(nodes.zero_sum_taps(whole), whole)
+    np.testing.assert_array_equal(graph_builder.zero_sum_taps(whole), whole)
 
 
 @pytest.mark.slow

@@ -12,9 +12,7 @@ import pytest
 
 from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
-from train.models.recipe.augment import Augmentation, augment
-from train.models.recipe.copies import BATCH, copies
-from train.models.scale import texture_scale
+from train.models.recipe.augment import BATCH, Augmentation, augment, copies, texture_scale
 
 STILL = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
 TYPES = ("uint8", "int16", "uint16", "float32")
@@ -85,7 +83,7 @@ def test_a_seed_gives_the_same_copies_and_each_differs():
 
 def test_copies_need_no_pytorch():
     """A fresh process that makes copies has not loaded it."""
-    code = "import sys, train.models.recipe.copies; print('torch' in sys.modules, 'scipy' in sys.modules)"
+    code = "import sys, train.models.recipe.augment; print('torch' in sys.modules, 'scipy' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )

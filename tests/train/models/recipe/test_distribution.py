@@ -11,9 +11,9 @@ import pytest
 
 from appliance.core.types import SweepFormat
 from train.models.recipe import distribution, graph
+from train.models.recipe.augment import texture_scale
 from train.models.recipe.distribution import Levels
 from train.models.recipe.recipe import FIXED
-from train.models.scale import texture_scale
 from train.onnx_tools.graph_builder import run
 
 FORMATS = [

@@ -8,7 +8,7 @@ import pytest
 from sklearn.covariance import ledoit_wolf
 
 from appliance.core.errors import FormatError
-from train.calibration import discriminant
+from train.calibration import heads
 
 
 def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +32,7 @@ def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
     spread = scatter.std(axis=0)
     covariance = ledoit_wolf(scatter / spread, assume_centered=True)[0] * spread[:, None] * spread
     wanted = np.linalg.solve(covariance, (means - means.mean(axis=0)).T).T
-    weight, bias = discriminant.fit(x, labels, 4)
+    weight, bias = heads.fit_discriminant(x, labels, 4)
     np.testing.assert_allclose(weight, wanted, rtol=1e-3, atol=1e-3 * np.abs(wanted).max())
     logits = x @ weight.T + bias
     away = ((x[:, None] - means) @ np.linalg.inv(covariance) * (x[:, None] - means)).sum(axis=2)
@@ -47,18 +47,18 @@ def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
 def test_a_material_without_sweeps_is_never_named():
     """Its logit lies below all others."""
     x, labels = drawn(40, 5)
-    weight, bias = discriminant.fit(x, np.where(labels == 2, 4, labels), 5)
+    weight, bias = heads.fit_discriminant(x, np.where(labels == 2, 4, labels), 5)
     assert set((x @ weight.T + bias).argmax(axis=1)) <= {0, 1, 3, 4}
-    assert bias[2] == discriminant.ABSENT
+    assert bias[2] == heads.ABSENT
     assert not weight[2].any()
 
 
 def test_constant_and_equal_features_change_nothing_but_themselves():
     """A silent feature and a copy of another leave finite weights, and the same answers."""
     x, labels = drawn(60, 6)
-    weight, bias = discriminant.fit(np.hstack([x, x[:, :1], np.ones((60, 1))]), labels, 4)
+    weight, bias = heads.fit_discriminant(np.hstack([x, x[:, :1], np.ones((60, 1))]), labels, 4)
     assert np.isfinite(weight).all()
-    plain_weight, plain_bias = discriminant.fit(x, labels, 4)
+    plain_weight, plain_bias = heads.fit_discriminant(x, labels, 4)
     plain = x @ plain_weight.T + plain_bias
     more = np.hstack([x, x[:, :1], np.ones((60, 1))]) @ weight.T + bias
     assert np.mean(plain.argmax(axis=1) == more.argmax(axis=1)) > 0.95
@@ -68,7 +68,7 @@ def test_features_without_any_scatter_are_compared_by_their_means():
     """All sweeps of a material alike: the nearest mean is named."""
     labels = np.repeat([0, 1], 3)
     x = np.repeat([[0.0, 1.0], [2.0, 1.0]], 3, axis=0)
-    weight, bias = discriminant.fit(x, labels, 2)
+    weight, bias = heads.fit_discriminant(x, labels, 2)
     assert (x @ weight.T + bias).argmax(axis=1).tolist() == labels.tolist()
 
 
@@ -78,4 +78,4 @@ def test_one_sweep_of_each_material_is_too_few():
         FormatError,
         match="3 sweeps of as many materials are too few for a linear discriminant; record more",
     ):
-        discriminant.fit(np.eye(3), np.arange(3), 3)
+        heads.fit_discriminant(np.eye(3), np.arange(3), 3)

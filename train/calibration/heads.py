@@ -1,0 +1,181 @@
+"""Heads in closed form: linear discriminants with shrinkage, and sums of them.
+
+A discriminant assumes that the sweeps of every material scatter alike around its mean, and that
+materials are equally probable. The covariance is that of Ledoit and Wolf (2004), of features that
+are scaled to the same scatter. If there are fewer sweeps than features, the equations are solved
+among the sweeps (Woodbury's identity): the same solution, many times as fast.
+
+A plan adds the logits of a few discriminants, each of some of the features. Several discriminants
+that were fitted apart name sweeps of a new condition better than a single one of all features, and
+together they are still one matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.core.errors import FormatError
+
+Array = NDArray[Any]
+ABSENT = -1e4
+"""Logit of a material without a sweep."""
+LEAST_SHRINKAGE = 1e-4
+"""Where the scatter is known so well that none is needed, equations with equal features must have a
+solution."""
+Given = tuple[Array, Array, Array, Array]
+"""What a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and labels
+[M] of augmented copies."""
+
+
+@dataclass(frozen=True)
+class HeadPart:
+    """One discriminant. columns: numbers of the features that it sees. copies: whether it sees
+    augmented copies of the sweeps too. factor: of its logits; temperatures are in it."""
+
+    columns: tuple[int, ...]
+    copies: bool
+    factor: float = 1.0
+
+    def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
+        """Weight [K, F] over all features, and bias [K]; see fit_discriminant."""
+        columns, (x, y, copied, of) = np.array(self.columns), given
+        if self.copies:
+            x, y = np.concatenate([x, copied]), np.append(y, of)
+        weight = np.zeros((classes, x.shape[1]), np.float32)
+        weight[:, columns], bias = fit_discriminant(x[:, columns], y, classes)
+        return weight * np.float32(self.factor), bias * np.float32(self.factor)
+
+
+@dataclass(frozen=True)
+class HeadData:
+    """Sweeps that a head is fitted to. features: [N, F], labels [N]; copied: [M, F] of augmented
+    copies, and the number [M] of the sweep that each was made of."""
+
+    features: Array
+    labels: Array
+    copied: Array
+    source: Array
+
+    def take(self, kept: Array) -> HeadData:
+        """The sweeps `kept` (mask) and their copies."""
+        position = np.cumsum(kept) - 1
+        also = kept[self.source]
+        return HeadData(
+            self.features[kept], self.labels[kept], self.copied[also], position[self.source[also]]
+        )
+
+    def given(self) -> Given:
+        """What heads are fitted to."""
+        return self.features, self.labels, self.copied, self.labels[self.source]
+
+
+@dataclass(frozen=True)
+class HeadPlan:
+    """The discriminants whose logits are added."""
+
+    parts: tuple[HeadPart, ...]
+
+    def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
+        """Weight [K, F] and bias [K], float32. Raises FormatError as fit_discriminant."""
+        heads = [part.fit(given, classes) for part in self.parts]
+        weight: Array = np.sum([w for w, _ in heads], axis=0)
+        bias: Array = np.sum([b for _, b in heads], axis=0)
+        return weight, bias
+
+    def cooled(self, temperature: float) -> HeadPlan:
+        """The same, its logits divided by `temperature`."""
+        return HeadPlan(tuple(replace(p, factor=p.factor / temperature) for p in self.parts))
+
+    def uncooled(self) -> HeadPlan:
+        """The same with logits as sure as discriminants are by themselves, which is never too
+        modest."""
+        return self.cooled(max(part.factor for part in self.parts))
+
+    def columns(self) -> Array:
+        """Numbers of the features that any of the discriminants sees, ascending."""
+        return np.unique(np.concatenate([np.array(part.columns) for part in self.parts]))
+
+    def renumbered(self, kept: Array) -> HeadPlan:
+        """The same for a trunk with only the features `kept` (ascending numbers), which include
+        `columns`."""
+        return HeadPlan(
+            tuple(
+                replace(p, columns=tuple(np.searchsorted(kept, p.columns).tolist()))
+                for p in self.parts
+            )
+        )
+
+    def json(self) -> list[dict[str, Any]]:
+        """For a fit's record."""
+        return [asdict(part) for part in self.parts]
+
+    @classmethod
+    def read(cls, entries: Sequence[dict[str, Any]]) -> Self:
+        """What `json` gave."""
+        return cls(
+            tuple(HeadPart(**entry | {"columns": tuple(entry["columns"])}) for entry in entries)
+        )
+
+
+def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Array, Array]:
+    """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below
+    `classes`.
+
+    The logits of a material without a sweep are ABSENT. Raises FormatError where there is only one
+    sweep of each material, which says nothing of how materials vary.
+    """
+    present, member = np.unique(labels, return_inverse=True)
+    x = np.asarray(features, np.float64)
+    if len(x) <= len(present):
+        raise FormatError(
+            f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record more"
+        )
+    means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
+    scatter = x - means[member]
+    spread = scatter.std(axis=0)
+    spread = np.maximum(spread, max(1e-6 * float(spread.max(initial=0)), 1e-12))
+    middle = means.mean(axis=0)
+    wanted = (means - middle) / spread
+    solved = _solve(scatter / spread, wanted)
+    weight, bias = np.zeros((classes, x.shape[1])), np.full(classes, ABSENT)
+    weight[present] = solved / spread
+    bias[present] = -0.5 * (wanted * solved).sum(axis=1) - weight[present] @ middle
+    return weight.astype(np.float32), bias.astype(np.float32)
+
+
+def _solve(z: Array, wanted: Array) -> Array:
+    """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are
+    0."""
+    n, size = z.shape
+    few = n < size
+    gram = z @ z.T if few else z.T @ z
+    share, mean = shrinkage(z, gram)
+    share = max(share, LEAST_SHRINKAGE)
+    ridge = max(share * mean, 1e-12)
+    if not few:
+        solution: Array = np.linalg.solve((1 - share) / n * gram + ridge * np.eye(size), wanted.T).T
+        return solution
+    share = min(share, 1 - LEAST_SHRINKAGE)
+    inner = np.linalg.solve(gram + ridge * n / (1 - share) * np.eye(n), z @ wanted.T)
+    solution = (wanted - (z.T @ inner).T) / ridge
+    return solution
+
+
+def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
+    """Ledoit and Wolf's share of the mean variance in the covariance of `z` [N, F], whose means are
+    0, and that variance.
+
+    gram: z @ z.T or z.T @ z, whichever is smaller.
+    """
+    n, size = z.shape
+    trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2
+    fourth = float(((z**2).sum(axis=1) ** 2).sum())
+    mean = trace / size
+    distance = (squares - 2 * mean * trace + size * mean**2) / size
+    noise = min(max((fourth / n - squares) / (size * n), 0.0), distance)
+    return noise / distance if distance > 0 else 1.0, mean
