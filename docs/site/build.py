@@ -41,7 +41,13 @@ CHAPTERS = {
         "docs/faults",
     ],
     "Results": ["docs/*/README"],
-    "Project": ["CHANGELOG", "CONTRIBUTING", "docs/decisions/README", "docs/decisions/*"],
+    "Project": [
+        "CHANGELOG",
+        "CONTRIBUTING",
+        "docs/decisions/README",
+        "docs/decisions/*",
+        "docs/data/trials/*",
+    ],
 }
 """Captions of the contents, and their pages, without .md."""
 
@@ -77,6 +83,8 @@ def gather(out: Path) -> list[str]:
         target.parent.mkdir(parents=True, exist_ok=True)
         text = linked(Path(name), text, out, lost)
         target.write_text(text + contents(names) * (name == "README.md"), "utf-8")
+    for page in ROOT.glob("docs/**/*.html"):
+        shutil.copyfile(page, out / page.relative_to(ROOT))
     return lost
 
 
