@@ -93,12 +93,12 @@ def main(argv: list[str] | None = None) -> int:
         "--signers", type=Path, metavar="FILE", help="allowed_signers: whose bundles the box takes"
     )
     parser.add_argument(
-        "--wheel", type=Path, default=WHEEL, help="of this checkout (made by make wheel)"
+        "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
     )
     args = parser.parse_args(argv)
     for file in (args.wheel, *([args.signers] if args.signers else [])):
         if not file.is_file():
-            sys.exit(f"palpate: no file {file}; check the path (make wheel makes the wheel)")
+            sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")
     try:
         known_board(args.board)
     except Failed as e:

@@ -181,7 +181,7 @@ def opened() -> Iterator[Remote]:
         file = os.open(PORT, os.O_RDWR)
     except OSError as e:
         raise BackendMissing(
-            f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: make test-rig"
+            f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: python -m tests.campaigns test-rig"
         ) from e
     with ExitStack() as stack:
         stack.callback(os.close, file)

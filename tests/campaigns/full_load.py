@@ -368,7 +368,7 @@ def main() -> int:
         "--bundles",
         type=Path,
         default=ROOT / "build" / "skins",
-        help="as `make skins PART=way` leaves it",
+        help="as `python -m tests.campaigns skins way` leaves it",
     )
     parser.add_argument(
         "--disks",
@@ -403,7 +403,7 @@ def _measured(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None
     bundles = {skin: args.bundles / skin / "bundle" for skin in SKINS}
     for skin, path in bundles.items():
         if not path.is_dir():
-            parser.error(f"{path} is no bundle; make skins PART=way SKINS={skin} makes it")
+            parser.error(f"{path} is no bundle; python -m tests.campaigns skins way {skin} makes it")
     if MEMORY.is_dir():
         tempfile.tempdir = str(MEMORY)
     real_time = (

