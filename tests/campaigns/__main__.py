@@ -1,7 +1,7 @@
 """`python -m tests.campaigns NAME [OPTION ...]` runs a campaign; without a name it lists them.
 
 A campaign is a measurement or a set of tests that takes too long, or needs too much of the machine,
-for `make test-all`. Run `make desktop` first. Each campaign installs the Debian packages and wheels
+for `make test-all`. Run `make desktop` first (on a board, `make demo`). Each campaign installs the Debian packages and wheels
 that it lacks. Its options are appended to the command that the list shows, so the last value counts.
 """
 
@@ -48,6 +48,12 @@ def fuzzer() -> None:
     """Install Atheris, the fuzzer, into this virtual environment."""
     if importlib.util.find_spec("atheris") is None:
         subprocess.run([sys.executable, "-m", "pip", "install", "-q", ATHERIS], check=True)
+
+
+def board_tests() -> None:
+    """Install pytest; a board has no other tool of the desktop."""
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q")
+    subprocess.run([*pip, "-e", ".[board]"], check=True, cwd=ROOT)
 
 
 def skin_bundles() -> None:
@@ -110,6 +116,11 @@ CAMPAIGNS = {
     "rig-shell": Campaign(
         "open a shell in the virtual box", _module("tests.rig", "shell"), prepare=rig_tools
     ),
+    "rig-tools": Campaign(
+        "install the emulator of the virtual box",
+        _module("tests.rig", "lacking"),
+        prepare=rig_tools,
+    ),
     "rig-ground": Campaign(
         "build the part of the virtual box that is the same for every commit (4 minutes)",
         _module("tests.rig", "ground"),
@@ -121,6 +132,13 @@ CAMPAIGNS = {
         paths=("tests/rig",),
         prepare=rig_tools,
         variables={"PALPATE_RIG": "quick"},
+    ),
+    "test-hw": Campaign(
+        "test skin, GPIO lines and serial line of this board (docs/board-checklist.md)",
+        (*PYTEST, "-rs"),
+        paths=("tests/appliance/io/test_backends.py",),
+        prepare=board_tests,
+        variables={"PALPATE_BACKEND": "wired"},
     ),
     "systemd": Campaign(
         "test the service under a real systemd in a container (as root; a Debian of 380 MB)",

@@ -403,7 +403,9 @@ def _measured(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None
     bundles = {skin: args.bundles / skin / "bundle" for skin in SKINS}
     for skin, path in bundles.items():
         if not path.is_dir():
-            parser.error(f"{path} is no bundle; python -m tests.campaigns skins way {skin} makes it")
+            parser.error(
+                f"{path} is no bundle; python -m tests.campaigns skins way {skin} makes it"
+            )
     if MEMORY.is_dir():
         tempfile.tempdir = str(MEMORY)
     real_time = (

@@ -25,14 +25,18 @@ def required() -> None:
     """Skip where ROS 2 is not installed, unless it was asked for."""
     if not PYTHON.exists():
         if "PALPATE_ROS" in os.environ:
-            pytest.fail(f"{PYTHON} is not there; python -m tests.campaigns ros installs it in build/ros")
+            pytest.fail(
+                f"{PYTHON} is not there; python -m tests.campaigns ros installs it in build/ros"
+            )
         pytest.skip("no ROS 2 here; python -m tests.campaigns ros installs it (255 MB)")
 
 
 def messages_required() -> None:
     """Fail where ROS 2 is installed without palpate_msgs."""
     package = PYTHON.parent.parent / "share" / "palpate_msgs" / "package.xml"
-    assert package.exists(), f"{package} is not there; python -m tests.campaigns ros builds palpate_msgs"
+    assert package.exists(), (
+        f"{package} is not there; python -m tests.campaigns ros builds palpate_msgs"
+    )
 
 
 def environment() -> dict[str, str]:

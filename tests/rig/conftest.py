@@ -22,7 +22,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs a guest where none is wanted."""
     for item in items:
         if not HOW and item.path.parent == Path(__file__).parent:
-            item.add_marker(pytest.mark.skip(reason="needs the virtual box; python -m tests.campaigns test-rig"))
+            item.add_marker(
+                pytest.mark.skip(reason="needs the virtual box; python -m tests.campaigns test-rig")
+            )
 
 
 @pytest.fixture(scope="session")

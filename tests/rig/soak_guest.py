@@ -86,7 +86,11 @@ class VirtualBox:
     @staticmethod
     def missing() -> str:
         """Why this box cannot be had here; "" where it can."""
-        return "" if image.built() else "it has not been built here; python -m tests.campaigns rig builds it"
+        return (
+            ""
+            if image.built()
+            else "it has not been built here; python -m tests.campaigns rig builds it"
+        )
 
     def start(self, seed: int, sweeps: Script) -> None:
         """As BoxUnderTest."""

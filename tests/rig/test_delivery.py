@@ -32,7 +32,8 @@ from tests.rig.notes import HOW
 from tests.rig.sound import known, not_wrong
 
 pytestmark = pytest.mark.skipif(
-    HOW != "full", reason="installs a bare guest; PALPATE_RIG=full python -m tests.campaigns test-rig"
+    HOW != "full",
+    reason="installs a bare guest; PALPATE_RIG=full python -m tests.campaigns test-rig",
 )
 pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
 

@@ -213,7 +213,9 @@ def cut(
     return len(kept)
 
 
-@pytest.mark.skipif(HOW != "full", reason="boots for each cut; PALPATE_RIG=full python -m tests.campaigns test-rig")
+@pytest.mark.skipif(
+    HOW != "full", reason="boots for each cut; PALPATE_RIG=full python -m tests.campaigns test-rig"
+)
 def test_power_cut(
     image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]
 ):

@@ -34,7 +34,8 @@ SITE = "/etc/palpate/palpate.toml"
 SECOND = "echo {} > /sys/devices/system/cpu/cpu1/online"
 """Turns the guest's second processor on or off."""
 needs_time = pytest.mark.skipif(
-    HOW != "full", reason="starts the service again; PALPATE_RIG=full python -m tests.campaigns test-rig"
+    HOW != "full",
+    reason="starts the service again; PALPATE_RIG=full python -m tests.campaigns test-rig",
 )
 DAMAGE = """
 import pathlib, shutil

@@ -46,7 +46,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
     """Two bare hosts, of which the second stays bare, and a desktop that may log in there."""
     if os.environ.get("PALPATE_SYSTEMD") != "1":
-        pytest.skip("installs on real hosts take minutes; run make systemd")
+        pytest.skip("installs on real hosts take minutes; run python -m tests.campaigns systemd")
     with hosts.Hosts(2, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:
         yield made
 

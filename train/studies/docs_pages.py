@@ -24,7 +24,9 @@ Run = Callable[[Sequence[str]], int]
 """Runs a command's words; its exit code."""
 NEEDS: dict[str, Callable[[], bool]] = {
     "the folder of real sweeps in PALPATE_DATA": lambda: bool(os.environ.get("PALPATE_DATA")),
-    "qemu-system-aarch64 (python -m tests.campaigns rig)": lambda: shutil.which("qemu-system-aarch64") is not None,
+    "qemu-system-aarch64 (python -m tests.campaigns rig-tools)": lambda: (
+        shutil.which("qemu-system-aarch64") is not None
+    ),
 }
 REAL, EMULATOR = NEEDS
 COMMANDS = {"appliance": "palpate"}

@@ -679,7 +679,10 @@ def test_controls_over_a_wire():
 
 @pytest.mark.parametrize(
     ("name", "there", "hint"),
-    [("wired", "/dev/gpiochip0", "wired as tests"), ("remote", remote.PORT, "python -m tests.campaigns test-rig")],
+    [
+        ("wired", "/dev/gpiochip0", "wired as tests"),
+        ("remote", remote.PORT, "python -m tests.campaigns test-rig"),
+    ],
 )
 def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
     """If a backend is not available, one line says what to do."""

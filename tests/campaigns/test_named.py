@@ -1,0 +1,107 @@
+"""The names that documents and CI use: targets of make, campaigns, studies."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.campaigns import __main__ as campaigns
+from tests.factories.paths import ROOT
+from train.studies.command import PROGRAM
+
+READ = (".md", ".py", ".toml", ".yml", ".yaml", ".html", ".j2", ".service")
+"""Kinds of files that name commands, besides .ci/run."""
+
+
+def texts() -> dict[str, str]:
+    """Each file of the project that may name a command, and its text."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
+    named = (name for name in listed if name.endswith(READ) or name.startswith(".ci/"))
+    return {name: (ROOT / name).read_text() for name in named if (ROOT / name).exists()}
+
+
+def targets() -> list[str]:
+    """The targets that `make help` lists."""
+    return re.findall(r"(?m)^([a-z-]+):.*## ", (ROOT / "Makefile").read_text())
+
+
+def strangers(pattern: str, known: set[str]) -> list[str]:
+    """File and name of every match whose first group is not a known name."""
+    return [
+        f"{file}: {name}"
+        for file, text in texts().items()
+        for name in re.findall(pattern, text)
+        if name not in known
+    ]
+
+
+def test_make_has_few_targets():
+    """At most 14 targets, each of which is listed and phony."""
+    phony = re.search(r"(?m)^\.PHONY: (.*)$", (ROOT / "Makefile").read_text())
+    assert phony
+    assert sorted(phony[1].split()) == sorted(targets())
+    assert len(targets()) <= 14
+
+
+def test_files_name_targets_that_exist():
+    """No document, message or test names a dropped target."""
+    assert strangers(r"(?:`|run: |step \w+ )make ([a-z-]+)", set(targets())) == []
+
+
+def test_files_name_campaigns_and_studies_that_exist():
+    """The same for campaigns and studies."""
+    names = {*campaigns.CAMPAIGNS, "lists"}
+    assert strangers(r"(?:-m tests\.campaigns|\$campaign) ([a-z][a-z-]*)", names) == []
+    studies = {*PROGRAM.descriptions(), "COMMAND", "NAME", "lists"}
+    assert strangers(r"(?:-m train\.studies|\$study) ([a-z][a-z-]*)", studies) == []
+
+
+@pytest.mark.parametrize("name", campaigns.CAMPAIGNS)
+def test_a_campaign_runs_something_that_exists(name: str):
+    """The module is there, and so are the tests."""
+    campaign = campaigns.CAMPAIGNS[name]
+    if campaign.command[0] == "make":
+        assert f"\n{campaign.command[1]}:" in (ROOT / "Makefile").read_text()
+    else:
+        assert campaign.command[0] == "-m"
+        assert importlib.util.find_spec(campaign.command[1])
+    assert all((ROOT / path).exists() for path in campaign.paths)
+
+
+def test_a_named_file_replaces_the_tests_of_a_campaign():
+    """`test-rig FILE::TEST` runs that test alone; other options leave the tests as they are."""
+    campaign = campaigns.CAMPAIGNS["test-rig"]
+    one = "tests/rig/test_usb.py::test_x"
+    assert campaign.arguments([one])[1:] == ["-m", "pytest", "-q", one]
+    assert campaign.arguments(["-x"])[1:] == ["-m", "pytest", "-q", "-x", "tests/rig"]
+
+
+def test_an_unknown_campaign_is_refused(capsys: pytest.CaptureFixture[str]):
+    """Exit code 2 and the names that exist; no argument prints the list."""
+    assert campaigns.main(["rigg"]) == 2
+    assert "no campaign rigg; there are rig, " in capsys.readouterr().err
+    assert campaigns.main([]) == 0
+    out = capsys.readouterr().out
+    assert all(f"  {name} " in out for name in campaigns.CAMPAIGNS)
+
+
+def test_a_campaign_gets_its_variables_and_returns_its_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    """A variable of the caller goes before that of the campaign."""
+    code = "import os, sys; print(os.environ['A_'], os.environ['B_']); sys.exit(7)"
+    monkeypatch.setenv("A_", "caller")
+    campaign = campaigns.Campaign("", ("-c", code), variables={"A_": "own", "B_": "own"})
+    assert campaign.run([]) == 7
+    assert capfd.readouterr().out.split() == ["caller", "own"]
+    assert campaign.arguments([])[0] == sys.executable
