@@ -15,7 +15,7 @@ from typing import Protocol
 from appliance.core.clock import Clock
 from appliance.core.config import SensorConfig
 from appliance.core.errors import SensorError, SensorMismatch
-from appliance.core.types import Frames, SweepFormat, shown
+from appliance.core.types import SweepFormat, shown
 from appliance.io import packets, serial_port, skin_stream
 from appliance.io.link import SkinLink
 from appliance.io.serial_link import SerialLink, find
@@ -90,13 +90,10 @@ class SerialSensor(LinkSensor):
         )
         self._profile, self._ports = profile, ports
         self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
-        self._deaf_ns = 0  # until then the skin tares itself
+        self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
 
-    def read(self) -> Frames:
-        """Frames that have come since the last call; waits at most `timeout_ms`. None while the
-        skin tares itself."""
-        frames = super().read()
-        return frames if self._clock.now_ns() >= self._deaf_ns else Frames.empty(self._format)
+    def _proven(self, now_ns: int) -> bool:
+        return now_ns >= self._tared_ns and super()._proven(now_ns)
 
     def _open(self) -> tuple[SkinLink, packets.Identity]:
         self._check_format()
@@ -111,7 +108,7 @@ class SerialSensor(LinkSensor):
             if self._config.tare:
                 for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
                     port.write(command)
-                self._deaf_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
+                self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
         except SensorError:
             port.close()
             raise
@@ -132,11 +129,12 @@ class SerialSensor(LinkSensor):
                 f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a bundle for this skin"
             )
 
-    def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
-        if not unheard:
-            return super()._mute(quiet_ms, unheard)
+    def _no_frame(self, *, bytes_came: bool) -> SensorError:
+        if not bytes_came:
+            return super()._no_frame(bytes_came=False)
         return SensorMismatch(
-            f"the skin sent {unheard} bytes in {quiet_ms} ms, but no frame of profile {self._config.skin} "
+            f"the skin sent bytes for {self._config.silence_ms} ms, "
+            f"but no frame of profile {self._config.skin} "
             f"({shown(self._profile.format.shape)} {self._profile.number}); correct sensor.skin, sensor.grid or "
             "sensor.baud; `palpate skin detect` listens for what fits"
         )

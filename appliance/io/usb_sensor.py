@@ -312,7 +312,7 @@ class LinkSensor(ABC):
                 wrong = e
         if self.counters.frames > before and not wrong:
             self._quiet_ns = self._unheard = 0
-            if self.state != "streaming" and now - self._opened_ns >= self._proof_ns:
+            if self.state != "streaming" and self._proven(now):
                 self._set_state("streaming", None)
         if data and self._tap:  # after the state in which its frames are used
             self._tap.transfer(now, data)
@@ -321,6 +321,10 @@ class LinkSensor(ABC):
             self._drop(wrong, PROOF_NS if early and not self.announced else 0)
         self._check_silence()
         return frames if self.state == "streaming" else Frames.empty(self._format)
+
+    def _proven(self, now_ns: int) -> bool:
+        """Whether a skin that sends frames counts as streaming."""
+        return now_ns - self._opened_ns >= self._proof_ns
 
     def close(self) -> None:
         """Stop the skin and release it."""
@@ -333,10 +337,12 @@ class LinkSensor(ABC):
         """Find, open, check and start the skin. Raises SensorError, with nothing left open."""
         ...
 
-    def _mute(self, quiet_ms: int, unheard: int) -> SensorError:
-        """Why no frame has come for `quiet_ms`. unheard: bytes that came in this time."""
+    def _no_frame(self, *, bytes_came: bool) -> SensorError:
+        """The trouble of a skin that sent no frame for `silence_ms`. bytes_came: it sent other
+        bytes. The message has no figure that changes each time, so that it is logged once."""
         return SensorSilent(
-            f"the skin is there but sent no frame for {quiet_ms} ms; starting it again"
+            f"the skin is there but sent no frame for {self._config.silence_ms} ms; "
+            "starting it again"
         )
 
     def _connect(self) -> bool:
@@ -372,9 +378,8 @@ class LinkSensor(ABC):
     def _check_silence(self) -> None:
         """Restart a skin that is connected but has sent no complete frame in `silence_ms` of
         reading."""
-        quiet_ms = self._quiet_ns // 1_000_000
-        if self._link and quiet_ms > self._config.silence_ms:
-            self._drop(self._mute(quiet_ms, self._unheard))
+        if self._link and self._quiet_ns > self._config.silence_ms * 1_000_000:
+            self._drop(self._no_frame(bytes_came=self._unheard > 0))
 
     def _drop(self, why: SensorError, proof_ns: int = 0) -> None:
         """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it

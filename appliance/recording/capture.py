@@ -201,6 +201,8 @@ class Playback:
             if kind == RecordKind.TRANSFER:
                 with suppress(SensorMismatch):  # the state that followed is the next record
                     frames = self._stream.feed(data, self._now_ns)
+                if self._opened:  # the sensor did not pass them on: it was not streaming yet
+                    frames = Frames.empty(self.format)
             elif kind == RecordKind.STATE:
                 self._enter(data.decode())
         return frames

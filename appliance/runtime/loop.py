@@ -243,7 +243,9 @@ class Box:
 
     def _report(self, now_ns: int) -> None:
         """Log what has changed, answer commands, send the state once in a while."""
-        self._skin_log.update(str(self._sensor.trouble or ""))
+        trouble = str(self._sensor.trouble or "")
+        if trouble or self._sensor.state == "streaming":  # not before its first frame
+            self._skin_log.update(trouble)
         if not self._port:
             return
         for command in self._port.commands():

@@ -14,7 +14,17 @@ import pytest
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import SweepConfig
 from appliance.core.errors import ConfigError, FormatError
-from appliance.core.types import Edge, EdgeKind, Frames, Status, Sweep, Verdict, load, save
+from appliance.core.types import (
+    EPOCH_BITS,
+    Edge,
+    EdgeKind,
+    Frames,
+    Status,
+    Sweep,
+    Verdict,
+    load,
+    save,
+)
 from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
@@ -25,6 +35,7 @@ from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.paths import ONE_AXIS
 from tests.factories.simulated_box import SECOND, OnSweep, Rigged
+from tests.factories.skin_wires import WiredSkin, profile
 
 
 def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
@@ -42,6 +53,30 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
+
+
+def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(tmp_path: Path):
+    """A skin that came too fast has to send for some seconds first: replay gives exactly the
+    frames that the sensor passed on."""
+    capture = CaptureWriter(tmp_path / "capture", profile("matrix").format, profile("matrix"))
+    wired = WiredSkin("matrix", rate=2.0, tap=capture)
+    wired.seconds(4)
+    assert wired.sensor.state == "mismatch"
+    wired.port.period_ns = wired.format.period_ns
+    wired.port.begun_ns = wired.clock.now_ns() - round(wired.port._next * wired.port.period_ns)
+    later = wired.seconds(10)
+    capture.close()
+    assert wired.sensor.state == "streaming"
+    play, parts = Playback(tmp_path / "capture"), []
+    while not play.finished:
+        parts.append(play.read())
+    again = Frames.joined(parts)
+    assert len(later) > 100
+    np.testing.assert_array_equal(again.seq[-len(later) :], later.seq)
+    np.testing.assert_array_equal(again.t_ns[-len(later) :], later.t_ns)
+    np.testing.assert_array_equal(again.taxels[-len(later) :], later.taxels)
+    first = again.seq[-len(later) - 1] >> EPOCH_BITS
+    assert first < later.seq[0] >> EPOCH_BITS
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ each way to fail."""
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -155,9 +156,12 @@ def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
     assert fault_line == [True, False]
 
 
-def test_a_board_that_sends_no_frame_is_never_ready(rigged: Callable[..., Rigged]):
+def test_a_board_that_sends_no_frame_is_never_ready(
+    rigged: Callable[..., Rigged], caplog: pytest.LogCaptureFixture
+):
     """The board answers and sends nothing: READY stays low and FAULT high, a trigger is
-    `not-ready`, and READY rises with the first frame."""
+    `not-ready`, and READY rises with the first frame, as the log says."""
+    caplog.set_level(logging.INFO)
     simulated = quiet()
     board = simulated.backend.board
     take, board.take = board.take, lambda: (take(), b"")[1]
@@ -166,10 +170,13 @@ def test_a_board_that_sends_no_frame_is_never_ready(rigged: Callable[..., Rigged
     assert [v.status for v in box.seconds(5)] == [Status.NOT_READY]
     levels = {name: [v for _, n, v in simulated.gpio.written if n == name] for name in LINES}
     assert levels == {devices.READY: [], devices.FAULT: [True]}
+    assert "skin: streaming" not in caplog.messages
+    assert sum("sent no frame" in message for message in caplog.messages) == 1
     board.take = take
     box.seconds(1)
     levels = {name: [v for _, n, v in simulated.gpio.written if n == name] for name in LINES}
     assert levels == {devices.READY: [True], devices.FAULT: [True, False]}
+    assert caplog.messages.count("skin: streaming") == 1
 
 
 def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):
