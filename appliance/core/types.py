@@ -34,9 +34,9 @@ MOST_AXES = 8
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
 enumerations of the board are never adjacent."""
-SCHEMA = 2
-"""Version of a recorded sweep's sidecar. Version 1 holds nothing but the sweep and is still
-read."""
+SCHEMA = 3
+"""Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
+sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
 """What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an
 impossible size."""

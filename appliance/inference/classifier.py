@@ -105,9 +105,13 @@ class Classifier:
 
     @property
     def rule(self) -> dict[str, Any]:
-        """The constructor's settings, for sidecars, so that a replay classifies a recorded sweep by
-        the same rule."""
-        return {"how": self._fusion, "sure": self.min_probability, "most_sweeps": self._max_sweeps}
+        """The classifier's settings under their names in the site file. Sidecars hold them, and a
+        replay applies them again."""
+        return {
+            "fuse": self._fusion,
+            "min_probability": self.min_probability,
+            "max_sweeps": self._max_sweeps,
+        }
 
     @property
     def format(self) -> SweepFormat:

@@ -8,7 +8,7 @@ object, at the same time. So its verdict must be that of its sidecar, bit for bi
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -33,6 +33,8 @@ SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """SAME: the verdict, bit for bit. ALONE: the scores of this sweep, but earlier sweeps of its object
 are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
+OLD_RULE_KEYS = {"how": "fuse", "sure": "min_probability", "most_sweeps": "max_sweeps"}
+"""Keys of the rule in sidecars up to schema 2, with the names that replaced them."""
 FUSIONS = get_args(get_type_hints(ClassifierConfig)["fuse"])
 
 
@@ -59,16 +61,31 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """The rule by which a classifier turns probabilities into answers. Its fields are the keys of
-    sidecars."""
+    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys.
 
-    how: str
-    sure: float
-    most_sweeps: int
+    Raises TypeError for an unknown fusion.
+    """
+
+    fuse: str
+    min_probability: float
+    max_sweeps: int
 
     def __post_init__(self) -> None:
-        if self.how not in FUSIONS:
-            raise TypeError(f"rule {self.how!r} is none of {', '.join(FUSIONS)}")
+        if self.fuse not in FUSIONS:
+            raise TypeError(f"fuse {self.fuse!r} is not one of {', '.join(FUSIONS)}")
+
+    @classmethod
+    def read(cls, about: Mapping[str, Any]) -> ReplayRule | None:
+        """The rule of a sidecar, None if the sidecar has no rule. Raises TypeError or ValueError.
+
+        Sidecars up to schema 2 are read under the names that the settings had then.
+        """
+        rule = about.get("rule")
+        if "rule" not in about:
+            return None
+        if isinstance(rule, dict) and about["schema"] < 3:
+            rule = {OLD_RULE_KEYS.get(name, name): value for name, value in rule.items()}
+        return typed(cls, rule)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +116,7 @@ class KeptSweep:
                 if "tare" in about
                 else None
             )
-            rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
+            rule = ReplayRule.read(about)
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "time_ns")):

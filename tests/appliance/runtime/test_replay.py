@@ -24,7 +24,7 @@ from appliance.recording.black_box import BlackBox
 from appliance.runtime.replay import replay
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
-from tests.factories.paths import NO_SITE
+from tests.factories.paths import NO_SITE, SIDECARS_2
 from tests.factories.simulated_box import Rigged
 
 SWEEPS = 30
@@ -281,13 +281,46 @@ def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
     assert ",ok,a," in played(tmp_path / "s.npy", high)[1][0]
 
 
+def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
+    """The rule is read under its old names: the settings of today would give other verdicts."""
+    arrays = toy_bundle.means(**toy_bundle.moved_arrays())
+    made = toy_bundle.load(
+        tmp_path / "bundle", arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE
+    )
+    abouts = [sidecar(path) for path in sorted(SIDECARS_2.glob("*.npy"))]
+    assert [(about["schema"], about["verdict"]["fused"]) for about in abouts] == [
+        (2, 1),
+        (2, 2),
+        (2, 1),
+    ]
+    assert all(about["rule"]["how"] == "vote" for about in abouts)
+    # another release of onnx may write the same graph in other bytes, and the id follows the bytes
+    model = replace(made, id=abouts[0]["bundle"])
+    code, sentences, outcomes = played(SIDECARS_2, model)
+    assert (code, outcomes[-1]) == (0, "3 sweeps: 3 the same")
+    assert all(
+        f",{status}," in line
+        for status, line in zip(("unsure", "ok", "unsure"), sentences, strict=True)
+    )
+    kept = Path(shutil.copytree(SIDECARS_2, tmp_path / "kept"))
+    for path in kept.glob("*.npy"):
+        about = sidecar(path)
+        del about["rule"]
+        path.with_suffix(".json").write_text(json.dumps(about))
+    assert played(kept, model)[0] == 1
+
+
 @pytest.mark.parametrize(
     ("about", "hint"),
     [
         ({"tare": [[1, 2, 3]]}, "sidecar cannot be used"),
         ({"tare": "heavy"}, "sidecar cannot be used"),
-        ({"rule": {"how": "product"}}, "sidecar cannot be used"),
-        ({"rule": {"how": "guess", "sure": 0.5, "most_sweeps": 0}}, "sidecar cannot be used"),
+        ({"rule": {"fuse": "product"}}, "sidecar cannot be used"),
+        (
+            {"rule": {"fuse": "guess", "min_probability": 0.5, "max_sweeps": 0}},
+            "sidecar cannot be used",
+        ),
+        ({"rule": {"how": "vote", "sure": 0.5, "most_sweeps": 0}}, "sidecar cannot be used"),
         ({"rule": 3}, "sidecar cannot be used"),
         ({"run": "first"}, "sidecar cannot be used"),
         ({"verdict": 7}, "sidecar cannot be used"),
