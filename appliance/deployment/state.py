@@ -1,4 +1,4 @@
-"""What the store knows of each bundle beside its files. In: the bytes of ledger.json. Out: a
+"""What the store knows of each bundle beside its files. In: the bytes of bundles.json. Out: a
 StoreState, and changed ones.
 
 Values only; `store` reads and writes the file. A bundle is named by the sha256 of its manifest, the
@@ -14,6 +14,8 @@ from typing import Any
 from appliance.core.errors import BundleError
 from appliance.core.schema import typed
 
+STATE_FILE, OLD_STATE_FILE = "bundles.json", "ledger.json"
+"""The file of a StoreState, and its name in earlier versions."""
 PACKAGED = ""
 """The bundle that comes with the program. It is never on trial."""
 MOST_STARTS = 3
@@ -125,12 +127,12 @@ class StoreState:
             )
 
     def json(self) -> bytes:
-        """The content of ledger.json."""
+        """The content of bundles.json."""
         return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
 
     @classmethod
     def parse(cls, text: bytes) -> StoreState:
-        """From the content of ledger.json. Raises ValueError or TypeError naming what is wrong.
+        """From the content of bundles.json. Raises ValueError or TypeError naming what is wrong.
 
         A field that this version does not know is left out: a newer program wrote it before it was
         gone back from, and its bundles must still start. What this version writes is then without

@@ -2,7 +2,7 @@
 whole at every moment.
 
 In the store's folder, `bundles/SHA/` (bundle.name) are whole, verified bundles, the symlink
-`current` names the one that runs (missing: the packaged one), and `ledger.json` holds all else
+`current` names the one that runs (missing: the packaged one), and `bundles.json` holds all else
 (StoreState). Each step is one atomic rename of a file, a folder or the link, and what the step
 relies on is on the disk before:
 
@@ -39,7 +39,14 @@ from appliance.core.log import log
 from appliance.deployment import signature
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.sandbox import run_limited
-from appliance.deployment.state import MOST_CUTS, MOST_STARTS, PACKAGED, StoreState
+from appliance.deployment.state import (
+    MOST_CUTS,
+    MOST_STARTS,
+    OLD_STATE_FILE,
+    PACKAGED,
+    STATE_FILE,
+    StoreState,
+)
 from appliance.deployment.trial import Trial
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")
@@ -184,7 +191,8 @@ class Store:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
         key = EnrolmentKey(Path(settings.enrolment_key))
         self.bundles = BundleFolder(self.folder / "bundles", Path(settings.signers), key)
-        self._link, self._state_file = self.folder / "current", self.folder / "ledger.json"
+        self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
+        self._old_state_file = self.folder / OLD_STATE_FILE
         self._clock, self._boot_file = clock or SystemClock(), boot
 
     @property
@@ -203,15 +211,25 @@ class Store:
 
     @property
     def state(self) -> StoreState:
-        """What is known of the bundles; empty where nothing was ever deployed."""
+        """The state of the bundles; empty where nothing was ever deployed.
+
+        A store that an earlier version wrote is read from its old file until the first write.
+        """
+        # the new file a second time: a writer may have replaced the old one between the two reads
+        for path in (self._state_file, self._old_state_file, self._state_file):
+            with suppress(FileNotFoundError):
+                return self._parsed(path)
+        return StoreState()
+
+    def _parsed(self, path: Path) -> StoreState:
+        """The state in a file. Raises FileNotFoundError, and BundleError for other content."""
+        text = path.read_bytes()
         try:
-            return StoreState.parse(self._state_file.read_bytes())
-        except FileNotFoundError:
-            return StoreState()
+            return StoreState.parse(text)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
-                f"{self._state_file} cannot be read: {e}; without this file the current bundle counts as committed, and any "
-                "counter is taken: remove it if you can vouch for both"
+                f"{path} cannot be read: {e}; without this file the current bundle counts as "
+                "committed, and any counter is taken: remove it if you can vouch for both"
             ) from e
 
     def examine(self, folder: Path) -> SignedBundle:
@@ -421,6 +439,8 @@ class Store:
 
     def _write(self, state: StoreState) -> None:
         storage.put(self._state_file, state.json())
+        # only now: while both files are there, the new one holds
+        self._old_state_file.unlink(missing_ok=True)
 
     def _set_current(self, sha: str) -> None:
         """Make `current` lead to a bundle, in one step."""

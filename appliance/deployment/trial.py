@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.deployment.state import STATE_FILE
 
 if TYPE_CHECKING:
     from appliance.core.config import StoreConfig
@@ -58,7 +59,7 @@ class Trial(Observer):
         self._last_ns: int | None = None  # the last turn's time, where frames came in it
         self._next_ns, self._over = 0, False
         self._log = TroubleLog(
-            f"trial of bundle {sha[:8]}: ledger.json cannot be written", "it is tried again"
+            f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
         )
 
     @property

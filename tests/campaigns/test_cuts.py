@@ -293,7 +293,7 @@ def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
         (
             "the ledger in place",
             "write",
-            r"first start: exit code 78, .*ledger.json cannot be read",
+            r"first start: exit code 78, .*bundles.json cannot be read",
         ),
     ],
     ids=["link", "ledger"],
@@ -306,7 +306,9 @@ def test_deliveries_that_are_wrong_are_found(
     (moment,) = [
         m
         for m in played.moments()
-        if m.call and m.call.name == call and m.call.paths[0].endswith(("/current", "/ledger.json"))
+        if m.call
+        and m.call.name == call
+        and m.call.paths[0].endswith(("/current", "/bundles.json"))
     ]
     assert re.search(what, str(played.kill(moment).wrong))
 

@@ -98,8 +98,8 @@ class DeliveredStore:
 
     @property
     def ledger(self) -> dict[str, Any]:
-        """The content of ledger.json: what the box knows of its bundles."""
-        return dict(json.loads(self.machine.get("cat", "/var/lib/palpate/ledger.json")))
+        """The content of bundles.json: what the box knows of its bundles."""
+        return dict(json.loads(self.machine.get("cat", "/var/lib/palpate/bundles.json")))
 
     def starts(self, sha: str) -> int:
         """How many starts count against a bundle."""

@@ -441,8 +441,8 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(
 def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
     """Its content is not guessed."""
     box.installed(1)
-    Path(box.how.folder, "ledger.json").write_text(text)
-    with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
+    Path(box.how.folder, "bundles.json").write_text(text)
+    with pytest.raises(BundleError, match=r"bundles\.json cannot be read"):
         box.start()
 
 
@@ -451,7 +451,7 @@ def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Deliv
     """Fields that it does not know, of the store and of each bundle, are nothing to it: bundle,
     trial and counter are as they were, and the newer program reads what this one writes."""
     one, two = box.committed(1), box.installed(2)
-    ledger = Path(box.how.folder, "ledger.json")
+    ledger = Path(box.how.folder, "bundles.json")
     newer = json.loads(ledger.read_text()) | {"format": 9, "kept": {"a": [1]}}
     newer["standings"] = {
         sha: held | {"heat": 4.5, "owner": {"name": "x"}}
@@ -466,6 +466,69 @@ def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Deliv
     assert "heat" not in ledger.read_text()
     with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
         box.store.install(box.made(1, name="older"))
+
+
+@pytest.mark.slow
+def test_a_box_that_is_upgraded_keeps_its_trial_and_its_counter(box: Delivery):
+    """An earlier version named the file ledger.json. The trial goes on, the counter holds, and one
+    file is left."""
+    one, two = box.committed(1), box.installed(2)
+    assert box.start() == two
+    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
+    new.rename(old)
+    before = box.store.state
+    assert (before.counter, before.of(two).starts, before.of(two).previous) == (1, 1, one)
+    assert not new.exists()  # reading writes nothing
+    assert box.start() == two
+    assert box.store.state.of(two).starts == 2
+    assert new.exists()
+    assert not old.exists()
+    assert box.start() == two
+    assert box.start() == one  # after three starts without a commit
+    with pytest.raises(BundleError, match="counter 0, and 1 was committed"):
+        box.store.install(box.made(0, name="older"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", ["before the new file", "before the old one goes"])
+def test_a_power_cut_during_the_upgrade_loses_no_state(
+    box: Delivery, cut: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The start that was being counted is counted or not; bundle, counter and way back are kept."""
+    one, two = box.committed(1), box.installed(2)
+    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
+    new.rename(old)
+
+    class PowerCutError(BaseException):
+        """Ends the program at once, as a power cut does."""
+
+    def off(*_: object, **__: object) -> None:
+        raise PowerCutError
+
+    with monkeypatch.context() as patch:
+        if cut == "before the new file":
+            patch.setattr(store.storage, "put", off)
+        else:
+            patch.setattr(Path, "unlink", off)
+        with pytest.raises(PowerCutError):
+            box.store.choose()
+    counted = int(cut != "before the new file")
+    assert (old.exists(), new.exists()) == (True, bool(counted))
+    state = box.store.state
+    assert (state.counter, state.of(two).starts, state.of(two).previous) == (1, counted, one)
+    assert box.start() == two
+    assert box.store.state.of(two).starts == counted + 1
+    assert not old.exists()
+
+
+def test_an_old_state_that_cannot_be_read_is_named(box: Delivery):
+    """The state of an earlier version is not guessed either."""
+    box.installed(1)
+    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
+    new.unlink()
+    old.write_text("{")
+    with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
+        box.start()
 
 
 def test_a_link_out_of_the_store_is_refused(box: Delivery):

@@ -163,7 +163,7 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
     """There is a turn about every millisecond; a file is written only when a fact has changed."""
     trial = box.tried()
     trial.turn(health(0))
-    book = Path(box.how.folder, "ledger.json")
+    book = Path(box.how.folder, "bundles.json")
     before = book.stat().st_mtime_ns, book.stat().st_ino
     for t in range(100):
         trial.turn(health(t))
@@ -270,7 +270,7 @@ def test_a_full_disk_is_told_once_and_tried_again(
         trial.stopping()
     assert len(calls) == 3
     assert logged[1:] == [
-        f"<4>trial of bundle {box.two[:8]}: ledger.json cannot be written: No space left on device; it is tried again"
+        f"<4>trial of bundle {box.two[:8]}: bundles.json cannot be written: No space left on device; it is tried again"
     ]
     trial.turn(health(30))
     assert box.standing.committed
