@@ -50,7 +50,7 @@ class Expected:
         """What a bundle says."""
         m = model.manifest
         named = f"{m.name} {m.version}, {model.id}"
-        return cls(m.format, named, m.thresholds.contact, m.place, normal(m.tare, 0), fingertip)
+        return cls(m.format, named, m.thresholds.contact, m.contact, normal(m.tare, 0), fingertip)
 
     def json(self) -> dict[str, Any]:
         """All but format and bundle, for the feed."""

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle import arrays, enrolled
-from appliance.bundle.contents import AddedLabels, Bundle, Classes, MovedClasses
+from appliance.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClasses
 from appliance.bundle.enrolled import ENROLMENT
 from appliance.bundle.manifest import (
     GOLDEN,
@@ -40,10 +40,10 @@ from appliance.bundle.manifest import (
     MEANS,
     MODEL,
     MOST_BYTES,
+    DisplacementRule,
     Early,
     Known,
     Manifest,
-    Moved,
     Thresholds,
 )
 from appliance.bundle.onnx_check import check
@@ -70,11 +70,11 @@ __all__ = [
     "AddedLabels",
     "Bundle",
     "Classes",
+    "DisplacedClasses",
+    "DisplacementRule",
     "Early",
     "Known",
     "Manifest",
-    "Moved",
-    "MovedClasses",
     "Thresholds",
     "digest",
     "file_entry",
@@ -242,8 +242,10 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
 def _classes(data: bytes, manifest: Manifest) -> Classes:
     """Content of means.npz: one row per label, trained labels first."""
     n = len(manifest.labels)
-    moved = [f"moved_{name}" for name in MovedClasses.__slots__] if manifest.moved else []
-    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *moved)
+    displaced = (
+        [f"moved_{name}" for name in DisplacedClasses.__slots__] if manifest.displacement else []
+    )
+    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced)
     held.setdefault("spread", np.ones(n, np.float32))
     held.setdefault("shapes", np.zeros((n, 0, 0), np.float16))
     arrays.check_classes(held, n)
@@ -262,5 +264,5 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
         sweeps,
         held["spread"],
         held["shapes"],
-        MovedClasses(*(held[name] for name in moved)) if moved else None,
+        DisplacedClasses(*(held[name] for name in displaced)) if displaced else None,
     )

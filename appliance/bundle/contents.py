@@ -14,8 +14,8 @@ from appliance.core.types import SweepFormat
 
 
 @dataclass(frozen=True, slots=True)
-class MovedClasses:
-    """The classes as they are where the contact has moved, in the embedding turned so that moved
+class DisplacedClasses:
+    """The classes for sweeps whose contact is displaced, in the embedding turned so that these
     sweeps have covariance 1.
 
     turn: float32 [r, r], embedding @ turn is the turned one. means: float32 [K, r]; shapes: float16
@@ -37,8 +37,8 @@ class Classes:
     label, and for all labels if the file has no such array. shapes: float16 [K, b, b], how the
     label's sweeps scatter in the last b directions of the embedding: what a difference from the
     mean is multiplied by before it is squared; 1 for an enrolled label, b = 0 if the file has no
-    such array. moved: the same for sweeps whose contact has moved, None if the manifest has no
-    `moved`.
+    such array. displaced: the same for sweeps whose contact is displaced, None if the manifest has
+    no rule for these.
     """
 
     means: NDArray[np.float32]
@@ -46,14 +46,14 @@ class Classes:
     sweeps: NDArray[np.int64]
     spread: NDArray[np.float32]
     shapes: NDArray[np.float16]
-    moved: MovedClasses | None = None
+    displaced: DisplacedClasses | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of means.npz by name."""
-        own = {name: getattr(self, name) for name in self.__slots__ if name != "moved"}
+        """The arrays of means.npz by name. Those of `displaced` are named moved_* in the file."""
+        own = {name: getattr(self, name) for name in self.__slots__ if name != "displaced"}
         return own | (
-            {f"moved_{name}": getattr(self.moved, name) for name in self.moved.__slots__}
-            if self.moved
+            {f"moved_{name}": getattr(self.displaced, name) for name in self.displaced.__slots__}
+            if self.displaced
             else {}
         )
 

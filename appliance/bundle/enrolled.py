@@ -3,7 +3,7 @@ enrolment.npz. Out: the bundle with these labels, or a BundleError.
 
 Nothing of the bundle is changed: its files stay as they are, and its own signature covers them. The
 file holds, of each label, the mean of its sweeps in the embedding, their number and spread, and a
-golden sweep; all that a class has besides (bias, shape, mean where the contact has moved) is
+golden sweep; all that a class has besides (bias, shape, mean where the contact is displaced) is
 computed from these. So a label is all that an enrolment can add.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle import arrays
-from appliance.bundle.contents import AddedLabels, Bundle, Classes, MovedClasses
+from appliance.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClasses
 from appliance.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"
@@ -97,15 +97,17 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
     """`classes` with one more label, whose `sweeps` have this mean [r] in the embedding.
 
     Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on average larger than
-    that of the true mean, by r / n. Its shape is that of all materials together. A moved skin is
+    that of the true mean, by r / n. Its shape is that of all materials together. A displacement is
     assumed to change its mean as it changes those of the trained labels on average.
     """
-    row, moved = mean.astype(np.float32).astype(np.float64), classes.moved
-    if moved:
+    row, displaced = mean.astype(np.float32).astype(np.float64), classes.displaced
+    if displaced:
         trained = classes.sweeps == 0
-        change = (moved.means - classes.means.astype(np.float64) @ moved.turn)[trained].mean(axis=0)
-        means = np.vstack([moved.means, row @ moved.turn + change]).astype(np.float32)
-        moved = MovedClasses(moved.turn, means, _one_more(moved.shapes))
+        change = (displaced.means - classes.means.astype(np.float64) @ displaced.turn)[
+            trained
+        ].mean(axis=0)
+        means = np.vstack([displaced.means, row @ displaced.turn + change]).astype(np.float32)
+        displaced = DisplacedClasses(displaced.turn, means, _one_more(displaced.shapes))
     with np.errstate(over="ignore"):  # what is not finite then is refused
         bias = -(row @ row) / 2 + len(row) / (2 * sweeps)
         return Classes(
@@ -114,7 +116,7 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
             np.append(classes.sweeps, sweeps),
             np.append(classes.spread, spread).astype(np.float32),
             _one_more(classes.shapes),
-            moved,
+            displaced,
         )
 
 

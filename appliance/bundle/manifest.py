@@ -10,7 +10,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,9 @@ from appliance.signal.window_check import WindowLimits
 SCHEMA = 4
 """Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`,
 `place`) and 3 (without `moved`) are read."""
+FILE_KEYS = {"displacement": "moved", "contact": "place"}
+"""Fields of Manifest whose keys in manifest.json have other names. Signed bundles hold these keys,
+so the file keeps them; messages name the keys, too."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
@@ -86,11 +89,11 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
-    """Rule for sweeps whose contact has moved, by `place`. Raises BundleError for a number out of
-    range.
+class DisplacementRule:
+    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
+    number out of range.
 
-    limit: as that of Known, for distances between moved sweeps. temperature: divisor of logits that
+    limit: as that of Known, for distances between displaced sweeps. temperature: divisor of logits that
     are calibrated for sweeps in place. unsure: least probability for status ok; above 1 no such
     sweep is ok by itself.
     """
@@ -103,7 +106,7 @@ class Moved:
         _check_positive(self, "moved")
 
 
-def _check_positive(rule: Known | Moved, where: str) -> None:
+def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
         if not _positive(value := getattr(rule, name)):
             raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
@@ -118,9 +121,9 @@ class Manifest:
     """The manifest of a bundle. Raises BundleError for values out of range.
 
     input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation
-    protocol. made: commit, seed and machine of the export. early, known, place, moved: rules for
-    early answers and unknown materials, contact positions of training, and the rule for contacts
-    elsewhere; None if the bundle does not support them. unloaded: raw counts of the skin without
+    protocol. made: commit, seed and machine of the export. early, known: rules for
+    early answers and unknown materials. contact: contact positions of training. displacement: rule
+    for contacts elsewhere. Each is None if the bundle does not support it. unloaded: raw counts of the skin without
     contact, the values of a frame in their order; () where they are not known, which `json` omits.
     runtime: least version of the box that can run it. counter: increases with each signed bundle,
     so that an older one cannot be installed unnoticed; 0 was never signed.
@@ -137,8 +140,8 @@ class Manifest:
     made: dict[str, Any] = field(default_factory=dict)
     early: Early | None = None
     known: Known | None = None
-    place: ContactPositions | None = None
-    moved: Moved | None = None
+    contact: ContactPositions | None = None
+    displacement: DisplacementRule | None = None
     runtime: str = "0.0.0"
     counter: int = 0
     unloaded: tuple[float, ...] = ()
@@ -159,11 +162,11 @@ class Manifest:
             raise BundleError(
                 f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
             )
-        if self.moved and not (self.known and self.place):
+        if self.displacement and not (self.known and self.contact):
             raise BundleError(
                 "manifest has `moved` without `known` and `place`; export the bundle again"
             )
-        if self.place and self.thresholds.contact is None:
+        if self.contact and self.thresholds.contact is None:
             raise BundleError(
                 "manifest has `place` without `thresholds.contact`; export the bundle again"
             )
@@ -185,7 +188,8 @@ class Manifest:
 
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
-        values = asdict(self) | {"format": self.format.json()}
+        values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
+        values["format"] = self.format.json()
         if not self.unloaded:
             del values["unloaded"]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
@@ -201,11 +205,22 @@ class Manifest:
         """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong
         type."""
         try:
-            made = typed(cls, json.loads(text))
+            made = typed(cls, _by_field(json.loads(text)))
             made.json()  # raises if it is nested too deeply to be written again after enrolment
             return made
         except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
             raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
+
+
+def _by_field(raw: Any) -> Any:
+    """The content of manifest.json under the names of Manifest's fields. Raises TypeError for an
+    unknown key."""
+    if not isinstance(raw, dict):
+        return raw
+    names = {FILE_KEYS.get(f.name, f.name): f.name for f in fields(Manifest)}
+    if unknown := sorted(raw.keys() - names.keys()):
+        raise TypeError(f"{unknown!r} is none of {', '.join(names)}")
+    return {names[key]: value for key, value in raw.items()}
 
 
 def version(text: object) -> tuple[int, ...]:
@@ -222,11 +237,11 @@ def _check_age(m: Manifest) -> None:
         raise BundleError(
             "manifest schema 1 has no `early` and no `known`; export the bundle again"
         )
-    if m.schema < 3 and (m.place or m.counter or m.runtime != "0.0.0"):
+    if m.schema < 3 and (m.contact or m.counter or m.runtime != "0.0.0"):
         raise BundleError(
             f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again"
         )
-    if m.schema < 4 and m.moved:
+    if m.schema < 4 and m.displacement:
         raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
 
 

@@ -216,9 +216,9 @@ class Verdict:
     what the status refers to ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as in Sweep.
     latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share: share of
     the window that was used, less than 1 in an early answer. own: float64 [K] probabilities of this
-    sweep alone; empty if nothing was classified. moved: distance of the contact from its position
-    in training ("moved 2.1 mm too far towards row 4"); "" if it is in place, or if the bundle does
-    not hold the positions.
+    sweep alone; empty if nothing was classified. displacement: distance of the contact from its
+    positions in training ("moved 2.1 mm too far towards row 4"); "" if it is in place, or if the
+    bundle does not hold the positions.
     """
 
     sweep: int
@@ -235,12 +235,16 @@ class Verdict:
     detail: str = ""
     share: float = 1.0
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    moved: str = ""
+    displacement: str = ""
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit. arrays: include `scores`
         and `own`, as lists."""
-        values = {name: getattr(self, name) for name in Verdict.__slots__}
+        # sidecars, the feed and the status file call the displacement `moved`
+        values = {
+            "moved" if name == "displacement" else name: getattr(self, name)
+            for name in Verdict.__slots__
+        }
         lists = {
             name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
         }

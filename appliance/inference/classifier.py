@@ -20,7 +20,7 @@ from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.novelty import Means
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
-from appliance.signal.contact import moved
+from appliance.signal.contact import displacement
 from appliance.signal.window_check import Finding, inspect
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Classifier:
     """Runs one bundle in one thread.
 
     Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is
-    answered by itself. A sweep whose contact has moved is judged by the bundle's rule for it, where
+    answered by itself. A sweep whose contact is displaced is judged by the bundle's rule for it, where
     there is one: its own distances, limit and temperature, and at least its probability. They are a
     sequential test: `unsure` asks for one more sweep of the object, until the probability is at
     least `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the
@@ -91,8 +91,8 @@ class Classifier:
         self.tare = bundle.manifest.tare
         known, classes = bundle.manifest.known, bundle.classes
         self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
-        rule = bundle.manifest.moved
-        self._moved_means = (
+        rule = bundle.manifest.displacement
+        self._displaced_means = (
             Means(classes, known, bundle.manifest.labels, rule)
             if rule and known and classes
             else None
@@ -206,23 +206,23 @@ class Classifier:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        moved, rule = self._moved(sweep), self.bundle.manifest.moved
-        logits, novelty = self._classify(sweep.frames.taxels, bool(moved))
+        displaced, rule = self._displacement(sweep), self.bundle.manifest.displacement
+        logits, novelty = self._classify(sweep.frames.taxels, bool(displaced))
         if novelty:
-            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), moved=moved)
+            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), displacement=displaced)
         return self.conclude(
-            sweep, softmax(logits / (rule.temperature if moved and rule else 1)), moved
+            sweep, softmax(logits / (rule.temperature if displaced and rule else 1)), displaced
         )
 
     def conclude(
-        self, sweep: Sweep, scores: NDArray[np.float64], moved: str | None = None
+        self, sweep: Sweep, scores: NDArray[np.float64], displaced: str | None = None
     ) -> Verdict:
-        """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with its
-        object's other sweeps. moved: what `_moved` gave for it, computed where it is None."""
-        moved = self._moved(sweep) if moved is None else moved
+        """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with the
+        other sweeps of the object. displaced: result of `_displacement`; None: it is computed here."""
+        displaced = self._displacement(sweep) if displaced is None else displaced
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
             return self._verdict(
-                sweep, Finding(Status.UNKNOWN, "the model gives no number"), moved=moved
+                sweep, Finding(Status.UNKNOWN, "the model gives no number"), displacement=displaced
             )
         if sweep.object == 0 or sweep.object != self._object or self._fusion == "none":
             self._object, self._scores = sweep.object, []
@@ -230,10 +230,10 @@ class Classifier:
         fused = len(self._scores)
         if fused > 1:
             scores = fuse(self._scores, self._fusion)
-        status, rule = Status.OK, self.bundle.manifest.moved
-        if scores.max() < max(self.min_probability, rule.unsure if moved and rule else 0):
+        status, rule = Status.OK, self.bundle.manifest.displacement
+        if scores.max() < max(self.min_probability, rule.unsure if displaced and rule else 0):
             status = Status.UNDECIDED if 0 < self._max_sweeps <= fused else Status.UNSURE
-        return self._verdict(sweep, Finding(status), scores, fused, own, moved)
+        return self._verdict(sweep, Finding(status), scores, fused, own, displaced)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
         """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on,
@@ -251,27 +251,27 @@ class Classifier:
         return self._model(outputs, graph_input)
 
     def _classify(
-        self, taxels: NDArray[Any], moved: bool = False
+        self, taxels: NDArray[Any], displaced: bool = False
     ) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and its distance from known materials; "" if it is like one of
         them.
 
-        moved: whether its contact has moved; what that changes then does not make a material
-        unknown.
+        displaced: whether the contact is displaced. The changes that a displacement causes then do
+        not make a material unknown.
         """
         values = self._run(self._outputs, taxels)
-        means = self._moved_means if moved and self._moved_means else self._means
+        means = self._displaced_means if displaced and self._displaced_means else self._means
         if means is None:
             return values[0], ""
         logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
         return logits, means.novelty(values[-1])
 
-    def _moved(self, sweep: Sweep) -> str:
+    def _displacement(self, sweep: Sweep) -> str:
         """Distance of the contact from its positions in training, "" if it is at one of them."""
         m = self.bundle.manifest
-        if m.place is None or m.thresholds.contact is None:
+        if m.contact is None or m.thresholds.contact is None:
             return ""
-        return moved(sweep.frames.taxels, self.tare, m.thresholds.contact, m.place)
+        return displacement(sweep.frames.taxels, self.tare, m.thresholds.contact, m.contact)
 
     def _verdict(
         self,
@@ -280,7 +280,7 @@ class Classifier:
         scores: NDArray[np.float64] = _NONE,
         fused: int = 0,
         own: NDArray[np.float64] = _NONE,
-        moved: str = "",
+        displacement: str = "",
     ) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
@@ -303,8 +303,8 @@ class Classifier:
             lost=sweep.lost,
             latency_ns=now - sweep.complete_ns,
             bundle=self.bundle.id,
-            detail="; ".join(filter(None, (moved, finding.detail))),
+            detail="; ".join(filter(None, (displacement, finding.detail))),
             share=sweep.share,
             own=own,
-            moved=moved,
+            displacement=displacement,
         )

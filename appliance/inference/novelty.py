@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Classes
-from appliance.bundle.manifest import Known, Moved
+from appliance.bundle.manifest import DisplacementRule, Known
 
 Array = NDArray[np.float64]
 
@@ -35,12 +35,16 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
 class Means:
     """Computes distances and logits from a bundle's class means. labels: those of the means, [K].
 
-    moved: the rule for sweeps whose contact has moved; the distances are then those between such
-    sweeps (`classes.moved`), in which what a moved skin changes counts for little.
+    displacement: the rule for sweeps whose contact is displaced. The distances are then computed in
+    `classes.displaced`, where directions that a displacement changes count for little.
     """
 
     def __init__(
-        self, classes: Classes, known: Known, labels: Sequence[str], moved: Moved | None = None
+        self,
+        classes: Classes,
+        known: Known,
+        labels: Sequence[str],
+        displacement: DisplacementRule | None = None,
     ) -> None:
         self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
         self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
@@ -48,11 +52,11 @@ class Means:
         # from distances, logits do not suffer the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
         shapes = classes.shapes
-        if moved and classes.moved:
-            self.limit, shapes = moved.limit, classes.moved.shapes
+        if displacement and classes.displaced:
+            self.limit, shapes = displacement.limit, classes.displaced.shapes
             self._means, self._turn = (
-                classes.moved.means.astype(np.float64),
-                classes.moved.turn.astype(np.float64),
+                classes.displaced.means.astype(np.float64),
+                classes.displaced.turn.astype(np.float64),
             )
         self._shapes = shapes.astype(np.float64)
         n = classes.sweeps

@@ -112,5 +112,7 @@ class VerdictLog(Observer):
     def answered(self, verdict: Verdict) -> None:
         """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a
         warning."""
-        fine = (verdict.status.classified or verdict.status is Status.ABORTED) and not verdict.moved
+        fine = (
+            verdict.status.classified or verdict.status is Status.ABORTED
+        ) and not verdict.displacement
         log.log(INFO if fine else WARNING, words(verdict))

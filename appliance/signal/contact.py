@@ -145,7 +145,7 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
     )
 
 
-def moved(
+def displacement(
     taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions
 ) -> str:
     """ "" if the contact of a sweep is at a trained position, otherwise for example "moved 2.1 mm

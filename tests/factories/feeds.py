@@ -51,7 +51,7 @@ OK = Verdict(
     lost=0,
     latency_ns=1_200_000,
     bundle="9f3c2a1b",
-    moved="moved 2 mm",
+    displacement="moved 2 mm",
 )
 
 

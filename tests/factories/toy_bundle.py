@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Early, Known, Manifest, Moved, Thresholds
+from appliance.bundle.bundle import Bundle, DisplacementRule, Early, Known, Manifest, Thresholds
 from appliance.core.types import Frames, Status, Sweep, SweepFormat
 from appliance.signal.contact import ContactPositions
 
@@ -25,8 +25,8 @@ FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 THREE_AXES = replace(FORMAT, axes=3)
 MEANS = np.array([[0, 0], [6, 0], [0, 6]], np.float32)
 KNOWN = Known(limit=9.0, temperature=2.0)
-MOVED = Moved(limit=4.0, temperature=3.0, unsure=0.75)
-"""Rule for moved sweeps, with the arrays of `moved_arrays`."""
+DISPLACEMENT = DisplacementRule(limit=4.0, temperature=3.0, unsure=0.75)
+"""Rule for displaced sweeps, with the arrays of `displaced_arrays`."""
 IN_PLACE = ContactPositions(1.0, (0.5,), (0.5,), 0.25)
 """The contact of a sweep with a small embedding is in the middle; a larger one draws it aside by up
 to this limit."""
@@ -134,7 +134,7 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
     } | changes
 
 
-def moved_arrays() -> dict[str, np.ndarray]:
+def displaced_arrays() -> dict[str, np.ndarray]:
     """More arrays of means.npz: in place "a" scatters twice as far in the second direction; moved
     sweeps scatter ten times as far in the first, and lie a tenth further in it."""
     shapes = np.stack([np.eye(1)] * 3).astype(np.float16)
@@ -155,8 +155,8 @@ def files(
     outputs: Sequence[str] = OUTPUTS,
     format: SweepFormat = FORMAT,
     arrays: dict[str, np.ndarray] | None = None,
-    moved: Moved | None = None,
-    place: ContactPositions | None = None,
+    displacement: DisplacementRule | None = None,
+    contact: ContactPositions | None = None,
     **graph: float,
 ) -> dict[str, bytes]:
     """The files of a toy bundle by name."""
@@ -183,8 +183,8 @@ def files(
         made={"seed": 1},
         early=early,
         known=known,
-        moved=moved,
-        place=place,
+        displacement=displacement,
+        contact=contact,
     )
     return content | {bundle.MANIFEST: manifest.json()}
 

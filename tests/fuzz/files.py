@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from appliance.bundle import bundle
+from appliance.bundle.manifest import FILE_KEYS
 from appliance.core import config, sentences, types
 from appliance.core.errors import BundleError, ConfigError, FormatError
 from appliance.io import robot_link
@@ -137,7 +138,9 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    assert json.loads(again).keys() | {"unloaded"} == {field.name for field in fields(read)}
+    assert json.loads(again).keys() | {"unloaded"} == {
+        FILE_KEYS.get(field.name, field.name) for field in fields(read)
+    }
     assert bundle.Manifest.parse(again).json() == again, (
         "what a manifest writes reads as something else"
     )

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from appliance.bundle import bundle
+from appliance.bundle.manifest import FILE_KEYS
 from appliance.core import config, sentences
 from appliance.core.types import (
     DATA_TYPES,
@@ -261,7 +262,9 @@ def words(target: str) -> Sequence[bytes]:
         "recording": (SweepFormat, Sweep),
         "capture": (SweepFormat,),
     }
-    names = [f.name for kind in kinds[target] for f in fields(kind)]
+    names = [FILE_KEYS.get(f.name, f.name) for kind in kinds[target] for f in fields(kind)]
+    if target == "manifest":
+        names.append("contact")  # key of Thresholds; a field of Manifest has the same name
     odd = [
         "NaN",
         "Infinity",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle.bundle import Classes, Moved, MovedClasses
+from appliance.bundle.bundle import Classes, DisplacedClasses, DisplacementRule
 from appliance.inference.classifier import softmax
 from train.calibration.novelty import Embedding, embed, limit
 from train.metrics.temperature import sufficient_temperature
@@ -56,12 +56,13 @@ class DisplacementFit:
     """embedding: of embeddings z, fitted to those of augmented copies. rule: for the manifest."""
 
     embedding: Embedding
-    rule: Moved
+    rule: DisplacementRule
 
     def classes(self, classes: Classes) -> Classes:
         """`classes` of the embedding z, with those of displaced contacts."""
         of = self.embedding
-        return replace(classes, moved=MovedClasses(of.projection, of.means - of.offset, of.shapes))
+        shown = DisplacedClasses(of.projection, of.means - of.offset, of.shapes)
+        return replace(classes, displaced=shown)
 
 
 def fit_displacement(
@@ -97,5 +98,5 @@ def fit_displacement(
     ]
     return DisplacementFit(
         turn(np.ones(len(labels), bool))[1],
-        Moved(beyond, temperature, enough[0] if enough else NEVER),
+        DisplacementRule(beyond, temperature, enough[0] if enough else NEVER),
     )

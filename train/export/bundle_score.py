@@ -184,7 +184,7 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
         statuses[str(verdict.status)] += 1
         given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
         hinted += verdict.status is Status.UNSURE and verdict.label == material[i]
-        moved.update([verdict.moved] if verdict.moved else [])
+        moved.update([verdict.displacement] if verdict.displacement else [])
     clusters, by = _clusters(sweeps)
     return BundleScore(
         {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id},

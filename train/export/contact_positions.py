@@ -39,7 +39,7 @@ def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[s
 
     Raises FormatError where the bundle has no positions.
     """
-    place = box.bundle.manifest.place
+    place = box.bundle.manifest.contact
     if place is None:
         raise FormatError(
             f"bundle {box.bundle.id} has no positions to compare with; export it again"
@@ -85,7 +85,7 @@ def _point(
     makes of it.
     """
     assert test.scene
-    sweeps, place, limits = test.sweeps, box.bundle.manifest.place, box.bundle.manifest.thresholds
+    sweeps, place, limits = test.sweeps, box.bundle.manifest.contact, box.bundle.manifest.thresholds
     assert place
     assert limits.contact is not None
     right, moved, wrong, unsure, unknown, network, distance_mm = (
@@ -100,7 +100,7 @@ def _point(
         named = verdict.status is Status.OK
         right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
         unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN
-        moved[i] = bool(verdict.moved)
+        moved[i] = bool(verdict.displacement)
         network[i] = box.bundle.manifest.labels[int(box.logits(window).argmax())] == truth
         found = centre(window, box.tare, limits.contact)
         distance_mm[i] = np.hypot(*place.offset(found)) if found else np.nan

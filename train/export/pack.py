@@ -81,7 +81,7 @@ class Content:
     figures: dict[str, Any] = field(default_factory=dict)
     early: bundle.Early | None = None
     known: bundle.Known | None = None
-    moved: bundle.Moved | None = None
+    moved: bundle.DisplacementRule | None = None
     means: bytes = b""
     reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
@@ -113,12 +113,12 @@ def pack(
         input=content.input,
         labels=content.train.materials,
         thresholds=thresholds(content.train, contacts.limit.contact, full_scale),
-        place=contacts.positions(pitch_mm),
+        contact=contacts.positions(pitch_mm),
         unloaded=contacts.limit.known_tare(),
         runtime=RUNTIME,
         early=content.early,
         known=content.known,
-        moved=content.moved,
+        displacement=content.moved,
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit, contacts.limit.why),
     )

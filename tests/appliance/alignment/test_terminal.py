@@ -40,7 +40,7 @@ MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
-    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, contact=MIDDLE))
 
 
 def views_of(
@@ -133,7 +133,9 @@ def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
     position is compared."""
     m = model.manifest
     limits = replace(m.thresholds, contact=None)
-    without = replace(model, manifest=replace(m, place=None, moved=None, thresholds=limits))
+    without = replace(
+        model, manifest=replace(m, contact=None, displacement=None, thresholds=limits)
+    )
     last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
     assert last.hint == (
@@ -160,7 +162,7 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
 def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
     """The View says that there are none, and what to do; the centre is in taxels."""
     without = replace(
-        default_bundle, manifest=replace(default_bundle.manifest, place=None, moved=None)
+        default_bundle, manifest=replace(default_bundle.manifest, contact=None, displacement=None)
     )
     views = views_of(resting(), without)
     last = [v for v in views(14.5) if v.centre][-1]
@@ -231,7 +233,7 @@ def test_another_skin_shape(model: Bundle):
         manifest=replace(
             model.manifest,
             format=format,
-            place=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0)),
+            contact=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0)),
         ),
     )
     load = np.zeros((3000, 2, 3), np.float32)
@@ -381,7 +383,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in bundle.load(bundle.DEFAULT).manifest.files:
         (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
     manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
-    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=MIDDLE).json())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, contact=MIDDLE).json())
     return target
 
 

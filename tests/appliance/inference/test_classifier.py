@@ -123,7 +123,7 @@ def of_features(weights: np.ndarray) -> dict[str, bytes]:
     manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
     return files | {
         bundle.MANIFEST: replace(
-            manifest, input="L", early=None, known=None, moved=None, files=entries
+            manifest, input="L", early=None, known=None, displacement=None, files=entries
         ).json()
     }
 
@@ -393,6 +393,8 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
         ({"known": None}, "both `known` and means.npz"),
         ({"schema": 1}, "schema 1 has no"),
         ({"moved": MOVED}, "`moved` without `known` and `place`"),
+        ({"displacement": MOVED, "place": PLACE}, r"\['displacement'\] is none of"),
+        ({"contact": PLACE}, r"\['contact'\] is none of"),
         ({"moved": MOVED | {"limit": 0}, "place": PLACE}, "moved.limit 0 must"),
         ({"moved": MOVED | {"temperature": -1}, "place": PLACE}, "moved.temperature -1 must"),
         ({"moved": MOVED | {"unsure": "0.5"}, "place": PLACE}, "unsure"),
@@ -431,12 +433,14 @@ def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: s
         ),
         (
             toy_bundle.means(
-                **toy_bundle.moved_arrays() | {"moved_turn": np.eye(3, dtype=np.float32)}
+                **toy_bundle.displaced_arrays() | {"moved_turn": np.eye(3, dtype=np.float32)}
             ),
             "moved_turn float32 .3",
         ),
         (
-            toy_bundle.means(**toy_bundle.moved_arrays() | {"moved_means": toy_bundle.MEANS[:2]}),
+            toy_bundle.means(
+                **toy_bundle.displaced_arrays() | {"moved_means": toy_bundle.MEANS[:2]}
+            ),
             "moved_means float32 .2",
         ),
         (toy_bundle.means(sweeps=np.zeros(3, np.int32)), "sweeps int32"),

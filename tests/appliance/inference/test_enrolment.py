@@ -176,8 +176,10 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
 def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
     """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained
     labels' means are."""
-    arrays = toy_bundle.means(**toy_bundle.moved_arrays())
-    signed = toy_bundle.files(arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE)
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
+    signed = toy_bundle.files(
+        arrays=arrays, displacement=toy_bundle.DISPLACEMENT, contact=toy_bundle.IN_PLACE
+    )
     new = enrolment.enrol(
         bundle.load(toy_bundle.put(tmp_path / "old", signed)), "felt", counts(*FELT)
     )
@@ -185,11 +187,11 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
         toy_bundle.put(tmp_path / "new", enrolment.files(signed, new, None))
     ).classes
     assert classes is not None
-    assert classes.moved is not None
+    assert classes.displaced is not None
     assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
-    assert classes.moved.shapes.ravel().tolist() == [1, 1, 1, 1]
-    assert classes.moved.means[3] == pytest.approx([0.7 + 0.1, 8], abs=1e-5)
-    assert classes.moved.means[:3].tolist() == arrays["moved_means"].tolist()
+    assert classes.displaced.shapes.ravel().tolist() == [1, 1, 1, 1]
+    assert classes.displaced.means[3] == pytest.approx([0.7 + 0.1, 8], abs=1e-5)
+    assert classes.displaced.means[:3].tolist() == arrays["moved_means"].tolist()
 
 
 def test_early_answers_end_with_an_enrolment(tmp_path: Path):

@@ -23,46 +23,52 @@ def elsewhere(z1: float, z2: float, number: int = 1, object: int = 0) -> Sweep:
 
 
 @pytest.fixture
-def moved_box(tmp_path: Path) -> Classifier:
+def displaced_box(tmp_path: Path) -> Classifier:
     """The toy bundle with a rule for moved sweeps."""
-    arrays = toy_bundle.means(**toy_bundle.moved_arrays())
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     it = toy_bundle.load(
-        tmp_path / "toy", arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE
+        tmp_path / "toy",
+        arrays=arrays,
+        displacement=toy_bundle.DISPLACEMENT,
+        contact=toy_bundle.IN_PLACE,
     )
     return Classifier(it, VirtualClock(), max_sweeps=2)
 
 
-def test_a_material_has_its_own_shape(moved_box: Classifier):
+def test_a_material_has_its_own_shape(displaced_box: Classifier):
     """In the second direction "a" scatters twice as far as "b": it is known at a distance of 5.5,
     and "b" is not."""
-    assert moved_box(toy_bundle.sweep(0, -5.5)).label == "a"
-    assert moved_box(toy_bundle.sweep(0, -6.5)).status is Status.UNKNOWN
-    assert moved_box(toy_bundle.sweep(6, -2.5)).label == "b"
-    assert moved_box(toy_bundle.sweep(6, -3.5)).status is Status.UNKNOWN
+    assert displaced_box(toy_bundle.sweep(0, -5.5)).label == "a"
+    assert displaced_box(toy_bundle.sweep(0, -6.5)).status is Status.UNKNOWN
+    assert displaced_box(toy_bundle.sweep(6, -2.5)).label == "b"
+    assert displaced_box(toy_bundle.sweep(6, -3.5)).status is Status.UNKNOWN
 
 
-def test_what_a_moved_skin_changes_makes_no_material_unknown(moved_box: Classifier):
+def test_what_a_moved_skin_changes_makes_no_material_unknown(displaced_box: Classifier):
     """Where the contact has moved, the first direction counts a tenth and the limit is another:
     what is unknown in place is known there, and the reverse."""
-    assert moved_box(toy_bundle.sweep(-3.5, 0)).status is Status.UNKNOWN
-    v = moved_box(elsewhere(-3.5, 0))
+    assert displaced_box(toy_bundle.sweep(-3.5, 0)).status is Status.UNKNOWN
+    v = displaced_box(elsewhere(-3.5, 0))
     assert (v.status, v.label) == (Status.OK, "a")
-    assert v.moved
-    assert moved_box(toy_bundle.sweep(0, -2.5)).label == "a"
-    v = moved_box(elsewhere(0, -2.5))
+    assert v.displacement
+    assert displaced_box(toy_bundle.sweep(0, -2.5)).label == "a"
+    v = displaced_box(elsewhere(0, -2.5))
     assert v.status is Status.UNKNOWN
     assert v.detail.endswith("; squared distance 6.26 from a, limit 4")
-    assert v.moved
+    assert v.displacement
 
 
-def test_a_moved_sweep_needs_its_own_probability(moved_box: Classifier):
+def test_a_moved_sweep_needs_its_own_probability(displaced_box: Classifier):
     """Its logits are divided by the rule's temperature, and below the rule's probability it is
     unsure: a second sweep of the object decides, or `max_sweeps` end it."""
     z = (2.2, 0.0)  # logits of "a" and "b" are (0, 6 * 2.2 - 18) / 2 = (0, -2.4), in place
-    assert moved_box(toy_bundle.sweep(*z)).probability == pytest.approx(
+    assert displaced_box(toy_bundle.sweep(*z)).probability == pytest.approx(
         1 / (1 + np.exp(-2.4) + np.exp(-9)), abs=1e-3
     )
-    first, second = moved_box(elsewhere(*z, 2, object=1)), moved_box(elsewhere(*z, 3, object=1))
+    first, second = (
+        displaced_box(elsewhere(*z, 2, object=1)),
+        displaced_box(elsewhere(*z, 3, object=1)),
+    )
     p = 1 / (1 + np.exp(-2.4 / 3) + np.exp(-9 / 3))
     assert (first.status, first.label, first.probability) == (
         Status.UNSURE,
@@ -70,32 +76,38 @@ def test_a_moved_sweep_needs_its_own_probability(moved_box: Classifier):
         pytest.approx(p, abs=1e-3),
     )
     assert (second.status, second.fused) == (Status.OK, 2)
-    least = Classifier(moved_box.bundle, VirtualClock(), min_probability=0.99)
+    least = Classifier(displaced_box.bundle, VirtualClock(), min_probability=0.99)
     assert least(elsewhere(*z, 4)).status is Status.UNSURE
 
 
 def test_without_a_rule_a_moved_sweep_is_judged_as_any(tmp_path: Path):
     """A bundle with places alone, as older ones are: the sweep is marked, and the distances are
     those in place."""
-    it = Classifier(toy_bundle.load(tmp_path / "toy", place=toy_bundle.IN_PLACE), VirtualClock())
+    it = Classifier(toy_bundle.load(tmp_path / "toy", contact=toy_bundle.IN_PLACE), VirtualClock())
     v = it(elsewhere(-3.5, 0))
     assert v.status is Status.UNKNOWN
-    assert v.moved
+    assert v.displacement
     assert it(elsewhere(0, -2.5)).label == "a"
 
 
 def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
     """Once a label is enrolled, logits come from means: those of moved sweeps where the contact has
     moved."""
-    arrays = toy_bundle.means(**toy_bundle.moved_arrays(), sweeps=np.array([0, 0, 2]))
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays(), sweeps=np.array([0, 0, 2]))
     made = toy_bundle.load(
-        tmp_path / "toy", arrays=arrays, labels=2, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE
+        tmp_path / "toy",
+        arrays=arrays,
+        labels=2,
+        displacement=toy_bundle.DISPLACEMENT,
+        contact=toy_bundle.IN_PLACE,
     )
     it = Classifier(made, VirtualClock())
     v = it(elsewhere(-3.5, 0))
     away = np.array([-0.35, 0]) - arrays["moved_means"]
     extra = arrays["bias"] + (toy_bundle.MEANS**2).sum(1) / 2
     logits = (
-        (extra - (away**2).sum(1) / 2) / toy_bundle.KNOWN.temperature / toy_bundle.MOVED.temperature
+        (extra - (away**2).sum(1) / 2)
+        / toy_bundle.KNOWN.temperature
+        / toy_bundle.DISPLACEMENT.temperature
     )
     assert v.scores == pytest.approx(softmax(logits), abs=1e-3)

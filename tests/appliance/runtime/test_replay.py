@@ -283,9 +283,12 @@ def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
 
 def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
     """The rule is read under its old names: the settings of today would give other verdicts."""
-    arrays = toy_bundle.means(**toy_bundle.moved_arrays())
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     made = toy_bundle.load(
-        tmp_path / "bundle", arrays=arrays, moved=toy_bundle.MOVED, place=toy_bundle.IN_PLACE
+        tmp_path / "bundle",
+        arrays=arrays,
+        displacement=toy_bundle.DISPLACEMENT,
+        contact=toy_bundle.IN_PLACE,
     )
     abouts = [sidecar(path) for path in sorted(SIDECARS_2.glob("*.npy"))]
     assert [(about["schema"], about["verdict"]["fused"]) for about in abouts] == [

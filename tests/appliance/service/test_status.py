@@ -284,7 +284,7 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
             "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)",
         ),
         (
-            replace(OK, moved="moved 2 mm", detail="moved 2 mm"),
+            replace(OK, displacement="moved 2 mm", detail="moved 2 mm"),
             "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm",
         ),
         (

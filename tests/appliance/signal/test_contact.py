@@ -15,7 +15,13 @@ from appliance.core.errors import BundleError
 from appliance.core.sentences import MAX_LINE
 from appliance.core.types import Status, Verdict
 from appliance.io.robot_link import result
-from appliance.signal.contact import ContactPositions, advice, centre, fill_dead_taxels, moved
+from appliance.signal.contact import (
+    ContactPositions,
+    advice,
+    centre,
+    displacement,
+    fill_dead_taxels,
+)
 from appliance.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch
 
@@ -50,8 +56,8 @@ def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: 
 
 def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
     """Written as JSON and read again it is the same."""
-    manifest = replace(default_bundle.manifest, place=MIDDLE)
-    assert Manifest.parse(manifest.json()).place == MIDDLE
+    manifest = replace(default_bundle.manifest, contact=MIDDLE)
+    assert Manifest.parse(manifest.json()).contact == MIDDLE
 
 
 @pytest.mark.parametrize("at", [(1.5, 1.5), (1.0, 2.0), (1.8, 1.4), (2.0, 1.0)])
@@ -72,7 +78,7 @@ def test_only_the_normal_axis_of_several_counts():
     three = np.concatenate([np.broadcast_to(shear, (*flat.shape, 2)), flat[..., None]], axis=-1)
     tares = np.stack([np.full((4, 4), 77.0), np.zeros((4, 4)), tare], axis=-1)
     assert centre(three, tares, 5.0) == centre(flat, tare, 5.0)
-    assert moved(three, tares, 5.0, MIDDLE) == moved(flat, tare, 5.0, MIDDLE) != ""
+    assert displacement(three, tares, 5.0, MIDDLE) == displacement(flat, tare, 5.0, MIDDLE) != ""
 
 
 def test_without_contact_there_is_no_centre():
@@ -80,7 +86,7 @@ def test_without_contact_there_is_no_centre():
     moved."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
-        assert moved(counts(load), TARE, 5.0, MIDDLE) == ""
+        assert displacement(counts(load), TARE, 5.0, MIDDLE) == ""
     one = np.where(np.indices((4, 4)).sum(0) == 6, INF, patch(1.5, 1.5))
     assert centre(counts(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
 
@@ -125,7 +131,7 @@ def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: t
             "wood", skin.Placement(**{along: mm}, seed=3), np.random.default_rng(0)
         )[:200]
         found.append(centre(window, TARE, 5.4)[axis])
-        text = moved(window, TARE, 5.4, MIDDLE)
+        text = displacement(window, TARE, 5.4, MIDDLE)
         assert text == "" if mm == 0 else text.endswith(f"mm too far towards {towards[mm > 0]}")
     assert (np.diff(found) < 0).all()
 

@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
     for name in manifest.files:
         (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
-    (target / bundle.MANIFEST).write_bytes(replace(manifest, place=PLACE).json())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, contact=PLACE).json())
     return target
 
 

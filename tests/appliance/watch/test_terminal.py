@@ -35,7 +35,7 @@ def lines_of(folder: Path, format: SweepFormat = skin.FORMAT, **facts: str) -> l
     offered.turns(2)
     for verdict in (
         OK,
-        replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), moved=""),
+        replace(OK, sweep=8, status=Status.SHORT, label="", scores=np.empty(0), displacement=""),
     ):
         offered.feed.frames(frames(1, format, first=int(verdict.sweep) * 5))
         offered.feed.answered(verdict)

@@ -54,9 +54,9 @@ def test_the_box_measures_the_same_distances():
     assert fit
     classes = fit.classes(z.classes())
     assert isinstance(classes, Classes)
-    assert classes.moved
+    assert classes.displaced
     x = sweeps(3, 7)[0]
-    away = (z(x) @ classes.moved.turn)[:, None] - classes.moved.means
+    away = (z(x) @ classes.displaced.turn)[:, None] - classes.displaced.means
     assert (away**2).sum(axis=2) == pytest.approx(
         fit.embedding.distances(fit.embedding(z(x))), rel=1e-3, abs=1e-3
     )

@@ -55,8 +55,8 @@ def test_from_a_set_to_the_answers_of_the_box(
     model = bundle.load(out)
     assert str(model.format) == "2x2x3 int16 at 750 Hz, window 600"
     assert model.manifest.thresholds.full_scale == 2047
-    assert model.manifest.place
-    assert np.abs(np.array(model.manifest.place.cols_mm) - PITCH_MM / 2).max() < 2
+    assert model.manifest.contact
+    assert np.abs(np.array(model.manifest.contact.cols_mm) - PITCH_MM / 2).max() < 2
     unseen = sheared(1, seed=6).take(np.arange(0, 54, 3))
     unseen.save(tmp_path / "unseen.npz")
     answers, _ = bundle_score.labels_of(Classifier(model, SystemClock()), unseen)

@@ -24,7 +24,7 @@ from train.studies.command import main as study
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
     """The default bundle, with trained positions."""
-    return replace(default_bundle, manifest=replace(default_bundle.manifest, place=MIDDLE))
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, contact=MIDDLE))
 
 
 @pytest.mark.slow
@@ -33,7 +33,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     lines agree."""
     monkeypatch.setattr(contact_positions, "OFF_MM", (8.0,))
     wide = replace(
-        model, manifest=replace(model.manifest, place=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
+        model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
     )
     figures = contact_positions.measure(
         Classifier(wide, SystemClock()),
@@ -74,7 +74,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(FormatError, match="no positions"):
         contact_positions.measure(
             Classifier(
-                replace(wide, manifest=replace(wide.manifest, place=None, moved=None)),
+                replace(wide, manifest=replace(wide.manifest, contact=None, displacement=None)),
                 SystemClock(),
             ),
             "",

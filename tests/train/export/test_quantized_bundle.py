@@ -177,11 +177,11 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
     are judged; without it the box could not tell, and the file has no arrays for it."""
     quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
-    assert placed.manifest.place
-    assert placed.manifest.moved
+    assert placed.manifest.contact
+    assert placed.manifest.displacement
     assert placed.classes
-    assert placed.classes.moved
-    assert plain.manifest.moved is None
+    assert placed.classes.displaced
+    assert plain.manifest.displacement is None
     with np.load(packed / bundle.MEANS) as arrays:
         assert not [name for name in arrays if name.startswith("moved")]
 

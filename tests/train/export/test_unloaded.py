@@ -88,7 +88,7 @@ def test_the_whole_way(
     assert "no-contact cannot be told" not in capsys.readouterr().out
     m = model.manifest
     assert m.tare == pytest.approx(np.full(FORM.shape, REST), abs=40)
-    assert m.place
+    assert m.contact
     assert m.thresholds.contact < 0.2 * REST
     rng = np.random.default_rng(5)
     touched = [act(material, place, rng) for place in PLACES[:2] for material in MATERIALS]
@@ -96,7 +96,7 @@ def test_the_whole_way(
     assert verdicts[0].status is Status.NO_CONTACT
     assert sum(v.label == a.label for v, a in zip(verdicts[1:], touched, strict=True)) >= 3
     assert Status.NO_CONTACT not in [v.status for v in verdicts[1:]]
-    assert sum(not v.moved for v in verdicts[1:]) >= 3
+    assert sum(not v.displacement for v in verdicts[1:]) >= 3
 
     more = 4000
     simulated = devices.build(
@@ -122,7 +122,7 @@ def test_the_whole_way(
         "what the unloaded skin gives is not known; record with palpate record, and send TARE"
         in line
     )
-    assert (model.manifest.thresholds.contact, model.manifest.place, model.manifest.unloaded) == (
+    assert (model.manifest.thresholds.contact, model.manifest.contact, model.manifest.unloaded) == (
         None,
         None,
         (),

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle.bundle import Early, Known, Moved
+from appliance.bundle.bundle import DisplacementRule, Early, Known
 from appliance.bundle.manifest import UNSURE
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.calibration import early_exit, novelty
@@ -100,7 +100,7 @@ class Calibration:
         """The entry `known` of a manifest."""
         return Known(self.limit, self.class_mean_temperature)
 
-    def displacement_rule(self) -> Moved | None:
+    def displacement_rule(self) -> DisplacementRule | None:
         """The entry `moved` of a manifest."""
         return self.displacement.rule if self.displacement else None
 
@@ -143,7 +143,7 @@ class Calibration:
             arrays["bias"],
             steps=part(Heads, "steps"),
             rule=EarlyRule(**figures["rule"] | {"early": early}),
-            displacement=moved and DisplacementFit(part(Embedding, "displaced"), Moved(**moved)),
+            displacement=moved and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**moved)),
             held=part(HeldOut, "held"),
             **{name: figures[name] for name in NUMBERS},
         )
