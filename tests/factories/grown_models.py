@@ -32,7 +32,9 @@ class Sprout:
 
     def __init__(self, rng: Random) -> None:
         self.rng, self.nodes, self.constants = rng, [], []
-        self.known = {"sweep": Value("uint8", (1, FORM.window, FORM.rows, FORM.cols), moved=True)}
+        self.known = {
+            "sweep": Value("uint8", (1, FORM.window, FORM.rows, FORM.cols), depends_on_sweep=True)
+        }
 
     def constant(self, kind: str, shape: tuple[int, ...]) -> str:
         """A new constant of random numbers."""
@@ -150,17 +152,19 @@ class Sprout:
             return False
         made = [f"t{len(self.nodes)}_{i}" for i in range(len(outs))]
         self.nodes.append(helper.make_node(op, names, made, domain=domain, **given))
-        moved = any(x.moved for x in inputs)
+        depends = any(x.depends_on_sweep for x in inputs)
         for name, (kind, shape) in zip(made, outs, strict=True):
             self.known[name] = Value(
-                "int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE
+                "int64" if kind == PLACE else kind, shape, None, depends, kind == PLACE
             )
         return True
 
     def model(self) -> bytes:
         """The finished model: what has grown, and two logits of it."""
         ends = [
-            name for name, value in self.known.items() if value.moved and value.kind == "float32"
+            name
+            for name, value in self.known.items()
+            if value.depends_on_sweep and value.kind == "float32"
         ][-6:]
         flat = self.constant("int64", (1,))
         self.constants[-1].CopyFrom(numpy_helper.from_array(np.array([1, -1]), flat))

@@ -79,7 +79,8 @@ class _Cost:
         self.work += products + TOUCH * sum(prod(v.shape) for v in (*call.inputs, *made))
         self.workspace = max(self.workspace, workspace)
         self.bytes += sum(
-            _bytes(v) * (1 if v.moved or name == "DequantizeLinear" else COPIES) for v in made
+            _bytes(v) * (1 if v.depends_on_sweep or name == "DequantizeLinear" else COPIES)
+            for v in made
         )
         total = self.bytes + self.workspace
         need(
@@ -167,7 +168,9 @@ def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
     ):
         need(len(have) <= most, f"it has {len(have)} {what} (limit {most})")
     (declared,) = graph.input
-    known = {declared.name: _bounded(declared.name, Value(*_declared(declared), moved=True))}
+    known = {
+        declared.name: _bounded(declared.name, Value(*_declared(declared), depends_on_sweep=True))
+    }
     for tensor in graph.initializer:
         need(tensor.name not in known, f"{tensor.name[:80]!r} is there twice")
         known[tensor.name] = _constant(tensor, tensor.name[:80])
@@ -260,9 +263,9 @@ def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
     given = operator.rule(call)
     outs: list[Out] = given if isinstance(given, list) else [given]
     need(len(node.output) == len(outs), f"it has {len(node.output)} outputs instead of {len(outs)}")
-    moved = any(x.moved for x in inputs)
+    depends = any(x.depends_on_sweep for x in inputs)
     made = [
-        Value("int64" if kind == PLACE else kind, shape, None, moved, kind == PLACE)
+        Value("int64" if kind == PLACE else kind, shape, None, depends, kind == PLACE)
         for kind, shape in outs
     ]
     for name, value in zip(node.output, made, strict=True):
@@ -347,7 +350,7 @@ def _gives(
         have, axes = known[name], len(forms[name])
         need(
             have.kind == "float32"
-            and have.moved
+            and have.depends_on_sweep
             and have.shape[:1] == (1,)
             and len(have.shape) == axes,
             f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the first 1",

@@ -44,12 +44,12 @@ Out = tuple[str, Shape]
 @dataclass(frozen=True, slots=True)
 class Value:
     """A tensor: its type (of KINDS) and shape; its numbers, where it is a constant of the file.
-    moved: whether it depends on the sweep. place: an int64 that is never negative."""
+    place: an int64 that is never negative."""
 
     kind: str
     shape: Shape
     numbers: NDArray[Any] | None = None
-    moved: bool = False
+    depends_on_sweep: bool = False
     place: bool = False
 
 

@@ -39,7 +39,7 @@ def fixed(*numbers: int, shape: tuple[int, ...] | None = None) -> Value:
 
 def of(*shape: int, kind: str = "float32") -> Value:
     """A tensor that a sweep moves."""
-    return Value(kind, shape, moved=True)
+    return Value(kind, shape, depends_on_sweep=True)
 
 
 WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
@@ -154,8 +154,10 @@ def test_all_rules_say_what_onnxruntime_gives():
         sprout.add("", "Cast", ["sweep"], {"to": 1})
         for _ in range(15):
             sprout.grow()
-        moved = {
-            name: value for name, value in sprout.known.items() if value.moved and name != "sweep"
+        dependent = {
+            name: value
+            for name, value in sprout.known.items()
+            if value.depends_on_sweep and name != "sweep"
         }
         nodes = list(sprout.nodes)
         model = onnx.load_from_string(sprout.model())
@@ -163,10 +165,10 @@ def test_all_rules_say_what_onnxruntime_gives():
         model.graph.node.extend(nodes)
         types = {
             name: onnx.helper.np_dtype_to_tensor_dtype(np.dtype(value.kind))
-            for name, value in moved.items()
+            for name, value in dependent.items()
         }
         model.graph.output.extend(
-            onnx.helper.make_tensor_value_info(name, types[name], None) for name in moved
+            onnx.helper.make_tensor_value_info(name, types[name], None) for name in dependent
         )
         try:
             gives = session(model.SerializeToString()).run(
@@ -174,7 +176,7 @@ def test_all_rules_say_what_onnxruntime_gives():
             )
         except Exception:  # a place that is not there: onnxruntime looks sweep by sweep
             continue
-        for (name, value), have in zip(moved.items(), gives, strict=True):
+        for (name, value), have in zip(dependent.items(), gives, strict=True):
             assert (value.kind, value.shape) == (have.dtype.name, have.shape), f"{seed}: {name}"
         seen |= {node.op_type for node in nodes}
         compared += 1
