@@ -27,7 +27,7 @@ from appliance.core.schema import typed
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.recording.recording import SweepFolder
 
 FILE = "agreement.json"
@@ -180,7 +180,7 @@ class Shadow(Observer):
         try:  # the model may kill the program here, so the start was counted before
             self._classifier = judge(candidate)
             self._classifier.self_test()
-            self._early = Decider(self._classifier) if candidate.manifest.early else None
+            self._early = EarlyExit(self._classifier) if candidate.manifest.early else None
         except ApplianceError:
             self.stopping()
             raise

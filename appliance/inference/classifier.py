@@ -17,7 +17,7 @@ from appliance.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
-from appliance.inference.novelty import Means
+from appliance.inference.novelty import ClassDistances
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
 from appliance.signal.contact import displacement
@@ -90,10 +90,12 @@ class Classifier:
         self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
         self.tare = bundle.manifest.tare
         known, classes = bundle.manifest.known, bundle.classes
-        self._means = Means(classes, known, bundle.manifest.labels) if known and classes else None
+        self._means = (
+            ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
+        )
         rule = bundle.manifest.displacement
         self._displaced_means = (
-            Means(classes, known, bundle.manifest.labels, rule)
+            ClassDistances(classes, known, bundle.manifest.labels, rule)
             if rule and known and classes
             else None
         )
@@ -127,7 +129,7 @@ class Classifier:
         """For sidecars, so that a replay judges by the same rule. tare: [R, C] raw counts."""
         return {"tare": self.tare.tolist(), "bundle": self.bundle.id, "rule": self.rule}
 
-    def tell(self) -> list[object]:
+    def describe(self) -> list[object]:
         """The bundle's name, version, id and format."""
         return [
             self.bundle.manifest.name,
@@ -182,7 +184,7 @@ class Classifier:
             self._test_means(self._means)
         return worst
 
-    def _test_means(self, means: Means) -> None:
+    def _test_means(self, means: ClassDistances) -> None:
         """Raises BundleError if the class means do not belong to the model: they give a golden
         sweep another label than the model's own logits."""
         for golden in self.bundle.golden:

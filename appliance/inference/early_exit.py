@@ -33,7 +33,7 @@ def decides(scores: NDArray[np.float64], rule: Early) -> bool:
     return bool(agreed and scores[-1].max() >= rule.least[len(scores) - 1])
 
 
-class Decider:
+class EarlyExit:
     """Answers sweeps that are still going on. steps: number of times in a window at which it can
     answer.
 

@@ -26,7 +26,7 @@ from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier, softmax
-from appliance.inference.novelty import Means
+from appliance.inference.novelty import ClassDistances
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +84,11 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             "the model gives no number for some of the sweeps; look at the skin and take others"
         )
     classes = extended(old.classes, z)
-    means = Means(classes, m.known, (*m.labels, label))
+    means = ClassDistances(classes, m.known, (*m.labels, label))
     median = _median(softmax(means.logits(means.distances(z))))
     logits = means.logits(means.distances(np.vstack([golden, z[median]])))
     new, file = _added(old, label, classes, sweeps[median], logits)
-    trained, warnings = Means(old.classes, m.known, m.labels), []
+    trained, warnings = ClassDistances(old.classes, m.known, m.labels), []
     if close := _closeness(trained, label, z):
         warnings.append(close)
     if m.early:
@@ -164,7 +164,7 @@ def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> 
     )
 
 
-def _disagreement(means: Means, label: str, z: NDArray[np.float64]) -> str:
+def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
     """Why the sweeps with the embeddings `z` [n, r] may not be of one material, "" where they
     agree.
 
@@ -183,7 +183,7 @@ def _disagreement(means: Means, label: str, z: NDArray[np.float64]) -> str:
     )
 
 
-def _closeness(means: Means, label: str, z: NDArray[np.float64]) -> str:
+def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
     """Which label of `means` the sweeps with the embeddings `z` [n, r] will be taken for, "" for
     none."""
     n, r = z.shape

@@ -32,7 +32,7 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     return result
 
 
-class Means:
+class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: those of the means, [K].
 
     displacement: the rule for sweeps whose contact is displaced. The distances are then computed in

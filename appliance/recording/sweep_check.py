@@ -80,7 +80,7 @@ class SweepCheck(Observer):
             "unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}
         }
 
-    def tell(self) -> list[object]:
+    def describe(self) -> list[object]:
         """No bundle, and the format."""
         return ["recording", "", self.model, self.format]
 

@@ -21,7 +21,7 @@ from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.deployment.store import SignedBundle, Store
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.io import skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.lineless_triggers import (
@@ -116,7 +116,7 @@ def _assembled(
     commands: Mapping[str, CommandHandler],
     *,
     codes: tuple[str, ...] = (),
-    early: Decider | None = None,
+    early: EarlyExit | None = None,
     ordered: bool = False,
 ) -> Box:
     """Put the components together. codes: labels that the class bits hold."""
@@ -219,9 +219,9 @@ def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
     return Classifier(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps)
 
 
-def early_exit(settings: Config, run: Classifier) -> Decider | None:
+def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
     """What answers early, where the settings ask for it."""
-    return Decider(run) if settings.classifier.early else None
+    return EarlyExit(run) if settings.classifier.early else None
 
 
 def prove(settings: Config, bundle: Bundle) -> None:

@@ -21,7 +21,7 @@ from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.io.robot_link import Command, Port
 from appliance.io.trigger import Trigger
 from appliance.io.usb_sensor import Sensor, SensorCounters
@@ -65,7 +65,7 @@ class Answerer(Protocol):
         """What belongs into the sidecar of a recorded sweep, for JSON."""
         ...
 
-    def tell(self) -> list[object]:
+    def describe(self) -> list[object]:
         """The first fields of the answer to ID: name, version, id, format."""
         ...
 
@@ -87,7 +87,7 @@ class Pipeline:
     trigger: Trigger
     cutter: SweepCutter
     answerer: Answerer
-    early: Decider | None = None
+    early: EarlyExit | None = None
 
 
 class Box:
@@ -351,7 +351,7 @@ class Box:
     def _identity(self) -> list[object]:
         who = self._sensor.identity
         skin = f"{who.board} {who.serial} {'.'.join(map(str, who.firmware))}" if who else "none"
-        return [*self._answerer.tell(), skin]
+        return [*self._answerer.describe(), skin]
 
     def _self_test(self) -> list[object]:
         return [self._answerer.test()]

@@ -22,7 +22,7 @@ from appliance.core.errors import FormatError
 from appliance.core.schema import typed
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict, load, sidecar
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.io.robot_link import StdoutPort, result
 from appliance.recording.capture import Playback
 from appliance.recording.sweep_window import SweepCutter
@@ -182,9 +182,9 @@ class Judge:
             self._last = kept.object, fused
         classifier = self._prepared(kept)
         sweep = kept.sweep if whole else replace(kept.sweep, object=0)
-        verdict = classifier(sweep) if sweep.share == 1 else Decider(classifier)(sweep)
+        verdict = classifier(sweep) if sweep.share == 1 else EarlyExit(classifier)(sweep)
         if not whole:
-            own = verdict.own if verdict else Decider(classifier).scores(sweep)[-1]
+            own = verdict.own if verdict else EarlyExit(classifier).scores(sweep)[-1]
             same = own.tolist() == was.get("own")
             return ReplayResult(
                 verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there"

@@ -16,7 +16,7 @@ from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, PortError, SensorError, SensorMismatch
 from appliance.core.types import SweepFormat, shown
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.io import skin_profile, skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
@@ -65,7 +65,7 @@ def check(
         classifier = Classifier(loaded[0], devices.clock)
         worst = classifier.self_test()
         if settings.classifier.early:
-            Decider(classifier)
+            EarlyExit(classifier)
         return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
 
     yield _try("bundle", bundle)

@@ -225,7 +225,7 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Pat
         (plain, (0, 0, 1)),
     ):
         pair = Side(eager, candidate, tmp_path / f"shadow-{candidate.id}")
-        verdict = shadow.Decider(pair.current)(half)
+        verdict = shadow.EarlyExit(pair.current)(half)
         assert verdict
         pair.shadow.sweep(half, verdict, {"tare": pair.tare.tolist()})
         found = pair.shadow.agreement

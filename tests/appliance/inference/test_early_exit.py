@@ -20,7 +20,7 @@ from appliance.core.config import SweepConfig
 from appliance.core.errors import BundleError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load, save
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider, decides
+from appliance.inference.early_exit import EarlyExit, decides
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
@@ -342,7 +342,7 @@ def test_the_rest_of_the_window_repeats_the_newest_frame(monkeypatch: pytest.Mon
     classifier = Classifier(toy(), rig.VirtualClock())
     heads = classifier.early
     monkeypatch.setattr(classifier, "early", lambda x: given.append(x) or heads(x))
-    verdict = Decider(classifier)(so_far(slid(60)[:40], 0.4))
+    verdict = EarlyExit(classifier)(so_far(slid(60)[:40], 0.4))
     assert verdict is not None
     assert verdict.share == 0.4
     assert (given[0][:40] == slid(60)[:40]).all()
@@ -392,7 +392,7 @@ def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
 def test_a_tare_counts(rigged: Callable[..., Rigged]):
     """With a tare as high as the load there is no contact, early or late."""
     classifier = Classifier(toy(), rig.VirtualClock())
-    decider, sweep = Decider(classifier), so_far(slid(60)[:20], 0.2)
+    decider, sweep = EarlyExit(classifier), so_far(slid(60)[:20], 0.2)
     assert decider(sweep) is not None
     classifier.tare = np.full((2, 2), 200.0)
     assert decider(sweep) is None
@@ -546,7 +546,11 @@ def test_a_capture_gives_the_same_answers(
     again, kept = [], []
     replayed = Box(
         Pipeline(
-            play, play, SweepCutter(FMT, SweepConfig(lead_ms=100)), classifier, Decider(classifier)
+            play,
+            play,
+            SweepCutter(FMT, SweepConfig(lead_ms=100)),
+            classifier,
+            EarlyExit(classifier),
         ),
         play,
         port=StdoutPort("replay", play.commands),
@@ -574,11 +578,11 @@ def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_p
     sweep, format = load(tmp_path / "sweep-000001.npy")
     assert (format, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
     assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
-    again = Decider(Classifier(toy(), rig.VirtualClock()))(sweep)
+    again = EarlyExit(Classifier(toy(), rig.VirtualClock()))(sweep)
     assert again is not None
     assert summary([again]) == summary([verdict])
     assert again.scores.tobytes() == verdict.scores.tobytes()
-    assert Decider(Classifier(toy((0.99,) * STEPS), rig.VirtualClock()))(sweep) is None
+    assert EarlyExit(Classifier(toy((0.99,) * STEPS), rig.VirtualClock()))(sweep) is None
 
 
 def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -20,7 +20,7 @@ from appliance.core.errors import ApplianceError, BundleError, ConfigError, Form
 from appliance.core.types import Status
 from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier
-from appliance.inference.novelty import Means
+from appliance.inference.novelty import ClassDistances
 from appliance.sim import devices
 from appliance.sim.rig import VirtualClock
 from tests.factories import toy_bundle
@@ -168,7 +168,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
             np.ones(4),
             np.zeros((4, 0, 0), np.float16),
         )
-        means = Means(classes, known, ("a", "b", "c", "felt"))
+        means = ClassDistances(classes, known, ("a", "b", "c", "felt"))
         kept += [not means.novelty(z) for z in rng.normal(size=(40, 2))]
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
 

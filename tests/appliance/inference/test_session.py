@@ -10,7 +10,7 @@ from appliance.bundle.onnx_check import reader
 from appliance.core.errors import BundleError
 from appliance.inference import session
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.inference.enrolment import enrol
 from appliance.inference.session import ModelRunner
 from appliance.sim.rig import VirtualClock
@@ -57,12 +57,12 @@ def test_a_classifier_opens_what_its_answers_need(
 
 
 def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
-    """It is opened with the Decider, before the first sweep, and once."""
+    """It is opened with the EarlyExit, before the first sweep, and once."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS), VirtualClock())
-    Decider(it)
+    EarlyExit(it)
     assert opened == [["logits", "embedding"], ["early"]]
     it.early(toy_bundle.window(1, 0))
-    Decider(it)
+    EarlyExit(it)
     assert len(opened) == 2
 
 
@@ -73,7 +73,7 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundl
         Classifier(default_bundle, VirtualClock()),
         Classifier(default_bundle, VirtualClock()),
     )
-    Decider(early)
+    EarlyExit(early)
     whole = session.session(default_bundle.model)
     noise = np.random.default_rng(1).integers(
         0, 256, (3, *default_bundle.golden.shape[1:]), np.uint8

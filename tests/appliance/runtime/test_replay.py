@@ -19,7 +19,7 @@ from appliance.core import config
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, load, save, sidecar
 from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import Decider
+from appliance.inference.early_exit import EarlyExit
 from appliance.recording.black_box import BlackBox
 from appliance.runtime.replay import replay
 from appliance.sim import devices, rig, script, skin
@@ -159,7 +159,7 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
         *(values[:10] for values in (whole.frames.t_ns, whole.frames.seq, whole.frames.taxels))
     )
     early = replace(whole, id=2, frames=frames, share=0.5)
-    verdicts = classifier(whole), Decider(classifier)(early)
+    verdicts = classifier(whole), EarlyExit(classifier)(early)
     assert [(str(v.status), v.fused) for v in verdicts] == [("unsure", 1), ("ok", 2)]
     for sweep, verdict in zip((whole, early), verdicts, strict=True):
         about = {"rule": classifier.rule, "bundle": model.id, "verdict": verdict.as_dict()}

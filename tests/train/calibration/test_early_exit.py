@@ -12,7 +12,7 @@ from appliance.bundle.pruning import prune
 from appliance.core.clock import SystemClock
 from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
-from appliance.inference.novelty import Means
+from appliance.inference.novelty import ClassDistances
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.trunk import FORM, trunk
 from train.calibration import early_exit
@@ -248,7 +248,7 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     drawn = np.flatnonzero(labels == 1)[:3]
     new = enrolment.enrol(whole, "new", counts[drawn]).bundle
     z = done.embedding(x[:, -1])
-    means = Means(new.classes, new.manifest.known, new.manifest.labels)
+    means = ClassDistances(new.classes, new.manifest.known, new.manifest.labels)
     want = means.logits(means.distances(z)) * done.class_mean_temperature
     have = uncertainty.enrolled_logits(done.embedding, z, z[drawn])
     assert np.allclose(
