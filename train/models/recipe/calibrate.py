@@ -143,7 +143,8 @@ class Calibration:
             arrays["bias"],
             steps=part(Heads, "steps"),
             rule=EarlyRule(**figures["rule"] | {"early": early}),
-            displacement=moved and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**moved)),
+            displacement=moved
+            and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**moved)),
             held=part(HeldOut, "held"),
             **{name: figures[name] for name in NUMBERS},
         )
