@@ -4,6 +4,7 @@ modules, tests and texts."""
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import re
 import subprocess
@@ -20,6 +21,7 @@ SOURCES = sorted(
     [*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")]
 )
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
+TEST_FILES = [path for path in TESTS if path.name.startswith("test_")]
 GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cuts")]
 BOX = [p for p in SOURCES if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
 ALLOWED = {"appliance", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}
@@ -41,10 +43,21 @@ def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
     return done.stdout
 
 
+@functools.cache
+def nodes(path: Path) -> list[ast.AST]:
+    """All nodes of a module; the module itself is the first."""
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
+def shown(path: Path) -> str:
+    """The path below the root of the project."""
+    return str(path.relative_to(ROOT))
+
+
 def imports(path: Path) -> set[str]:
     """Names of all modules that a file imports; relative ones begin with a dot."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -62,7 +75,7 @@ def module_imports(*packages: str) -> dict[str, set[str]]:
     }
     found: dict[str, set[str]] = {name: set() for name in dotted}
     for name, path in dotted.items():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.Import):
                 found[name] |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):  # `from package import module` names the module
@@ -106,25 +119,31 @@ def test_packages_import_downwards_only():
     assert "0 broken" in output
 
 
-@pytest.mark.parametrize("path", BOX, ids=lambda p: str(p.relative_to(ROOT)))
-def test_the_box_imports_five_libraries(path: Path):
-    """Only the five libraries of the design, and itself by full names; those of an extra only in
-    the part that it is for."""
+def foreign(path: Path) -> set[str]:
+    """The modules that a file of the box imports and may not import."""
     extras = (
         names for part, names in EXTRAS.items() if path.is_relative_to(ROOT / "appliance" / part)
     )
-    extra = set().union(*extras)
-    for name in imports(path):
-        assert name.split(".")[0] in ALLOWED | extra | set(sys.stdlib_module_names), (
-            f"{path.name} imports {name}"
-        )
+    allowed = ALLOWED.union(sys.stdlib_module_names, *extras)
+    return {name for name in imports(path) if name.split(".")[0] not in allowed}
 
 
-@pytest.mark.parametrize("path", TESTS, ids=lambda p: str(p.relative_to(ROOT)))
-def test_no_test_imports_another(path: Path):
-    """What tests share stands in tests/factories."""
-    named = [name for name in imports(path) if re.search(r"(^|\.)(test_|conftest)", name)]
-    assert not named
+def test_the_box_imports_five_libraries():
+    """The box imports the five libraries of the design, and itself by full names; a library of an
+    extra only in the part that the extra is for."""
+    assert {shown(path): names for path in BOX if (names := foreign(path))} == {}
+    assert foreign(ROOT / "train" / "models" / "training.py") >= {"torch"}
+
+
+def test_no_test_imports_another():
+    """Code that tests share stands in tests/factories."""
+    found = [
+        f"{shown(path)} imports {name}"
+        for path in TESTS
+        for name in imports(path)
+        if re.search(r"(^|\.)(test_|conftest)", name)
+    ]
+    assert found == []
 
 
 @pytest.mark.slow
@@ -157,40 +176,59 @@ def test_onnxruntime_starts_no_thread_of_its_own():
     assert run(sys.executable, "-c", code, cwd=ROOT, env=env).splitlines()[-1] == "1"
 
 
-@pytest.mark.parametrize("path", [*SOURCES, *GROUNDS], ids=lambda p: str(p.relative_to(ROOT)))
-def test_modules_are_introduced_and_functions_short(path: Path):
-    """A docstring that opens the file; at most 500 lines; functions under 40 lines of code."""
-    text = path.read_text()
-    tree = ast.parse(text)
-    assert ast.get_docstring(tree), "no opening paragraph"
-    if path.name.startswith("test_"):
-        return
-    assert len(text.splitlines()) <= LONGEST
-    for node in ast.walk(tree):
+def too_long(path: Path) -> list[str]:
+    """The functions of 40 lines and more, without their docstrings."""
+    found = []
+    for node in nodes(path):
         if isinstance(node, ast.FunctionDef):
             body = node.body[1:] if ast.get_docstring(node) else node.body
             lines = node.end_lineno - body[0].lineno + 1 if body else 0
-            assert lines < 40, f"{node.name} has {lines} lines"
+            if lines >= 40:
+                found.append(f"{shown(path)}: {node.name} has {lines} lines")
+    return found
 
 
-@pytest.mark.parametrize("path", BOX, ids=lambda p: p.name)
-def test_no_wall_clock_no_pickle_no_bare_except(path: Path):
+def test_modules_are_introduced():
+    """A docstring opens each file."""
+    assert [shown(p) for p in [*SOURCES, *GROUNDS] if not ast.get_docstring(nodes(p)[0])] == []
+
+
+def test_modules_and_functions_are_short():
+    """Modules have at most 500 lines, functions under 40 lines of code."""
+    paths = [path for path in [*SOURCES, *GROUNDS] if not path.name.startswith("test_")]
+    sizes = {shown(path): len(path.read_text().splitlines()) for path in paths}
+    assert {path: lines for path, lines in sizes.items() if lines > LONGEST} == {}
+    assert [line for path in paths for line in too_long(path)] == []
+
+
+def test_no_wall_clock_no_pickle_no_bare_except():
     """Monotonic time only, nothing unpickled, no error swallowed whole."""
-    text = path.read_text()
-    assert not re.search(r"\btime\.time\(|datetime|import pickle|allow_pickle=True", text)
-    assert not re.search(r"except\s*:", text)
-    if path.name != "clock.py":
-        assert "time.sleep" not in text
+    banned = r"\btime\.time\(|datetime|import pickle|allow_pickle=True|except\s*:"
+    found = []
+    for path in BOX:
+        pattern = banned if path.name == "clock.py" else rf"{banned}|time\.sleep"
+        found += [f"{shown(path)}: {m[0]}" for m in re.finditer(pattern, path.read_text())]
+    assert found == []
 
 
-@pytest.mark.parametrize(
-    "path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT))
-)
-def test_every_test_says_what_it_holds(path: Path):
+def written_tests(path: Path) -> list[ast.FunctionDef]:
+    """The test functions of a file."""
+    return [
+        node
+        for node in nodes(path)
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    ]
+
+
+def test_every_test_says_what_it_holds():
     """Each test has a docstring."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-            assert ast.get_docstring(node), node.name
+    silent = [
+        f"{shown(path)}: {test.name}"
+        for path in TEST_FILES
+        for test in written_tests(path)
+        if not ast.get_docstring(test)
+    ]
+    assert silent == []
 
 
 def asserts(test: ast.FunctionDef) -> bool:
@@ -210,26 +248,25 @@ def asserts(test: ast.FunctionDef) -> bool:
     )
 
 
-@pytest.mark.parametrize(
-    "path", sorted(ROOT.glob("tests/**/test_*.py")), ids=lambda p: str(p.relative_to(ROOT))
-)
-def test_every_test_asserts(path: Path):
+def test_every_test_asserts():
     """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or
     expect_."""
-    tests = [
-        node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)
+    idle = [
+        f"{shown(path)}: {test.name}"
+        for path in TEST_FILES
+        for test in written_tests(path)
+        if not asserts(test)
     ]
-    assert not [test.name for test in tests if test.name.startswith("test_") and not asserts(test)]
+    assert idle == []
 
 
-@pytest.mark.slow
 def test_each_class_name_stands_once():
     """A class name says which class is meant: none stands in two modules, tests included."""
     found: dict[str, list[str]] = {}
     for path in [*SOURCES, *TESTS]:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef):
-                found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+                found.setdefault(node.name, []).append(shown(path))
     assert {name: where for name, where in found.items() if len(where) > 1} == {}
 
 
@@ -253,12 +290,16 @@ BANNED = (
 material, backend, reference model, search, sizes, page, look, store, observer, uncertainty."""
 
 
-@pytest.mark.parametrize("path", [*SOURCES, *TESTS], ids=lambda p: str(p.relative_to(ROOT)))
-def test_banned_words_do_not_come_back(path: Path):
+def test_banned_words_do_not_come_back():
     """Standard English: none of BANNED, in code, comments and messages."""
-    if path != Path(__file__):
-        text = path.read_text().lower()
-        assert not [word for word in BANNED if re.search(rf"\b{word}", text)]
+    pattern = re.compile(rf"\b(?:{'|'.join(BANNED)})")
+    found = [
+        f"{shown(path)}: {word}"
+        for path in [*SOURCES, *TESTS]
+        if path != Path(__file__)
+        for word in pattern.findall(path.read_text().lower())
+    ]
+    assert found == []
 
 
 @pytest.fixture(scope="module")
@@ -284,6 +325,7 @@ def test_the_wheel_holds_the_appliance_alone(wheel: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # installs five libraries
 def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
     """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok,
     away from the checkout."""
