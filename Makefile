@@ -42,6 +42,7 @@ lint: $(DESKTOP) ## check style, imports between packages, and prose
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.prose
 
 types: $(DESKTOP) ## check types: mypy --strict
 	$(BIN)/mypy
