@@ -1,15 +1,13 @@
-"""What a trunk needs to hold, and how its heads see it: chosen by groups that were held out. In:
-features. Out: a Choice.
+"""The choice of heads by held-out groups of the training sweeps.
 
-Candidates differ in the filters, in how these are pooled, in the spectrum, in whether heads see
-augmented copies, and in whether trained stages join in. Each is judged by the cross entropy of
-sweeps whose group it did not see, its temperature being the best for them, and every group counts
-the same.
+Candidates differ in the filters and their features, in the spectrum, and in whether heads see
+augmented copies. Each is scored by the cross entropy of sweeps whose group its heads did not see,
+at its best temperature; every group counts the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,21 +18,23 @@ from appliance.inference.classifier import softmax
 from train.calibration.heads import HeadData, HeadPart, HeadPlan
 from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
+from train.models.methods import Log
 
 Array = NDArray[Any]
 TINY = 1e-12
 ERRORS = 2.0
-"""Standard errors by which a candidate must be better than the first: it is the best of about
-ten."""
+"""Number of standard errors by which a candidate must be better than the usual one, because it is
+the best of about ten."""
 MOST_LOST, MOST_WORSE = 0.005, 0.02
-"""Share of the sweeps, and cross entropy, that fewer filters may cost."""
+"""Largest loss of accuracy and largest rise of the cross entropy by which fewer filters are still
+chosen."""
 Columns = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class ScoredPlan:
-    """One candidate. losses: cross entropy [n] of each held-out sweep; logits [n, K] are of the
-    temperature that is best."""
+    """A candidate with its scores. logits: [n, K] of the held-out sweeps at the best temperature.
+    losses: cross entropy [n] of each."""
 
     plan: HeadPlan
     logits: Array
@@ -42,12 +42,13 @@ class ScoredPlan:
 
 
 class HeldOutScores:
-    """Judges candidates on held-out parts. known: what heads are fitted to, for each part the same
-    sweeps in the same order; their features may differ, where a trunk was trained without the part.
-    copied: augmented copies of the held-out sweeps are judged too, and count as much as these.
+    """Scores candidates on held-out parts.
 
-    labels, clusters: of all that is judged [n], the latter numbers of parts. own: bool [n], which
-    are sweeps, not copies.
+    known: the data that heads are fitted to, for each part the same sweeps in the same order; their
+    features may differ, if a trunk was trained without the part. copied: score augmented copies of
+    the held-out sweeps as well, which then count as much as these. labels, clusters: of everything
+    that is scored [n]; a cluster is the number of a part. own: bool [n], True for a sweep and False
+    for a copy.
     """
 
     def __init__(
@@ -75,8 +76,8 @@ class HeldOutScores:
         self._logits: dict[tuple[Columns, bool], Array] = {}
 
     def score(self, parts: Sequence[HeadPart]) -> ScoredPlan:
-        """The candidate that adds the logits of `parts`, each scaled to the same size; what factors
-        they had does not count."""
+        """The candidate that adds the logits of `parts`, each scaled to the same size; their own
+        factors are ignored."""
         logits = [self._of(part) for part in parts]
         factors = [
             1 / max(float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()), TINY) for x in logits
@@ -88,21 +89,21 @@ class HeldOutScores:
         )
         return ScoredPlan(plan, total / temperature, self._losses(total / temperature))
 
-    def loss(self, judged: ScoredPlan) -> float:
-        """Mean cross entropy, every group counting the same."""
-        return float(self.weights @ judged.losses)
+    def loss(self, scored: ScoredPlan) -> float:
+        """Mean cross entropy; every group counts the same."""
+        return float(self.weights @ scored.losses)
 
-    def accuracy(self, judged: ScoredPlan) -> float:
-        """Share of held-out sweeps that are named rightly, every group counting the same."""
-        return float(self.weights @ self._right(judged))
+    def accuracy(self, scored: ScoredPlan) -> float:
+        """Accuracy on held-out sweeps; every group counts the same."""
+        return float(self.weights @ self._right(scored))
 
     def better(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether `one` has less loss and names more sweeps rightly, by more than ERRORS standard
-        errors of the paired difference.
+        """Whether `one` has a lower loss and a higher accuracy, by more than ERRORS standard errors
+        of the paired difference.
 
-        The error is that over held-out parts, or over sweeps where it is larger: a few parts may
-        agree by chance. Loss alone is no reason: that of a sum of discriminants changes with how
-        sure each is.
+        The standard error is the larger of that over parts and that over sweeps, because a few
+        parts may agree by chance. The loss alone decides nothing: in a sum of discriminants it
+        depends on the size of their logits.
         """
         gain = self._lost(other, one)
         by_part = np.bincount(self.clusters, gain)
@@ -111,9 +112,9 @@ class HeldOutScores:
         )
 
     def holds(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether held-out sweeps show that `one` loses no more than MOST_LOST of those that
-        `other` names rightly, and MOST_WORSE of its cross entropy: a standard error of the paired
-        difference is added, at least one sweep."""
+        """Whether held-out sweeps show that `one` has at most MOST_LOST less accuracy than `other`
+        and at most MOST_WORSE more cross entropy. One standard error of the paired difference is
+        added to the lost accuracy, or one sweep if that is more."""
         lost = self._lost(one, other)
         worse = self.loss(one) - self.loss(other)
         return bool(
@@ -122,12 +123,12 @@ class HeldOutScores:
         )
 
     def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
-        """What each sweep [n] adds to the accuracy of `other` less that of `one`."""
+        """The share [n] of each sweep in the accuracy of `other` minus that of `one`."""
         lost: Array = self.weights * (self._right(other).astype(float) - self._right(one))
         return lost
 
-    def _right(self, judged: ScoredPlan) -> Array:
-        right: Array = judged.logits.argmax(axis=1) == self.labels
+    def _right(self, scored: ScoredPlan) -> Array:
+        right: Array = scored.logits.argmax(axis=1) == self.labels
         return right
 
     def _losses(self, logits: Array) -> Array:
@@ -159,65 +160,112 @@ def _error(x: Array) -> float:
     return float(np.sqrt(len(x) / max(len(x) - 1, 1) * ((x - x.mean()) ** 2).sum()))
 
 
-def choose(
-    scores: HeldOutScores,
-    kinds: Sequence[Array],
-    pools: Sequence[Array],
-    levels: Array,
-    bands: Array,
-    log: Callable[[str], None],
-    always_copies: bool = False,
-) -> ScoredPlan:
-    """The candidate with the least loss, where it is `better` than the usual one; else the usual
-    one.
+@dataclass(frozen=True)
+class FeatureColumns:
+    """Numbers of the features of a trunk, by their source.
 
-    What the sweeps are too few to tell apart is not chosen among. The usual one adds three
-    discriminants for each kind of filters: all see their magnitudes, one their shares and the
-    spectrum as well, one the distribution of counts and the spectrum. An average is seldom worse
-    than the better of two, and no held-out part need show which that is. Whether magnitudes are
-    enough is chosen first; then whether all see the spectrum and copies, or the spectrum is enough
-    alone. kinds: filters [n] of each kind. pools: the features [F] of every filter's magnitude,
-    then of its share. levels, bands: numbers of the features of the distribution and of the
-    spectrum, which may be none. always_copies: only candidates whose discriminants all see
-    augmented copies are there, as held-out sweeps cannot show what these are for.
+    magnitudes, shares: int [n], the two features of each filter. kinds: the filters of each kind,
+    zero-sum ones first. levels, bands: of the distribution and of the spectrum; may be empty.
     """
 
-    def judged(named: str, parts: Sequence[HeadPart]) -> ScoredPlan:
-        log(f"choosing: {named}")
-        return scores.score(parts)
+    magnitudes: Array
+    shares: Array
+    kinds: tuple[Array, ...]
+    levels: Array
+    bands: Array
 
-    def best(of: Sequence[ScoredPlan]) -> ScoredPlan:
-        return min(of, key=scores.loss)
-
-    sizes, shares = (filter_groups(kinds, pools[:n], always_copies) for n in (1, 2))
-    usual = [
-        *sizes,
-        *_with(shares, bands),
-        *(_with(sizes, np.append(levels, bands)) if len(levels) else ()),
-    ]
-    plain = [judged("magnitudes, shares, distribution", usual), judged("magnitudes", sizes)]
-    first = best(plain).plan.parts
-    seen = {"without more of the spectrum": list(first)}
-    if len(bands):
-        seen |= {
-            "with the spectrum": _with(first, bands),
-            "the spectrum alone": [HeadPart(tuple(bands.tolist()), always_copies)],
-        }
-    more = [
-        judged(
-            f"{name}{', with copies' * copies}", [replace(part, copies=copies) for part in parts]
+    @classmethod
+    def of(cls, layout: Mapping[str, slice], free: Array) -> FeatureColumns:
+        """The columns of a trunk with this graph.layout; free: bool [n], of its filters."""
+        magnitudes, shares, levels, bands = (
+            np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
+            for name in ("sizes", "shares", "levels", "bands")
         )
-        for name, parts in seen.items()
-        for copies in sorted({always_copies, True})
-        if copies != always_copies or name != "without more of the spectrum"
-    ]
-    chosen = best([*plain, *more])
-    return chosen if scores.better(chosen, plain[0]) else plain[0]
+        kinds = tuple(np.flatnonzero(free == kind) for kind in np.unique(free))
+        return cls(magnitudes, shares, kinds, levels, bands)
+
+    def filters(self) -> Array:
+        """The filter [F] of each feature, -1 if it is not of a filter."""
+        every = (self.magnitudes, self.shares, self.levels, self.bands)
+        filters = np.full(1 + max(int(part.max(initial=-1)) for part in every), -1)
+        for part in (self.magnitudes, self.shares):
+            filters[part] = np.arange(len(part))
+        return filters
 
 
-def _with(parts: Sequence[HeadPart], more: Array) -> list[HeadPart]:
-    """`parts`, each of which sees the features `more` too."""
-    return [replace(p, columns=tuple(dict.fromkeys([*p.columns, *more.tolist()]))) for p in parts]
+Heads = tuple[HeadPart, ...]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The heads to choose from. copies: whether all discriminants see augmented copies, because
+    held-out sweeps cannot show the use of these.
+
+    Sweeps are too few to distinguish more candidates than these.
+    """
+
+    columns: FeatureColumns
+    copies: bool = False
+
+    def plain(self) -> dict[str, Heads]:
+        """The usual candidate, and magnitudes alone.
+
+        The usual one adds three discriminants for each kind of filters. All see the magnitudes, the
+        second also the shares and the spectrum, the third also the distribution and the spectrum.
+        An average is seldom worse than the better of two, and no held-out part has to show which
+        that is.
+        """
+        levels, bands = self.columns.levels, self.columns.bands
+        magnitudes = self.by_kind(shares=False)
+        usual = (*magnitudes, *_with(self.by_kind(shares=True), bands))
+        if len(levels):
+            usual += _with(magnitudes, np.append(levels, bands))
+        return {"magnitudes, shares, distribution": usual, "magnitudes": magnitudes}
+
+    def extended(self, best: Heads) -> dict[str, Heads]:
+        """The best plain candidate with the spectrum and with copies, and the spectrum alone."""
+        bands, kept = self.columns.bands, "without more of the spectrum"
+        bases = {kept: best}
+        if len(bands):
+            bases["with the spectrum"] = _with(best, bands)
+            bases["the spectrum alone"] = (HeadPart(tuple(bands.tolist()), self.copies),)
+        return {
+            f"{name}{', with copies' * copies}": tuple(replace(p, copies=copies) for p in parts)
+            for name, parts in bases.items()
+            for copies in sorted({self.copies, True})
+            if (name, copies) != (kept, self.copies)
+        }
+
+    def by_kind(self, shares: bool) -> Heads:
+        """A discriminant of each kind of filters, zero-sum ones first: of their magnitudes, or of
+        magnitudes and shares."""
+        of = self.columns
+        pools = (of.magnitudes, of.shares) if shares else (of.magnitudes,)
+        seen = [np.concatenate([pool[filters] for pool in pools]) for filters in of.kinds]
+        return tuple(HeadPart(tuple(columns.tolist()), self.copies) for columns in seen)
+
+
+def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
+    """The candidate with the lowest loss if it is `better` than the usual one, else the usual
+    one. Plain candidates are compared first, then extensions of the best of them."""
+
+    def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
+        for name, parts in heads.items():
+            log(f"choosing: {name}")
+            yield scores.score(parts)
+
+    plain = list(scored(candidates.plain()))
+    best = min(plain, key=scores.loss)
+    extended = list(scored(candidates.extended(best.plan.parts)))
+    best = min([*plain, *extended], key=scores.loss)
+    return best if scores.better(best, plain[0]) else plain[0]
+
+
+def _with(parts: Heads, more: Array) -> Heads:
+    """`parts`, each with the features `more` as well."""
+    return tuple(
+        replace(p, columns=tuple(dict.fromkeys([*p.columns, *more.tolist()]))) for p in parts
+    )
 
 
 def with_fewer_filters(
@@ -225,11 +273,10 @@ def with_fewer_filters(
     chosen: ScoredPlan,
     filters: Array,
     least: int,
-    log: Callable[[str], None],
+    log: Log,
 ) -> ScoredPlan:
-    """`chosen` with half of its filters, a quarter and so on, at least `least`, as long as held-out
-    parts show that this `holds`. filters: of each feature [F] the number of its filter, -1 where it
-    has none."""
+    """`chosen` with half of its filters, a quarter and so on, but at least `least`, as long as
+    this `holds` on held-out parts. filters: the filter [F] of each feature, -1 if it has none."""
     full, used = chosen, np.unique(filters[chosen.plan.columns()])
     used = used[used >= 0]
     while len(used) >= 2 * least:
@@ -244,13 +291,3 @@ def with_fewer_filters(
             break
         chosen = less
     return chosen
-
-
-def filter_groups(
-    kinds: Sequence[Array], pools: Sequence[Array], copies: bool = False
-) -> list[HeadPart]:
-    """A discriminant for each of `kinds`, filters [n] that are pooled in some ways."""
-    return [
-        HeadPart(tuple(np.concatenate([pool[filters] for pool in pools]).tolist()), copies)
-        for filters in kinds
-    ]

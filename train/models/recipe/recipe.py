@@ -1,16 +1,27 @@
-"""The default recipe: a trunk and its heads, chosen by held-out groups of the training sweeps. In:
-a Dataset. Out: a Fit.
+"""The default recipe: from the sweeps of a training set to a finished model.
 
-Bank, distribution and spectrum are fixed, so that choosing among them takes seconds and no PyTorch.
-Trained stages join what was chosen, where PyTorch is installed and sweeps are many, unless that
-names nearly everything. What the heads do not use is left out of the trunk.
+    training sweeps, and augmented copies of them
+       |   features:    filters, distribution and spectrum, in closed form
+       v
+    candidates:         sums of discriminants, each of some of the features
+       |   judged:      by groups that their heads did not see; then fewer filters
+       v
+    stages:             trained convolutions beside them, if there are many sweeps
+       |                and too many of the held-out ones are named wrongly
+       v
+    pruned:             a trunk with only the features that a discriminant sees
+       |   finished:    heads in float and int8, calibration, contact positions
+       v
+    Fit
+
+Without stages a fit takes seconds and does not need PyTorch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -35,32 +46,34 @@ from train.models.recipe.augment import (
     texture_scale,
 )
 from train.models.recipe.bank import Bank
-from train.models.recipe.choice import HeldOutScores, ScoredPlan
+from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
 from train.models.recipe.fitted import Fit, finished
 from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
 
 Array = NDArray[Any]
 STAGES = ARCHITECTURES["50k"]
-"""The stages that are trained."""
+"""The architecture of trained stages."""
 LEAST_SWEEPS = 200
-"""For training stages: fewer than a few batches give stages that know them by heart."""
+"""Smallest number of sweeps for training stages, which overfit to a few batches."""
 ENOUGH = 0.99
-"""Accuracy on held-out parts that leaves stages too little to mend for what they take of a bundle
-and of its time."""
+"""Accuracy on held-out parts from which on stages improve too little for their share of the
+bundle's size and time."""
 FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
-"""A trunk without stages that prepares counts as one with STAGES does."""
+"""A trunk without stages that prepares counts as a trunk with STAGES does."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a user may set. steps: of the training of stages; 0 to try none. augmentation: None for
-    the usual one. choose: whether anything is chosen; else all zero-sum filters are seen by one
-    discriminant. unfinished: a file that keeps the training of stages from time to time, from which
-    it goes on with the same bits. reattached: the skin will be taken off and put back after these
-    recordings, so that all heads see augmented copies, which look so. mains_hz: see
-    Architecture. calibrate: whether the fit is calibrated, which a bundle needs and `evaluate` does
-    not."""
+    """The settings of a fit.
+
+    steps: of the training of stages; 0 for no stages. augmentation: None for the default. choose:
+    False to use one discriminant of all zero-sum filters. unfinished: a file that keeps the
+    training of stages from time to time; from it an interrupted training goes on with the same
+    bits. reattached: the skin will be taken off and put back after the recordings; all heads then
+    see augmented copies. mains_hz: see Architecture. calibrate: whether the fit is finished with
+    calibration and contacts, which a bundle needs and `evaluate` does not.
+    """
 
     steps: int = 600
     augmentation: Augmentation | None = None
@@ -83,92 +96,229 @@ class Trunk:
     ranges: graph.Ranges
 
     def features(self, sweeps: Dataset, int8: bool = True) -> Array:
-        """What the heads see of `sweeps`, float32 [n, F]."""
+        """Features float32 [n, F] of `sweeps`."""
         ranges = self.ranges if int8 else None
-        return run(
-            graph.trunk_graph(sweeps.format, self.scale, self.weights, self.architecture, ranges),
-            sweeps.samples,
+        model = graph.trunk_graph(
+            sweeps.format, self.scale, self.weights, self.architecture, ranges
         )
+        return run(model, sweeps.samples)
 
     def layout(self) -> dict[str, slice]:
         """See graph.layout."""
         return graph.layout(self.sweeps.format, self.weights, self.architecture)
 
 
-def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
-    """Choose and fit on `sweeps`, of which each material must occur; a fifth of the groups is what
-    stages never see.
+@dataclass(frozen=True)
+class Setup:
+    """Everything that the steps of a fit share. out: bool [N], the sweeps of some values of the
+    group `by`, on which stages are not trained; `by` is "nothing" if there are too few groups."""
 
-    Raises FormatError where the window is shorter than a filter, every taxel is constant, or
+    sweeps: Dataset
+    seed: int
+    settings: Settings
+    augmentation: Augmentation
+    out: Array
+    by: str
+    log: Log
+
+    @classmethod
+    def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
+        """Raises FormatError if the window is too short."""
+        usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
+        numbered = replace(sweeps, groups=sweeps.groups | {"index": np.arange(len(sweeps))})
+        _, held, by = hold_out_or_all(numbered, seed)
+        out = np.isin(np.arange(len(sweeps)), held.group("index"))
+        return cls(sweeps, seed, settings, settings.augmentation or usual, out, by, log)
+
+    @cached_property
+    def copies(self) -> list[Dataset]:
+        """Augmented copies of the sweeps."""
+        return list(copies(self.sweeps, self.augmentation, self.seed, COPIES))
+
+    @cached_property
+    def sides(self) -> tuple[Dataset, Dataset]:
+        """The sweeps to train stages on, and those to judge them by."""
+        if self.by == "nothing":
+            return self.sweeps, self.sweeps
+        return self.sweeps.take(~self.out), self.sweeps.take(self.out)
+
+    @cached_property
+    def may_train(self) -> bool:
+        """Whether stages can be trained."""
+        enough = len(self.sweeps) >= LEAST_SWEEPS and self.by != "nothing"
+        return bool(self.settings.steps and enough and find_spec("torch"))
+
+    def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
+        """The features of all sweeps and copies."""
+        of_copies = [trunk.features(one, int8) for one in self.copies]
+        source = np.tile(np.arange(len(self.sweeps)), len(self.copies))
+        return HeadData(
+            trunk.features(self.sweeps, int8),
+            self.sweeps.labels,
+            np.concatenate(of_copies),
+            source,
+        )
+
+    def scores(self, data: HeadData, parts: list[InnerPart]) -> HeldOutScores:
+        """The scores of heads of these features on these parts."""
+        classes, copied = len(self.sweeps.materials), self.settings.reattached
+        return HeldOutScores([data] * len(parts), parts, classes, copied)
+
+    def part(self, number: int) -> Log:
+        """The log of one part of the fit. The third part, the stages, takes most of the time, and
+        is left out if the first two suffice."""
+        return lambda line: self.log(f"part {number} of {3 if self.may_train else 2}, {line}")
+
+
+@dataclass(frozen=True)
+class FixedFeatures:
+    """The fixed trunk with the features of all sweeps and copies, and where these are."""
+
+    trunk: Trunk
+    data: HeadData
+    columns: FeatureColumns
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The chosen heads, and the scores that chose them."""
+
+    scores: HeldOutScores
+    chosen: ScoredPlan
+
+    def validation(self) -> dict[str, Any]:
+        """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by
+        part; copies do not count."""
+        own = self.scores.own
+        right = (self.chosen.logits.argmax(axis=1) == self.scores.labels)[own]
+        low, high = interval(right, self.scores.clusters[own])
+        accuracy = round(float(right.mean()), 4)
+        return {"accuracy": accuracy, "n": len(right), "low": low, "high": high}
+
+
+def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
+    """A model for the materials of `sweeps`, each of which must occur. A fifth of the groups is
+    held out from stages and calibration.
+
+    Raises FormatError if the window is shorter than a filter, if every taxel is constant, or if
     materials have too few recordings to hold some out.
     """
-    augmentation = settings.augmentation or default_augmentation(
-        FIXED.zero_sum(sweeps.format.window)
+    setup = Setup.of(sweeps, seed, settings, log)
+    fixed = features(setup)
+    heads = candidates(fixed, setup)
+    judged = judge(heads, fixed, setup)
+    stages, judged = with_stages(judged, fixed, setup)
+    trunk, plan = pruned(fixed.trunk, stages, judged.chosen.plan)
+    return finish(trunk, plan, judged, setup)
+
+
+def features(setup: Setup) -> FixedFeatures:
+    """Step 1: the features that need no training."""
+    setup.part(1)(f"features of {len(setup.sweeps)} sweeps and {COPIES} copies of each")
+    trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.mains_hz)
+    columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free)
+    return FixedFeatures(trunk, setup.data(trunk), columns)
+
+
+def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
+    """Step 2: the heads to choose from."""
+    return Candidates(fixed.columns, setup.settings.choose and setup.settings.reattached)
+
+
+def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> Judged:
+    """Step 3: the best candidate by held-out groups, with as few filters as suffice. Without a
+    choice, one discriminant of all zero-sum filters."""
+    scores = setup.scores(fixed.data, inner_parts(setup.sweeps))
+    if not setup.settings.choose:
+        return Judged(scores, scores.score(heads.by_kind(shares=True)[:1]))
+    chosen = choice.choose(scores, heads, setup.part(2))
+    return Judged(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
+
+
+def with_stages(judged: Judged, fixed: FixedFeatures, setup: Setup) -> tuple[Trunk | None, Judged]:
+    """Step 4: trained stages and the heads beside them, if the heads without stages are not good
+    enough; else None and these.
+
+    If the skin will be reattached, stages and the spectrum suffice, unless held-out sweeps and
+    their copies show that more is better: a displaced contact changes the responses of filters
+    more. Sweeps of the recorded positions alone could not show it.
+    """
+    if not setup.may_train or judged.scores.accuracy(judged.chosen) >= ENOUGH:
+        return None, judged
+    log, plan = setup.part(3), judged.chosen.plan
+    stages = _trained(fixed.trunk.scale, setup, log)
+    scores = setup.scores(
+        _side_by_side(setup.data(stages), fixed.data), [InnerPart(setup.by, setup.out)]
     )
-    out, by = _held_out(sweeps, seed)
-    may_train = (
-        settings.steps and len(sweeps) >= LEAST_SWEEPS and by != "nothing" and find_spec("torch")
+    full = scores.score(_beside_stages(plan))
+    if not setup.settings.choose:
+        return stages, Judged(scores, full)
+    if setup.settings.reattached:
+        log("choosing: stages and the spectrum alone")
+        lean = scores.score(_stages_alone(fixed.columns.bands))
+        if not scores.better(full, lean):
+            return stages, Judged(scores, lean)
+    filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
+    return stages, Judged(scores, fewer_filters(scores, full, filters, log))
+
+
+def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
+    """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
+    it."""
+    size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
+    filters, shares, levels, bands = (
+        used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
+        for part in (layout.get(k, slice(0, 0)) for k in ("sizes", "shares", "levels", "bands"))
     )
-    told = partial(_tell, log, 3 if may_train else 2)
-    told(1, f"features of {len(sweeps)} sweeps and {COPIES} copies of each")
-    fixed = fixed_trunk(sweeps, seed, settings.mains_hz)
-    changed = list(copies(sweeps, augmentation, seed, COPIES))
-    known, classes = _known(fixed, sweeps, changed), len(sweeps.materials)
-    parts = inner_parts(sweeps)
-    scores = HeldOutScores([known] * len(parts), parts, classes, settings.reattached)
-    judged, stages = _choose(scores, fixed, settings, partial(told, 2)), None
-    train, held = (sweeps.take(~out), sweeps.take(out)) if by != "nothing" else (sweeps, sweeps)
-    if may_train and scores.accuracy(judged) < ENOUGH:
-        stages = _stages(
-            train, fixed.scale, seed, replace(settings, augmentation=augmentation), partial(told, 3)
-        )
-        both = _side_by_side(_known(stages, sweeps, changed), known)
-        scores = HeldOutScores([both], [InnerPart(by, out)], classes, settings.reattached)
-        judged = _beside_stages(scores, judged, fixed, settings, partial(told, 3))
-    trunk, plan = _pruned(fixed, stages, judged.plan)
-    heads: dict[str, Array] = {}
+    architecture = replace(
+        stages.architecture if stages else fixed.architecture,
+        pools=(len(filters) > 0) + (len(shares) > 0),
+        distribution=len(levels) > 0,
+        spectrum=len(bands) > 0,
+    )
+    weights = dict(stages.weights) if stages else {}
+    weights |= Bank.of(fixed.weights).take(filters).weights() if architecture.pools else {}
+    weights |= distribution.Levels.of(fixed.weights).weights() if architecture.distribution else {}
+    ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
+    return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
+
+
+def finish(trunk: Trunk, plan: HeadPlan, judged: Judged, setup: Setup) -> Fit:
+    """Step 6: heads of the float and the int8 trunk, calibration and contacts."""
+    settings, classes, heads = setup.settings, len(setup.sweeps.materials), {}
     for name, int8 in (("head", False), ("int8", True)):
-        weight, bias = plan.fit(_known(trunk, sweeps, changed, int8).given(), classes)
-        heads |= {
-            f"{name}.weight": weight - weight.mean(axis=0),
-            f"{name}.bias": bias - bias.mean(),
-        }
+        weight, bias = plan.fit(setup.data(trunk, int8).given(), classes)
+        heads[f"{name}.weight"] = weight - weight.mean(axis=0)
+        heads[f"{name}.bias"] = bias - bias.mean()
     about = {
-        "seed": seed,
+        "seed": setup.seed,
         "recipe": {
-            "scene": vars(augmentation),
+            "scene": vars(setup.augmentation),
             "steps": settings.steps,
             "keep_means": False,
             "reattached": settings.reattached,
             "mains_hz": settings.mains_hz,
         },
-        "held_out_by": by,
+        "held_out_by": setup.by,
         "chosen": describe(trunk, plan),
-        "validation": _validation(scores, judged),
+        "validation": judged.validation(),
     }
     made = Fit(
         {**trunk.weights, **heads},
         trunk.scale,
         trunk.architecture,
         trunk.ranges,
-        train,
-        held,
+        *setup.sides,
         about,
         plan=plan.uncooled(),
     )
     return finished(made) if settings.calibrate else made
 
 
-def _tell(log: Log, parts: int, part: int, line: str) -> None:
-    """Show how far a fit is: `part` of `parts`. The last of three takes nearly all of the time, and
-    says how much is left; it does not come where the first two are enough."""
-    log(f"part {part} of {parts}, {line}")
-
-
 def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk:
     """The trunk with the whole bank, the distribution and the spectrum.
 
-    Raises FormatError where the window is shorter than a filter, or every taxel of every sweep is
+    Raises FormatError if the window is shorter than a filter, or if every taxel of every sweep is
     constant.
     """
     format, rng = sweeps.format, np.random.default_rng(seed)
@@ -194,83 +344,28 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
-def _choose(scores: HeldOutScores, trunk: Trunk, settings: Settings, log: Log) -> ScoredPlan:
-    """choice.choose for a trunk with the whole bank; the usual candidate where there is no
-    choosing."""
-    layout, filters = trunk.layout(), Bank.of(trunk.weights)
-    *pools, levels, bands = (
-        np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
-        for name in ("sizes", "shares", "levels", "bands")
-    )
-    kinds = [which for free in (False, True) if len(which := np.flatnonzero(filters.free == free))]
-    if not settings.choose:
-        return scores.score(choice.filter_groups([np.flatnonzero(~filters.free)], pools))
-    chosen = choice.choose(scores, kinds, pools, levels, bands, log, settings.reattached)
-    return choice.with_fewer_filters(
-        scores, chosen, _filter_numbers(trunk), bank.LEAST_FILTERS, log
-    )
-
-
-def _beside_stages(
-    scores: HeldOutScores, judged: ScoredPlan, fixed: Trunk, settings: Settings, log: Log
+def fewer_filters(
+    scores: HeldOutScores, chosen: ScoredPlan, filters: Array, log: Log
 ) -> ScoredPlan:
-    """What was chosen with a discriminant of trained stages, with as few filters as then do.
-
-    For a skin that will be reattached stages and the spectrum are enough unless held-out sweeps and
-    their copies show that more is better: what corrupts sweeps moves filters more. Sweeps in place
-    alone would not do as judges: they do not show what a view is good for in a condition that
-    nobody recorded.
-    """
-    size, full = sum(STAGES.channels), scores.score(_with_stages(judged.plan))
-    if not settings.choose:
-        return full
-    if settings.reattached:
-        log("choosing: stages and the spectrum alone")
-        lean = scores.score(_stages_alone(fixed.layout().get("bands", slice(0, 0))))
-        if not scores.better(full, lean):
-            return lean
-    numbers = np.append(np.full(size, -1), _filter_numbers(fixed))
-    return choice.with_fewer_filters(scores, full, numbers, bank.LEAST_FILTERS, log)
+    """See choice.with_fewer_filters."""
+    return choice.with_fewer_filters(scores, chosen, filters, bank.LEAST_FILTERS, log)
 
 
-def _stages_alone(bands: slice) -> list[HeadPart]:
-    """A discriminant of each stage and the spectrum, whose features `bands` come after those of
-    stages; all see copies."""
-    size, ends = sum(STAGES.channels), np.cumsum(STAGES.channels).tolist()
-    spectrum = range(size + bands.start, size + bands.stop)
-    return [
-        HeadPart((*range(end - channels, end), *spectrum), True)
-        for channels, end in zip(STAGES.channels, ends, strict=True)
-    ]
+def _trained(scale: float, setup: Setup, log: Log) -> Trunk:
+    """Stages trained on the sweeps that are not held out, as a trunk of their own."""
+    from train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
 
-
-def _filter_numbers(trunk: Trunk) -> Array:
-    """Of each feature the number of the filter that gives it, -1 where none does."""
-    layout = trunk.layout()
-    numbers = np.full(max(part.stop for part in layout.values()), -1)
-    for name in ("sizes", "shares"):
-        if name in layout:
-            numbers[layout[name]] = np.arange(layout[name].stop - layout[name].start)
-    return numbers
-
-
-def _known(
-    trunk: Trunk, sweeps: Dataset, changed: Sequence[Dataset], int8: bool = True
-) -> HeadData:
-    features = [trunk.features(one, int8) for one in (sweeps, *changed)]
-    source = np.tile(np.arange(len(sweeps)), len(changed))
-    return HeadData(features[0], sweeps.labels, np.concatenate(features[1:]), source)
-
-
-def _held_out(sweeps: Dataset, seed: int) -> tuple[Array, str]:
-    """Which sweeps [N] stages never see, and by which group; see linear_head.hold_out_or_all."""
-    numbered = replace(sweeps, groups=sweeps.groups | {"index": np.arange(len(sweeps))})
-    _, held, by = hold_out_or_all(numbered, seed)
-    return np.isin(np.arange(len(sweeps)), held.group("index")), by
+    settings, sweeps = setup.settings, setup.sides[0]
+    recipe = stages.FitRecipe(steps=settings.steps, augmentation=setup.augmentation)
+    architecture = replace(STAGES, mains_hz=settings.mains_hz)
+    weights, ranges = stages.train_stages(
+        sweeps, scale, setup.seed, recipe, log, architecture, settings.unfinished
+    )
+    return Trunk(sweeps, scale, weights, architecture, ranges)
 
 
 def _side_by_side(stages: HeadData, fixed: HeadData) -> HeadData:
-    """The same sweeps with the features of both, those of stages first."""
+    """The features of both for the same sweeps, those of stages first."""
     return replace(
         fixed,
         features=np.hstack([stages.features, fixed.features]),
@@ -278,82 +373,42 @@ def _side_by_side(stages: HeadData, fixed: HeadData) -> HeadData:
     )
 
 
-def _with_stages(plan: HeadPlan) -> list[HeadPart]:
-    """`plan` with a discriminant of trained stages, whose features come before all others; it sees
+def _beside_stages(plan: HeadPlan) -> list[HeadPart]:
+    """`plan` with a discriminant of trained stages, whose features come before all others. It sees
     copies, as stages do.
 
-    What differs so much in kind errs on other sweeps: the two together stand a condition that
-    nobody recorded better than either alone, which no held-out part shows. So nothing is asked."""
+    Stages and fixed features are so different that they err on different sweeps. Together they name
+    sweeps of a new condition better than either alone, which no held-out part can show. Therefore
+    stages are added without a comparison.
+    """
     size = sum(STAGES.channels)
-    fixed = [
-        replace(part, columns=tuple(np.add(part.columns, size).tolist())) for part in plan.parts
-    ]
+    fixed = [replace(p, columns=tuple(np.add(p.columns, size).tolist())) for p in plan.parts]
     return [HeadPart(tuple(range(size)), True), *fixed]
 
 
-def _stages(sweeps: Dataset, scale: float, seed: int, settings: Settings, log: Log) -> Trunk:
-    """Stages trained on `sweeps`, as a trunk of their own."""
-    from train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
-
-    recipe = stages.FitRecipe(steps=settings.steps, augmentation=settings.augmentation)
-    architecture = replace(STAGES, mains_hz=settings.mains_hz)
-    weights, ranges = stages.train_stages(
-        sweeps, scale, seed, recipe, log, architecture, settings.unfinished
-    )
-    return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def _pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
-    """The trunk with only what the plan's discriminants see, and the plan for it."""
-    size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
-    fixed_used = used[used >= size] - size
-    filters, shares, levels, bands = (
-        fixed_used[(fixed_used >= layout[name].start) & (fixed_used < layout[name].stop)]
-        - layout[name].start
-        if name in layout
-        else np.empty(0, int)
-        for name in ("sizes", "shares", "levels", "bands")
-    )
-    architecture = replace(
-        stages.architecture if stages else fixed.architecture,
-        pools=(len(filters) > 0) + (len(shares) > 0),
-        distribution=len(levels) > 0,
-        spectrum=len(bands) > 0,
-    )
-    weights = dict(stages.weights) if stages else {}
-    weights |= Bank.of(fixed.weights).take(filters).weights() if architecture.pools else {}
-    weights |= distribution.Levels.of(fixed.weights).weights() if architecture.distribution else {}
-    ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
-    return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
+def _stages_alone(bands: Array) -> list[HeadPart]:
+    """A discriminant of each stage and the spectrum, whose features `bands` come after those of
+    stages; all see copies."""
+    ends = np.cumsum(STAGES.channels).tolist()
+    spectrum = (ends[-1] + bands).tolist()
+    return [
+        HeadPart((*range(end - channels, end), *spectrum), True)
+        for channels, end in zip(STAGES.channels, ends, strict=True)
+    ]
 
 
 def describe(trunk: Trunk, plan: HeadPlan) -> str:
-    """In words: what the trunk holds, and how many discriminants see copies."""
-    filters = Bank.of(trunk.weights).free if trunk.architecture.pools else np.empty(0, bool)
-    what = [
+    """The parts of the trunk, and how many discriminants see copies, in words."""
+    pools, channels = trunk.architecture.pools, trunk.architecture.channels
+    filters = Bank.of(trunk.weights).free if pools else np.empty(0, bool)
+    words = [
         f"{int((filters == free).sum())} {name} filters"
         for free, name in ((False, "zero-sum"), (True, "free"))
         if (filters == free).any()
     ]
-    what += (
-        ["magnitudes and shares" if trunk.architecture.pools > 1 else "magnitudes"]
-        if len(filters)
-        else []
-    )
-    what += ["distribution"] if trunk.architecture.distribution else []
-    what += ["spectrum"] if trunk.architecture.spectrum else []
-    what += (
-        [f"stages of {', '.join(map(str, trunk.architecture.channels))} channels"]
-        if trunk.architecture.channels
-        else []
-    )
+    words += ["magnitudes and shares" if pools > 1 else "magnitudes"] * (len(filters) > 0)
+    words += ["distribution"] * trunk.architecture.distribution
+    words += ["spectrum"] * trunk.architecture.spectrum
+    words += [f"stages of {', '.join(map(str, channels))} channels"] * (len(channels) > 0)
     copied = sum(part.copies for part in plan.parts)
-    return f"{', '.join(what)}; {len(plan.parts)} discriminants, {copied} with augmented copies"
-
-
-def _validation(scores: HeldOutScores, judged: ScoredPlan) -> dict[str, Any]:
-    """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by part;
-    copies do not count."""
-    right = (judged.logits.argmax(axis=1) == scores.labels)[scores.own]
-    low, high = interval(right, scores.clusters[scores.own])
-    return {"accuracy": round(float(right.mean()), 4), "n": len(right), "low": low, "high": high}
+    return f"{', '.join(words)}; {len(plan.parts)} discriminants, {copied} with augmented copies"

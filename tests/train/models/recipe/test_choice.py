@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from appliance.inference.classifier import softmax
 from train.calibration.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
 from train.data.splitters import InnerPart
 from train.models.recipe import choice
-from train.models.recipe.choice import HeldOutScores
+from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores
 
 GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
 """Features: that name the material everywhere; that say nothing; that name it in one group and lie
@@ -30,6 +31,20 @@ def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
     copied = x + 0.1 * rng.standard_normal(x.shape)
     given = HeadData(x.astype(np.float32), labels, copied.astype(np.float32), np.arange(n))
     return given, [InnerPart("place", group == value) for value in range(3)]
+
+
+def candidates(
+    kinds: Sequence[Sequence[int]],
+    magnitudes: Sequence[int],
+    shares: Sequence[int],
+    levels: Sequence[int] = (),
+    bands: Sequence[int] = (),
+    copies: bool = False,
+) -> Candidates:
+    """The candidates of a trunk with these features."""
+    parts = [np.array(part, int) for part in (magnitudes, shares, levels, bands)]
+    columns = FeatureColumns(*parts[:2], tuple(map(np.array, kinds)), *parts[2:])
+    return Candidates(columns, copies)
 
 
 def scores() -> HeldOutScores:
@@ -78,8 +93,7 @@ def test_what_lies_in_another_group_is_not_chosen():
     losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
     assert losses[0] < 0.2 < losses[1]
     assert losses[0] < losses[2]
-    pools = np.array(GOOD), np.array(NOISE)
-    chosen = choice.choose(at, [np.array([0, 1])], pools, np.arange(0), np.array(TRAP), print)
+    chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE, bands=TRAP), print)
     assert (
         sum(TRAP[0] in part.columns for part in chosen.plan.parts) <= 1
     )  # where the usual one sees the spectrum
@@ -90,14 +104,7 @@ def test_what_is_clearly_better_is_chosen():
     """Bands that name the materials, beside filters that say nothing; all discriminants see
     them."""
     at = scores()
-    chosen = choice.choose(
-        at,
-        [np.arange(2)],
-        (np.array(NOISE), np.array(TRAP * 2)),
-        np.arange(0),
-        np.array(GOOD),
-        print,
-    )
+    chosen = choice.choose(at, candidates([[0, 1]], NOISE, TRAP * 2, bands=GOOD), print)
     assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
     assert at.better(chosen, at.score([HeadPart(NOISE, False)]))
 
@@ -105,9 +112,7 @@ def test_what_is_clearly_better_is_chosen():
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
     """A discriminant of all magnitudes and one of all features, without copies."""
     at = scores()
-    chosen = choice.choose(
-        at, [np.arange(2)], (np.array(GOOD), np.array(NOISE)), np.arange(0), np.arange(0), print
-    )
+    chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE), print)
     assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
 
 
@@ -232,17 +237,12 @@ def test_candidates_are_what_the_features_allow():
     """The usual one and magnitudes alone; then the best with copies, with the spectrum, and that
     alone."""
     tried: list[str] = []
-    kinds, pools, none = (
-        [np.array([0]), np.array([1])],
-        (np.array([0, 1]), np.array([2, 3])),
-        np.arange(0),
-    )
-    choice.choose(scores(), kinds, pools, none, np.array([4]), tried.append)
+    choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 5
     assert tried[:2] == ["choosing: magnitudes, shares, distribution", "choosing: magnitudes"]
     assert tried[-1] == "choosing: the spectrum alone, with copies"
     tried.clear()
-    chosen = choice.choose(scores(), kinds[:1], pools, none, none, tried.append)
+    chosen = choice.choose(scores(), candidates([[0]], [0, 1], [2, 3]), tried.append)
     assert len(tried) == 2 + 1
     assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
 
@@ -250,8 +250,8 @@ def test_candidates_are_what_the_features_allow():
 def test_every_discriminant_sees_copies_where_these_are_wanted():
     """Fewer candidates: none is there without."""
     tried: list[str] = []
-    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
-    chosen = choice.choose(scores(), kinds, pools, np.arange(0), np.array([4]), tried.append, True)
+    heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
+    chosen = choice.choose(scores(), heads, tried.append)
     assert all(part.copies for part in chosen.plan.parts)
     assert len(tried) == len(set(tried)) == 2 + 2
 
@@ -267,9 +267,9 @@ def test_the_usual_one_sees_each_kind_three_times():
         features=(x + 0.1 * rng.standard_normal(x.shape)).astype(np.float32),
         copied=np.zeros((240, 12)),
     )
-    kinds, pools = [np.array([0]), np.array([1])], (np.array([0, 1]), np.array([2, 3]))
     at = HeldOutScores([own] * 3, parts, 3)
-    chosen = choice.choose(at, kinds, pools, np.arange(4, 8), np.arange(8, 12), print)
+    heads = candidates([[0], [1]], [0, 1], [2, 3], levels=range(4, 8), bands=range(8, 12))
+    chosen = choice.choose(at, heads, print)
     wanted = [(0,), (1,)]
     wanted += [(kind, kind + 2, 8, 9, 10, 11) for kind in (0, 1)] + [
         (kind, *range(4, 12)) for kind in (0, 1)
