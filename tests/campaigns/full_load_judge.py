@@ -218,8 +218,8 @@ def _slower(box: Json) -> str:
     """What a slower core would make of it: the share in proportion."""
     reading, share = box["reading"], box["calm"]["share"]
     slow = (
-        f"{100 * n * share:.0f} % of a core {word} times slower, of which reading {100 * n * reading:.0f} %"
+        f"{100 * n * share:.0f} % of a core {word} times slower, reading alone {100 * n * reading:.0f} %"
         + ": `palpate check` fails there" * (n * reading > MOST_READING)
         for n, word in ((6, "six"), (10, "ten"))
     )
-    return f"- {box['skin']}: {100 * share:.1f} % of a core here, of which reading {100 * reading:.1f} % by `palpate check`; {'; '.join(slow)}."
+    return f"- {box['skin']}: {100 * share:.1f} % of a core here, reading alone {100 * reading:.1f} % (`palpate check`); {'; '.join(slow)}."

@@ -100,11 +100,11 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
         in text
     )
     assert (
-        "- papillarray: 10.0 % of a core here, of which reading 7.0 % by `palpate check`; 60 % of a core six times slower"
+        "- papillarray: 10.0 % of a core here, reading alone 7.0 % (`palpate check`); 60 % of a core six times slower"
         in text
     )
     assert (
-        "reading 42 %; 100 % of a core ten times slower, of which reading 70 %: `palpate check` fails there."
+        "reading alone 42 %; 100 % of a core ten times slower, reading alone 70 %: `palpate check` fails there."
         in text
     )
     assert (
