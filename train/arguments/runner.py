@@ -7,7 +7,6 @@ module of a command is imported when the command is wanted, since training takes
 from __future__ import annotations
 
 import argparse
-import difflib
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -16,11 +15,8 @@ from importlib import import_module
 
 from appliance.core.errors import ApplianceError
 from appliance.core.interrupts import INTERRUPTED, during_imports
+from appliance.core.menu import Menu
 from train.arguments.types import Run
-
-USAGE_ERROR = 2
-"""Exit code of argparse for arguments that it refuses."""
-HELP = ("-h", "--help")
 
 
 @dataclass(frozen=True)
@@ -37,20 +33,14 @@ class Program:
     groups: Mapping[str, Mapping[str, str]]
     modules: Mapping[str, tuple[str, ...]]
 
+    @property
+    def menu(self) -> Menu:
+        """All commands in groups, without an import of any."""
+        return Menu(self.name, self.about, self.groups)
+
     def descriptions(self) -> dict[str, str]:
         """Of all commands, by name."""
-        return {name: text for group in self.groups.values() for name, text in group.items()}
-
-    def help(self) -> str:
-        """All commands in groups, without an import of any."""
-        width = max(map(len, self.descriptions()))
-        lines = [f"usage: {self.name} COMMAND [OPTIONS]", "", self.about]
-        for heading, commands in self.groups.items():
-            lines += ["", f"{heading}:"]
-            lines += [f"  {name:<{width}}  {text}" for name, text in commands.items()]
-        return "\n".join(
-            [*lines, "", f"{self.name} COMMAND --help shows the options of a command."]
-        )
+        return self.menu.commands
 
     def parser(self, wanted: str) -> argparse.ArgumentParser:
         """The parser of one command; `args.run` is the function that carries it out."""
@@ -73,18 +63,8 @@ class Program:
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run one command; its exit code. An error of this project is one line on standard error."""
         words = sys.argv[1:] if argv is None else list(argv)
-        if not words or words[0] in HELP:
-            print(self.help())
-            return 0
-        if words[0] not in self.descriptions():
-            print(self._unknown(words[0]), file=sys.stderr)
-            return USAGE_ERROR
-        return self._run(words)
-
-    def _unknown(self, word: str) -> str:
-        near = difflib.get_close_matches(word, self.descriptions(), n=1)
-        advice = f"did you mean {near[0]!r}?" if near else f"`{self.name} --help` lists them"
-        return f"{self.name}: there is no command {word!r}; {advice}"
+        answered = self.menu.answer(words)
+        return self._run(words) if answered is None else answered
 
     def _run(self, words: Sequence[str]) -> int:
         args = argparse.Namespace()
