@@ -1,9 +1,8 @@
-"""Works on many boxes at once, over ssh. In: one USER@HOST or an inventory, and the work for a box.
-Out: a line for each box.
+"""Works on many boxes at once over ssh, and prints a line for each box.
 
 pyinfra provides inventory, connections and commands. Its operations are not used: they wait for the
 slowest box after each step, and have no deadline for a box that hangs while files are copied to it.
-Here the boxes are independent, and each ends by itself, by a failure or by its deadline.
+Here the boxes are independent; a box that fails or exceeds its deadline does not delay the others.
 """
 
 # ruff: noqa: E402
@@ -32,17 +31,17 @@ from pyinfra.context import ctx_state
 from pyinfra_cli.inventory import make_inventory_from_files
 
 BEGAN_S = time.monotonic()
-"""When the command began, after the start of Python."""
+"""Start of the command, monotonic seconds."""
 PALPATE = "/opt/palpate/bin/palpate"
 NAME = re.compile(
     r"(?:(?P<ssh_user>[^@]+)@)?(?P<ssh_hostname>[^@:\[\]]+|\[[^\]]+\])(?::(?P<ssh_port>\d+))?"
 )
 """USER@HOST:PORT; user and port may be missing, an IPv6 address stands in brackets."""
 SHORT_S = 60
-"""Longest wait for a command that should take a second; a slow board that classifies takes much
-longer."""
+"""Longest wait for a command that usually takes a second. A slow board takes much longer while it
+classifies."""
 SKIN_S = 10
-"""How long to wait for a service without other trouble to find its skin."""
+"""Longest wait for the skin of a service that has passed its self-test."""
 PROPERTIES = (
     "ActiveState",
     "InvocationID",
@@ -52,8 +51,7 @@ PROPERTIES = (
     "ActiveEnterTimestampMonotonic",
     "ActiveExitTimestampMonotonic",
 )
-"""Properties of the service that systemd is asked for."""
-
+"""Properties of the service that are read from systemd."""
 
 REMEDIES = (
     ("No space left on device", "free some room there (df -h; journalctl --vacuum-size=50M)"),
@@ -71,40 +69,44 @@ REMEDIES = (
     ("host key", "if the box was set up anew, forget its old key: ssh-keygen -R HOST"),
     ("Could not resolve", "check the name, or use the address"),
     ("Could not connect", "check the address, and that the box is on: ssh USER@HOST must get in"),
-    ("SSH", "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in"),
+    ("SSH", "the server there does not speak ssh or is too busy: ssh USER@HOST must get in"),
 )
-"""Words in what a box or the way to it says, and what to do then; the first that fits."""
+"""A part of an error message, and its remedy; the first match counts."""
 
 
 class Failed(Exception):
-    """The work cannot be done on this box; the message says why and what to try."""
+    """The work failed on this box; the message gives the reason and the remedy."""
 
 
 class FleetBox:
-    """One box and the connection to it. `result`: figures that are written beside its line.
-    verbose: prints each step."""
+    """One box and the connection to it. result: figures for the JSON report. verbose: print each
+    step."""
 
     def __init__(self, host: Host, verbose: bool) -> None:
         self._host, self._verbose = host, verbose
         self.name: str = host.name
         self.result: dict[str, Any] = {}
 
+    def connect(self) -> None:
+        """Open the connection. Raises ConnectError."""
+        self._host.connect(show_errors=False, raise_exceptions=True)
+
     def data(self, name: str, default: Any = None) -> Any:
-        """A value that the inventory has for this box, or the default."""
+        """A value of this box in the inventory, or the default."""
         return self._host.data.dict().get(name, default)
 
     def report(self, text: str) -> None:
-        """Print progress for the person who waits."""
+        """Print progress."""
         print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
     def run(
         self, what: str, command: str, *, user: str = "", stdin: str = "", limit_s: float = SHORT_S
     ) -> str:
-        """Output of a command that the shell of the login user, or of `user`, runs; stdin: a file
-        in the login user's home.
+        """Output of a shell command, run as the login user or as `user`. stdin: a file in the login
+        user's home.
 
-        Raises Failed, with `what` and the last line of the output, where the command fails or takes
-        longer than limit_s.
+        Raises Failed if the command fails or takes longer than limit_s. The message begins with
+        `what` and ends with a line of the output.
         """
         if self._verbose:
             self.report(what)
@@ -115,12 +117,10 @@ class FleetBox:
         try:
             done, output = self._host.run_shell_command(StringCommand(command), _timeout=limit_s)
         except TimeoutError as e:
-            raise Failed(
-                f"{what}: no answer within {limit_s:.0f} s; look whether the box is well"
-            ) from e
+            raise Failed(f"{what}: no answer within {limit_s:.0f} s; check the box") from e
         if not done:
             lines = [line for line in (output.stderr or output.stdout).splitlines() if line.strip()]
-            # what it stumbled over may stand before what it made of that
+            # the cause may stand before the last line
             line = next(
                 (line for line in lines if remedy(line)), lines[-1] if lines else "no reason given"
             )
@@ -131,45 +131,33 @@ class FleetBox:
         """Copy a file into the home of the login user. Raises Failed."""
         try:
             self._host.put_file(str(content) if isinstance(content, Path) else content, name)
-        except OSError as e:  # over SFTP a full disk is no more than "Failure"
+        except OSError as e:  # SFTP reports a full disk just as "Failure"
             raise Failed(
-                f"copying {name}: {e}; see whether its disk is full (df -h) and try again"
+                f"copying {name}: {e}; check whether its disk is full (df -h) and try again"
             ) from e
 
     def service(self) -> dict[str, str]:
-        """Properties of the service, from systemd; `Now`: seconds since the box was switched on."""
+        """Properties of the service, from systemd. `Now`: seconds since the box was switched on."""
         ask = f"systemctl show palpate -p {','.join(PROPERTIES)}; sed 's/^/Now=/; s/ .*//' /proc/uptime"
         output = self.run("asking for the service", ask, user="root")
         return dict(line.partition("=")[::2] for line in output.splitlines())
 
     def restart(self, limit_s: float, starts: int) -> bool:
-        """Restart the service. True where it is READY, False where it only waits for its skin.
+        """Restart the service. True if it is READY, False if it only waits for its skin.
 
-        `result` gets ready_s, seconds from the begin of this command to READY, and lost_s, seconds
-        without classifying by the clock of the box. Raises Failed where it is neither within
-        limit_s, or has failed `starts` times. That limit is by the clock of the box, too: a slow
-        way to it, or an emulator that is short of time, costs nothing.
+        `result` gets ready_s, seconds from the start of this command to READY, and lost_s, seconds
+        without classification. Raises Failed if the service is in neither state within limit_s, or
+        has failed `starts` times. Limit and lost_s are by the clock of the box, so a slow network
+        or emulator does not count.
         """
-        before, waits_s = self.service(), 0.0
+        before = self.service()
         # reset-failed sets the count of restarts back to 0
         again = "systemctl reset-failed palpate; systemctl --no-block restart palpate"
         self.run("restarting the service", again, user="root")
-        end_s = float(before["Now"]) + limit_s
-        while True:
-            now = self.service()
-            now_s = float(now["Now"])
-            begun = now["InvocationID"] != before["InvocationID"]
-            if begun and now["ActiveState"] == "active":
-                break
-            if begun and now["StatusText"].startswith("skin "):  # past its self-test
-                waits_s = waits_s or now_s
-                if now_s > waits_s + SKIN_S:
-                    self.result["waits"] = now["StatusText"]
-                    return False
-            failed = begun and (now["ActiveState"] == "failed" or int(now["NRestarts"]) >= starts)
-            if failed or now_s > end_s:
-                raise Failed(f"the service does not come up: {self._last_line(now)}")
-            time.sleep(0.2)
+        now = self._restarted(before, limit_s, starts)
+        if now["ActiveState"] != "active":
+            self.result["waits"] = now["StatusText"]
+            return False
         self.result["ready_s"] = round(time.monotonic() - BEGAN_S, 2)
         if before["ActiveState"] == "active":
             away_us = int(now["ActiveEnterTimestampMonotonic"]) - int(
@@ -178,9 +166,28 @@ class FleetBox:
             self.result["lost_s"] = round(away_us / 1e6, 2)
         return True
 
+    def _restarted(self, before: dict[str, str], limit_s: float, starts: int) -> dict[str, str]:
+        """Wait for the service: its properties once it is active, or has waited SKIN_S for its
+        skin. before: its properties before the restart. Raises Failed."""
+        end_s, waits_s = float(before["Now"]) + limit_s, 0.0
+        while True:
+            now = self.service()
+            now_s = float(now["Now"])
+            begun = now["InvocationID"] != before["InvocationID"]
+            if begun and now["ActiveState"] == "active":
+                return now
+            if begun and now["StatusText"].startswith("skin "):  # it has passed its self-test
+                waits_s = waits_s or now_s
+                if now_s > waits_s + SKIN_S:
+                    return now
+            failed = begun and (now["ActiveState"] == "failed" or int(now["NRestarts"]) >= starts)
+            if failed or now_s > end_s:
+                raise Failed(f"the service does not come up: {self._last_line(now)}")
+            time.sleep(0.2)
+
     def _last_line(self, service: dict[str, str]) -> str:
         """Last line of the service's journal, with its state."""
-        # -t palpate: leaves out the program that lowers the outputs afterwards
+        # -t palpate leaves out the program that lowers the outputs afterwards
         command = "journalctl -q -t palpate _SYSTEMD_UNIT=palpate.service -n 20 -o cat"
         lines = self.run("reading the journal", command, user="root").splitlines()
         own = [line for line in lines if not line.startswith("sweep ")] or [
@@ -190,17 +197,17 @@ class FleetBox:
 
 
 def remedy(text: str) -> str:
-    """What to do about what a box or the way to it said, "" where that is not known."""
+    """The remedy for an error message, "" if none is known."""
     return next((do for words, do in REMEDIES if words in text), "")
 
 
 def with_remedy(text: str) -> str:
-    """`text`, and after it what to do, where that is known."""
+    """An error message, followed by its remedy if one is known."""
     return "; ".join(filter(None, (text, remedy(text))))
 
 
 def options(about: str, limit_s: int) -> argparse.ArgumentParser:
-    """A parser with the options that say which boxes, and how long the work on one may take."""
+    """A parser with the options for the boxes and the time limit."""
     parser = argparse.ArgumentParser(description=about)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--host", metavar="USER@HOST[:PORT]", help="one box")
@@ -215,20 +222,20 @@ def options(about: str, limit_s: int) -> argparse.ArgumentParser:
         type=int,
         default=limit_s,
         metavar="SECONDS",
-        help=f"for all of one box (default {limit_s})",
+        help=f"time limit for each box (default {limit_s})",
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="print each step")
     parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="write what became of each box to FILE"
+        "--json", type=Path, metavar="FILE", help="write the result of each box to FILE"
     )
     return parser
 
 
 def each(args: argparse.Namespace, work: Callable[[FleetBox], str]) -> int:
-    """Do `work` on all boxes at once, and print for each the line that it returns, or why it
-    failed.
+    """Do `work` on all boxes at once. Prints for each box the line that `work` returns, or the
+    reason of its failure.
 
-    args: of a parser from `options`. Returns the exit code: 1 where any box failed.
+    args: of a parser from `options`. Returns the exit code: 1 if any box failed.
     """
     inventory = _inventory(args)
     try:
@@ -240,22 +247,11 @@ def each(args: argparse.Namespace, work: Callable[[FleetBox], str]) -> int:
 
     def one(host: Host) -> None:
         box = FleetBox(host, args.verbose)
-        try:
-            with gevent.Timeout(
-                args.limit
-            ):  # a BaseException, so no code in between catches and retries it
-                host.connect(show_errors=False, raise_exceptions=True)
-                line = work(box)
+        failure = _attempt(box, work, args.limit)
+        if failure:
+            why[box.name] = failure
+        else:
             results[box.name] = box.result
-            print(f"{box.name}: {line}", flush=True)
-        except gevent.Timeout:
-            why[box.name] = (
-                f"not done within {args.limit} s and given up; look whether the box is well, then try again"
-            )
-        except ConnectError as e:
-            why[box.name] = with_remedy(f"cannot be reached: {e}")
-        except (Failed, OSError, EOFError, SSHException, PyinfraError) as e:
-            why[box.name] = str(e) or type(e).__name__
 
     try:
         gevent.joinall([state.pool.spawn(one, host) for host in inventory], raise_error=True)
@@ -274,10 +270,26 @@ def each(args: argparse.Namespace, work: Callable[[FleetBox], str]) -> int:
     return 1 if why else 0
 
 
+def _attempt(box: FleetBox, work: Callable[[FleetBox], str], limit_s: int) -> str:
+    """Do `work` on one box and print its line; the reason of a failure, else ""."""
+    try:
+        # Timeout is a BaseException, so no code in between catches it and retries
+        with gevent.Timeout(limit_s):
+            box.connect()
+            line = work(box)
+    except gevent.Timeout:
+        return f"not done within {limit_s} s and given up; check the box, then try again"
+    except ConnectError as e:
+        return with_remedy(f"cannot be reached: {e}")
+    except (Failed, OSError, EOFError, SSHException, PyinfraError) as e:
+        return str(e) or type(e).__name__
+    print(f"{box.name}: {line}", flush=True)
+    return ""
+
+
 def _inventory(args: argparse.Namespace) -> Inventory:
-    """The boxes that the options name; ends the program where these are not understood."""
-    # errors are printed with each box's line; pyinfra's warnings are about host keys that ssh does
-    # not know
+    """The boxes of the options. Ends the program if the options are wrong."""
+    # errors are printed with each box's line; pyinfra's warnings are about unknown host keys
     logging.getLogger("paramiko").setLevel(logging.CRITICAL)
     logging.getLogger("pyinfra").addFilter(lambda record: record.levelno == logging.WARNING)
     util.getpass = _no_password
@@ -293,7 +305,7 @@ def _inventory(args: argparse.Namespace) -> Inventory:
         return Inventory(([(args.host, data)], {}))
     if not args.hosts.is_file():
         sys.exit(f"palpate: no inventory {args.hosts}; systemd/inventory.example.py shows one")
-    with ctx_state.use(State()):  # it records there which file it reads
+    with ctx_state.use(State()):  # the reader notes its file there
         inventory: Inventory = make_inventory_from_files(str(args.hosts))
     if not len(inventory):
         sys.exit(f"palpate: {args.hosts} names no box; systemd/inventory.example.py shows how")
@@ -301,6 +313,6 @@ def _inventory(args: argparse.Namespace) -> Inventory:
 
 
 def _no_password(prompt: str = "", stream: TextIO | None = None) -> str:
-    """Replaces pyinfra's password prompt, which would stop all boxes until somebody types. Raises
+    """Replaces pyinfra's password prompt, which would block the work on all boxes. Raises
     Failed."""
     raise Failed(with_remedy("sudo: a password is required"))

@@ -1,8 +1,8 @@
-"""Packs a release for a box. In: the wheel, the lock, files of this checkout. Out: an archive for
-each architecture and Python.
+"""Packs the wheel, the lock and files of this checkout into one archive for each architecture and
+Python version of the boxes.
 
-Wheels for another architecture or Python are fetched here, each checked by its hash: the boxes need
-no internet for them.
+The wheels of the lock are fetched on this machine and checked by their hashes, so the boxes need no
+internet.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from appliance.core import storage
 ROOT = Path(__file__).resolve().parent.parent
 LOCK = ROOT / "appliance" / "requirements.lock"
 GLIBC = 36
-"""Wheels may need glibc 2.36, that of Debian 12, or an older one."""
+"""Newest glibc, 2.36 of Debian 12, that a wheel may need."""
 
 
 class ReleaseArchives:
-    """What is copied to a box: one archive for each architecture and Python, made when the first
-    box needs it.
+    """The archives for the boxes, one for each architecture and Python version. Each is made when
+    the first box needs it.
 
-    wheel: of Palpate. shares: files and folders of this checkout that are copied as well. folder:
-    for the archives.
+    wheel: of Palpate. shares: files and folders of this checkout that are packed too. folder: where
+    the archives are written.
     """
 
     def __init__(self, wheel: Path, shares: Sequence[str], folder: Path) -> None:
@@ -45,7 +45,7 @@ class ReleaseArchives:
         self._made: dict[tuple[str, str], tuple[str, Path]] = {}
 
     def of(self, machine: str, python: str) -> tuple[str, Path]:
-        """Name of the release, and its archive. Raises Failed where a wheel cannot be fetched."""
+        """Name and archive of the release. Raises Failed if a wheel cannot be fetched."""
         with self._lock:
             if (machine, python) not in self._made:
                 self._made[machine, python] = self._make(machine, python)
@@ -54,7 +54,7 @@ class ReleaseArchives:
     def _make(self, machine: str, python: str) -> tuple[str, Path]:
         lock = locked(LOCK.read_text(), python, machine)
         content = hashlib.sha256(f"{python.rpartition('.')[0]}\n{lock}".encode())
-        with zipfile.ZipFile(self._wheel) as wheel:  # not the file itself: it has dates in it
+        with zipfile.ZipFile(self._wheel) as wheel:  # not the wheel's own bytes: they contain dates
             content.update(
                 repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode()
             )
@@ -79,8 +79,8 @@ def _plain(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 
 def locked(text: str, python: str, machine: str) -> str:
-    """The lock without the lines for another Python or architecture: pip evaluates markers for the
-    Python it runs on, also when it fetches for another."""
+    """The lock without the lines for other Python versions or architectures. pip would evaluate
+    their markers for the Python that it runs on."""
     box = {
         "python_full_version": python,
         "python_version": python.rpartition(".")[0],
@@ -97,46 +97,36 @@ def locked(text: str, python: str, machine: str) -> str:
 
 
 def fetch(lock: str, python: str, machine: str) -> Path:
-    """A folder with the lock and its wheels, kept for the next time. Raises Failed where pip cannot
-    fetch them."""
+    """A folder with the lock and its wheels, which is kept. Raises Failed if pip cannot fetch
+    them."""
     short = python.rpartition(".")[0]
-    target = (
-        ROOT
-        / "build"
-        / "wheels"
-        / f"{machine}-{short}-{hashlib.sha256(lock.encode()).hexdigest()[:8]}"
-    )
+    digest = hashlib.sha256(lock.encode()).hexdigest()[:8]
+    target = ROOT / "build" / "wheels" / f"{machine}-{short}-{digest}"
     if target.exists():
         return target
-    tags = [f"--platform=manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
     target.parent.mkdir(parents=True, exist_ok=True)
     with storage.folder(target) as part:
         (part / "requirements.lock").write_text(lock)
-        command: tuple[str | Path, ...] = (
-            sys.executable,
-            "-m",
-            "pip",
-            "--disable-pip-version-check",
-            "-q",
-            "download",
-            "--no-deps",
-            "--only-binary",
-            ":all:",
-            "--implementation",
-            "cp",
-            "--python-version",
-            short,
-            *tags,
-            f"--platform=manylinux2014_{machine}",
-            "--require-hashes",
-            "-r",
-            part / "requirements.lock",
-            "-d",
-            part,
+        command: list[str | Path] = [sys.executable, *_download(machine, short), "-d", part]
+        done = subprocess.run(
+            [*command, "-r", part / "requirements.lock"],
+            capture_output=True,
+            text=True,
+            check=False,
         )
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise Failed(
                 f"wheels for {machine}, Python {short}: {done.stderr.strip().splitlines()[-1]}"
             )
     return target
+
+
+def _download(machine: str, python: str) -> list[str]:
+    """Arguments with which pip fetches wheels for another machine. python: "3.11"."""
+    options = "-q download --no-deps --only-binary :all: --require-hashes --implementation cp"
+    platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 16, -1)]
+    return [
+        *("-m", "pip", "--disable-pip-version-check", *options.split()),
+        *("--python-version", python),
+        *(f"--platform={platform}" for platform in [*platforms, f"manylinux2014_{machine}"]),
+    ]

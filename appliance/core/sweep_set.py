@@ -43,7 +43,18 @@ class SweepSet:
     unloaded: Array | None = None
 
     def __post_init__(self) -> None:
-        x, n = self.samples, len(self.materials)
+        self._check_samples()
+        self._check_numbers()
+        self._check_materials()
+        if not 0 < self.rate_hz < np.inf:
+            raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
+        try:
+            _ = self.format
+        except FormatError as e:
+            raise self._error(str(e)) from e
+
+    def _check_samples(self) -> None:
+        x = self.samples
         if x.ndim not in (4, 5) or 0 in x.shape or x.shape[4:] == (1,):
             raise self._error(
                 f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty, "
@@ -56,6 +67,10 @@ class SweepSet:
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
+
+    def _check_numbers(self) -> None:
+        """The arrays with an entry for each sweep."""
+        x = self.samples
         for name, values in {
             "labels": self.labels,
             **{f"group_{k}": v for k, v in self.groups.items()},
@@ -71,6 +86,9 @@ class SweepSet:
                 f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: mean and standard deviation "
                 "of the unloaded skin for each sweep, or leave it out"
             )
+
+    def _check_materials(self) -> None:
+        n = len(self.materials)
         outside = np.flatnonzero((self.labels < 0) | (self.labels >= n))
         if len(outside):
             i = outside[0]
@@ -81,12 +99,6 @@ class SweepSet:
             raise self._error(
                 f"materials {list(self.materials)} name one twice; give each its own name"
             )
-        if not 0 < self.rate_hz < np.inf:
-            raise self._error(f"rate_hz is {self.rate_hz}; give frames per second")
-        try:
-            _ = self.format
-        except FormatError as e:
-            raise self._error(str(e)) from e
 
     def _error(self, why: str) -> FormatError:
         return FormatError(f"{self.source}: {why}")

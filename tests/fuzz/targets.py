@@ -24,7 +24,7 @@ from appliance.core.errors import FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
 from appliance.io import robot_link, usb_sensor
-from appliance.service import feed
+from appliance.service import feed_reader
 from tests.fuzz import enrolments, far_sides, files, skins
 from tests.fuzz.files import one_line
 
@@ -219,12 +219,12 @@ def _answer(parsed: robot_link.Command) -> None:
 
 
 def requests(data: bytes, folder: Path) -> None:
-    """feed.requests: what the document allows is taken, whatever else is refused in one line, in
-    parts as at once."""
+    """feed_reader.requests: requests as in PROTOCOL.md are accepted, all others are refused with a
+    one-line message. The result is the same if the bytes come in parts."""
     *lines, last = data.split(b"\n")
     right = len(last) <= REQUEST and all(map(_is_request, lines))
     try:
-        got, rest = feed.requests(data)
+        got, rest = feed_reader.requests(data)
     except FormatError as e:
         refused = one_line(e)
     else:
@@ -237,10 +237,10 @@ def requests(data: bytes, folder: Path) -> None:
     for asked in got:
         assert asked.frames_hz is None or 0 <= asked.frames_hz <= 20
         assert asked.sweeps in (None, True, False)
-        assert asked != feed.Asked()
+        assert asked != feed_reader.Asked()
     for cut in cuts(data):
-        first, left = feed.requests(data[:cut])
-        then, left = feed.requests(data[cut:], left)
+        first, left = feed_reader.requests(data[:cut])
+        then, left = feed_reader.requests(data[cut:], left)
         assert (first + then, left) == (got, rest), f"cut at {cut}, other requests come out"
 
 

@@ -539,7 +539,7 @@ def test_boxes_that_fail_do_not_stop_the_others(
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
     assert (
-        "what answers there is no ssh, or too busy for it: ssh USER@HOST must get in"
+        "the server there does not speak ssh or is too busy: ssh USER@HOST must get in"
         in lines["dumb"]
     )
     assert lines["bare"].startswith(
@@ -626,7 +626,7 @@ except fleet.Failed as e:
         ("Could not resolve hostname", "check the name, or use the address"),
         ("Could not connect", "check the address, and that the box is on"),
         ("Authentication error", "let your key in: ssh-copy-id"),
-        ("SSH error", "what answers there is no ssh"),
+        ("SSH error", "the server there does not speak ssh"),
     ],
 )
 def test_a_box_that_cannot_be_reached_comes_with_what_to_do(said: str, do: str):
@@ -670,7 +670,7 @@ except fleet.Failed as e:
 """
     assert (
         run_here(code)
-        == "copying bundle.tar: Failure; see whether its disk is full (df -h) and try again"
+        == "copying bundle.tar: Failure; check whether its disk is full (df -h) and try again"
     )
 
 

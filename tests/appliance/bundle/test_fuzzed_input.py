@@ -20,7 +20,7 @@ from appliance.core.errors import ApplianceError
 from appliance.io import packets, robot_link, skin_codecs, skin_profile, usb_sensor
 from appliance.io.skin_codecs import fixed, papillarray, robotiq, text, xela
 from appliance.recording import capture
-from appliance.service import feed
+from appliance.service import feed_reader
 from tests.fuzz import corpus, enrolments, files, seeds, skins, targets
 from tests.fuzz.mutators import MUTATORS
 from train.data import raw_files
@@ -133,7 +133,7 @@ def frames_of(name: str, data: bytes, folder: Path) -> int:
 READ: dict[str, Callable[[bytes, Path], Any]] = {
     "unpack": lambda data, folder: packets.unpack(data).packets,
     "command": lambda data, folder: any(not c.error for c in robot_link.parse(data)[0]),
-    "feed": lambda data, folder: feed.requests(data)[0],
+    "feed": lambda data, folder: feed_reader.requests(data)[0],
     "settings": lambda data, folder: config.load(
         None, folder=folder, site=written(folder, "palpate.toml", data)
     ),
@@ -326,20 +326,20 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     (
         "feed",
         "a request is lost",
-        feed,
+        feed_reader,
         "requests",
-        changed(feed, "requests", lambda got: (got[0][1:], got[1])),
+        changed(feed_reader, "requests", lambda got: (got[0][1:], got[1])),
     ),
     (
         "feed",
         "the rest is dropped",
-        feed,
+        feed_reader,
         "requests",
-        changed(feed, "requests", lambda got: (got[0], b"")),
+        changed(feed_reader, "requests", lambda got: (got[0], b"")),
     ),
-    ("feed", "frames without a limit", feed, "MOST_HZ", 1e9),
-    ("feed", "a line has no limit", feed, "MOST_REQUEST", 10**9),
-    ("feed", "a message of two lines", feed, "_shown", lambda line: "line 1\nline 2"),
+    ("feed", "frames without a limit", feed_reader, "MOST_HZ", 1e9),
+    ("feed", "a line has no limit", feed_reader, "MOST_REQUEST", 10**9),
+    ("feed", "a message of two lines", feed_reader, "_shown", lambda line: "line 1\nline 2"),
     (
         "settings",
         "limits are not looked at",
@@ -448,7 +448,7 @@ def test_each_promise_can_be_seen_broken(
     [
         ("unpack", packets, "unpack_identity"),
         ("command", sentences, "read"),
-        ("feed", feed, "_request"),
+        ("feed", feed_reader, "_request"),
         ("settings", config, "_checked"),
         ("manifest", manifest, "typed"),
         ("recording", types, "typed"),

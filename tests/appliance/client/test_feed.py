@@ -156,7 +156,7 @@ def test_the_reason_of_the_box_is_kept(tmp_path: Path):
         offered.turns(10)
         kinds = [line["type"] for line in iter(lambda: feed.read(0), None)]
         assert kinds == ["hello", "health", "closed"]
-        assert "frames a second are a number from 0 to 20" in feed.trouble
+        assert "give frames a second as a number from 0 to 20" in feed.trouble
     offered.feed.stopping()
 
 

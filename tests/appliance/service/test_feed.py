@@ -22,19 +22,17 @@ import pytest
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, SweepFormat
 from appliance.service import feed as module
+from appliance.service import feed_reader
 from appliance.service.feed import (
     HEARD,
-    HEARD_BYTES,
     MOST_PERIOD_NS,
     MOST_READERS,
     PERIOD_NS,
-    QUEUE_BYTES,
     SERVED,
     SHARE,
-    Asked,
     FeedServer,
-    requests,
 )
+from appliance.service.feed_reader import HEARD_BYTES, QUEUE_BYTES, Asked, requests
 from appliance.sim import devices, rig, script, skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND, Rigged
@@ -244,8 +242,8 @@ def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
     large.feed.sweep(sweep, OK, {})
     large.feed.answered(replace(OK, sweep=8))
     one, other = large.feed._readers.values()
-    assert one.takes(large.feed._large)
-    assert other.takes(large.feed._large)
+    assert one.takes(large.feed._shared)
+    assert other.takes(large.feed._shared)
     got: list[list[dict[str, Any]]] = [[], []]
     for _ in range(20):
         large.turns()
@@ -265,7 +263,7 @@ def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
             "uint8",
         )
         assert b64decode(line["data"]) == sweep.frames.taxels.tobytes()
-    assert not any(reader.takes(large.feed._large) for reader in (one, other))
+    assert not any(reader.takes(large.feed._shared) for reader in (one, other))
 
 
 def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
@@ -448,10 +446,10 @@ def test_a_thousand_connections_leave_no_file_open(offered: Offered) -> None:
 
 WRONG = {
     "garbage": (b"\x00\xff\x80 garbage\n", "is not json"),
-    "another form": (b"[1]\n", "is no request"),
+    "another form": (b"[1]\n", "is not a request"),
     "an empty line": (b"\n", "is not json"),
-    "nothing asked": (b"{}\n", "is no request"),
-    "an unknown name": (b'{"frames": 1, "write": true}\n', "is no request"),
+    "nothing asked": (b"{}\n", "is not a request"),
+    "an unknown name": (b'{"frames": 1, "write": true}\n', "is not a request"),
     "too many frames": (b'{"frames": 21}\n', "a number from 0 to 20"),
     "fewer than none": (b'{"frames": -1}\n', "a number from 0 to 20"),
     "no number": (b'{"frames": NaN}\n', "a number from 0 to 20"),
@@ -489,13 +487,13 @@ def test_endless_requests_are_read_a_little_each_turn(
     """A reader that sends without a pause: of its bytes no more than a few are taken in a turn, and
     others are served."""
     taken: list[int] = []
-    plain = module.requests
+    plain = feed_reader.requests
 
     def counted(data: bytes, rest: bytes) -> tuple[list[Asked], bytes]:
         taken.append(len(data))
         return plain(data, rest)
 
-    monkeypatch.setattr(module, "requests", counted)
+    monkeypatch.setattr(feed_reader, "requests", counted)
     floods, other = [offered.peer() for _ in range(10)], offered.peer()
     for peer in floods:
         peer.socket.setblocking(False)

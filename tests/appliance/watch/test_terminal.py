@@ -19,7 +19,7 @@ from appliance.cli.main import main
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ConfigError, FormatError
 from appliance.core.types import Status, SweepFormat
-from appliance.service.feed import encode
+from appliance.service.feed_reader import encode
 from appliance.sim import skin
 from appliance.watch import terminal
 from appliance.watch.terminal import TerminalWatch, WatchedBox, events, pass_on, picture
