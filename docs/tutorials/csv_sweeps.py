@@ -3,7 +3,7 @@ docs/tutorials/csv_sweeps.py FOLDER`.
 
 Each file is one sweep of a finger over a tube: a line of names, then a line for each frame with its
 time in ms and the raw counts of sixteen taxels. `wood_p3_2.csv` is the second sweep of wood at
-position 3. The numbers come from the project's simulated skin, so they are no real skin's.
+position 3. The numbers come from the project's simulated skin, not from a real skin.
 """
 
 from __future__ import annotations
