@@ -130,9 +130,9 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
 
     Warns of materials without a sweep, which are left out, and of taxels that never change.
     """
-    pairs = labels.renames(args.rename)
+    pairs = labels.parse_renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
-    labels.check_known(pairs, (name for sweeps in loaded for name in sweeps.materials))
+    labels.check_renames(pairs, (name for sweeps in loaded for name in sweeps.materials))
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
     for line in warnings_of(part if args.only else whole):

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> None:
         args.dtype,
         args.variable,
         args.transpose,
-        labels.renames(args.rename),
+        labels.parse_renames(args.rename),
     )
     for option in ("out", "report"):
         if path := getattr(args, option):

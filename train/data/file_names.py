@@ -1,5 +1,7 @@
-"""What the names of files say. In: a pattern such as "{material}_{force:d}N_{trial}.csv", a path.
-Out: its fields as text."""
+"""Reads fields such as material and force from file names.
+
+A pattern such as "{material}_{force:d}N_{trial}.csv" says where each field stands in a path.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,17 @@ from train.data.readers import NUMBER, numbered
 
 FIELD = re.compile(r"\{(\w*)(?::([^{}]*))?\}")
 KINDS = {"": r"[^/]+", "d": r"-?\d+", "f": r"-?\d+(?:\.\d+)?"}
-"""What a field may hold: any text within one folder's or file's name, a whole number, a number."""
+"""Regular expression of each kind of field: any text without a slash, a whole number, a number."""
 GROUP = re.compile(r"[a-z]\w*")
 EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 
 
 @dataclass(frozen=True)
 class NamePattern:
-    """A pattern over paths below a folder; `{}` is a part that says nothing. Raises FormatError
-    where it cannot be read."""
+    """A pattern over paths below a folder; `{}` matches text that is ignored.
+
+    Raises FormatError if the pattern cannot be read.
+    """
 
     text: str
 
@@ -34,20 +38,23 @@ class NamePattern:
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
-                f"--pattern {self.text!r} has a brace without its other one; write e.g. {EXAMPLE}"
+                f"--pattern {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
         if "material" not in names:
             raise FormatError(
-                f"--pattern {self.text!r} does not say where the material stands; write e.g. {EXAMPLE}"
+                f"--pattern {self.text!r} does not say where the material stands; "
+                f"write e.g. {EXAMPLE}"
             )
         for name, kind in FIELD.findall(self.text):
             if name and (names.count(name) > 1 or not GROUP.fullmatch(name)):
                 raise FormatError(
-                    f"--pattern: {name!r} stands twice or is no name; use small letters, each name once"
+                    f"--pattern: {name!r} stands twice or is not a name; "
+                    "use lower-case letters, and each name once"
                 )
             if kind not in KINDS:
                 raise FormatError(
-                    f"--pattern: {kind!r} is no kind; use {{{name}}}, {{{name}:d}} (whole) or {{{name}:f}}"
+                    f"--pattern: {kind!r} is not a kind of field; "
+                    f"use {{{name}}}, {{{name}:d}} (whole) or {{{name}:f}}"
                 )
         if "recording" in names:
             raise FormatError(
@@ -56,12 +63,13 @@ class NamePattern:
 
     @property
     def names(self) -> list[str]:
-        """The names of its fields."""
         return [name for name, _ in FIELD.findall(self.text) if name]
 
     def read(self, path: str) -> dict[str, str] | None:
-        """The fields of a path; None where it does not fit. Raises FormatError where it fits in
-        several ways."""
+        """The fields of a path, or None if it does not match the pattern.
+
+        Raises FormatError if it matches in several ways.
+        """
         short, long = (re.fullmatch(self._expression(how), path) for how in ("+?", "+"))
         if not (short and long):
             return None
@@ -77,7 +85,8 @@ class NamePattern:
         return short.groupdict()
 
     def _expression(self, how: str) -> str:
-        """As a regular expression in which fields are as short (+?) or as long (+) as can be."""
+        """The pattern as a regular expression; `how` makes fields match shortest (+?) or longest
+        (+)."""
         parts, end = [], 0
         for found in FIELD.finditer(self.text):
             name, kind = found.groups()
@@ -91,12 +100,15 @@ class NamePattern:
 
 
 def group(texts: Sequence[str]) -> tuple[NDArray[Any], str]:
-    """A number for each text [N], and what the numbers stand for, "" where they are the texts:
-    whole numbers stay, other texts are ranked, by value where all are numbers."""
+    """A number for each text [N], and an explanation of the numbers.
+
+    Whole numbers keep their value, and the explanation is "". Other texts get their rank: by
+    value if all are numbers, else by alphabet.
+    """
     different = sorted(set(texts))
     if all(map(NUMBER.fullmatch, different)):
         return numbered(texts), ""
-    with suppress(ValueError):  # some are no numbers
+    with suppress(ValueError):  # some are not numbers
         different = sorted(different, key=float)
     rank = {text: i for i, text in enumerate(different)}
     return np.array([rank[text] for text in texts]), ", ".join(

@@ -1,8 +1,7 @@
-"""Imports a folder of recordings as a sweep set. In: files of frames x taxels, an ImportPlan. Out:
-a Dataset and a report.
+"""Imports a folder of recordings, files of frames x taxels, as a sweep set.
 
-Each file is one recording of one material; what it is of stands in its name. Nothing is guessed:
-what is missing or fits in two ways leaves the file out, and the report says why.
+Each file is one recording of one material, and its name says which. Nothing is guessed: a file
+with missing or ambiguous information is left out, and the report says why.
 """
 
 from __future__ import annotations
@@ -33,7 +32,10 @@ RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 
 @dataclass(frozen=True)
 class Length:
-    """A length of time, as seconds or as frames. Raises FormatError where its text is neither."""
+    """A length of time, in seconds, milliseconds or frames. option: its name in error messages.
+
+    Raises FormatError if the text is not a length.
+    """
 
     text: str
     option: str
@@ -41,11 +43,12 @@ class Length:
     def __post_init__(self) -> None:
         if not (found := LENGTH.fullmatch(self.text)) or not float(found[1] or found[3]):
             raise FormatError(
-                f"{self.option} {self.text} cannot be read; write 2s, 500ms, or a number of frames, 1500"
+                f"{self.option} {self.text} cannot be read; "
+                "write 2s, 500ms, or a number of frames, 1500"
             )
 
     def frames(self, rate_hz: float) -> int:
-        """In frames, at least one."""
+        """The length in frames, at least 1."""
         found = LENGTH.fullmatch(self.text)
         assert found
         if found[3]:
@@ -55,14 +58,18 @@ class Length:
 
 @dataclass(frozen=True)
 class ImportPlan:
-    """How files become sweeps. grid: ROWSxCOLUMNS or ROWSxCOLUMNSxAXES, "" where arrays have that
-    shape. columns: those of the taxels, "" for all but the time. time: COLUMN:UNIT, rate_hz: frames
-    per second; one of them is needed.
+    """How files become sweeps; each attribute is an option of `palpate-train import`.
 
-    every: from the start of one window to that of the next, None for the middle window alone.
-    dtype: of the counts, "" as recorded. variable, transpose: for files of several arrays, and
-    arrays of taxels x frames. renames: materials. Raises FormatError where an option cannot be
-    read.
+    grid: ROWSxCOLUMNS or ROWSxCOLUMNSxAXES, "" if the arrays already have that shape.
+    columns: the taxels' columns, "" for all except the time.
+    time: COLUMN:UNIT; rate_hz: frames per second. One of the two is needed.
+    every: from the start of one window to the start of the next; None takes only the middle
+    window.
+    dtype: data type of the counts, "" to keep the recorded type.
+    variable: the array to read from a file with several.
+    transpose: whether files hold taxels x frames.
+    renames: new names of materials by their old names.
+    Raises FormatError if an option cannot be read.
     """
 
     pattern: NamePattern
@@ -80,11 +87,13 @@ class ImportPlan:
     def __post_init__(self) -> None:
         if self.grid and not GRID.fullmatch(self.grid):
             raise FormatError(
-                f"--grid {self.grid} cannot be read; write ROWSxCOLUMNS or ROWSxCOLUMNSxAXES: 4x4, 4x4x3"
+                f"--grid {self.grid} cannot be read; "
+                "write ROWSxCOLUMNS or ROWSxCOLUMNSxAXES: 4x4, 4x4x3"
             )
         if not self.time and not self.rate_hz:
             raise FormatError(
-                "how fast frames follow is not known; give --rate HZ, or --time COLUMN:UNIT where a column holds times"
+                "the frame rate is not known; give --rate HZ, or --time COLUMN:UNIT if a column "
+                "holds times"
             )
         if self.time and self.time.rpartition(":")[2] not in sampling.UNITS_S:
             raise FormatError(
@@ -97,15 +106,15 @@ class ImportPlan:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Rows, columns, and axes where there are several; () where --grid is not given."""
+        """Rows, columns, and axes if there are several; () without --grid."""
         rows_columns_axes = tuple(map(int, self.grid.split("x"))) if self.grid else ()
         return rows_columns_axes[:2] if rows_columns_axes[2:] == (1,) else rows_columns_axes
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One file as it was read. frames: [n, R, C] or [n, R, C, A] as recorded; time_s: [n], or None
-    where it has none."""
+    """The contents of one file. frames: [n, R, C] or [n, R, C, A], as recorded. time_s: [n], or
+    None if the file holds no times."""
 
     name: str
     fields: Mapping[str, str]
@@ -115,7 +124,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A file that was not taken. broken: it fits the pattern, but cannot be used."""
+    """A file that was not imported. broken: its name matches the pattern, but it cannot be used."""
 
     name: str
     why: str
@@ -124,7 +133,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Cut:
-    """Windows [k, T, R, C(, A)] of one recording, and what was done to it."""
+    """Windows [k, T, R, C(, A)] of one recording. notes: how its frames were changed."""
 
     recording: Recording
     windows: Array
@@ -133,7 +142,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Imported:
-    """A sweep set and how it came about. taken, left_out: by file. notes: what holds for the whole
+    """An imported sweep set. taken, left_out: one entry for each file. notes: remarks on the whole
     set."""
 
     sweeps: Dataset
@@ -145,9 +154,12 @@ class Imported:
 def import_folder(
     folder: Path, plan: ImportPlan, log: Callable[[str], None], left_out: list[LeftOut]
 ) -> Imported:
-    """The set of all files in `folder` and below whose names fit the pattern; files that are left
-    out are added to `left_out` as they are found. Raises FormatError where materials cannot be sent
-    or nothing is left."""
+    """Import all files in and below `folder` whose names match the pattern.
+
+    Files that cannot be imported are added to `left_out` at once, so that the caller can show them
+    even after an error. Raises FormatError if the box cannot send a material's name, or if no file
+    remains.
+    """
     named = _named(folder, plan, left_out)
     recordings, progress = [], Progress(len(named), log)
     for name, fields in named.items():
@@ -158,20 +170,22 @@ def import_folder(
             left_out.append(LeftOut(name, str(e), broken=True))
     cuts, rate_hz = _cuts(recordings, plan, left_out)
     dtype, about = _common_type(cuts, plan.dtype, left_out)
-    cuts = [cut for cut in cuts if cut.recording.name not in {one.name for one in left_out}]
+    cuts = [cut for cut in cuts if cut.recording.name not in {file.name for file in left_out}]
     if not cuts:
         raise FormatError(
-            f"{folder}: none of {len(named)} files could be taken; the lines above say why"
+            f"{folder}: none of {len(named)} files could be imported; the messages above say why"
         )
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
     return Imported(sweeps, cuts, left_out, [about, *notes])
 
 
 def _named(folder: Path, plan: ImportPlan, left_out: list[LeftOut]) -> dict[str, dict[str, str]]:
-    """The fields of each file whose name fits the pattern, by its path below `folder`; materials
-    are renamed."""
+    """The fields of each file whose name matches the pattern, by its path below `folder`.
+
+    Materials have their new names.
+    """
     if not folder.is_dir():
-        raise FormatError(f"{folder} is no folder; name one that holds the recordings")
+        raise FormatError(f"{folder} is not a folder; name the folder that holds the recordings")
     readers.check_folder(folder)
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = [
@@ -183,13 +197,13 @@ def _named(folder: Path, plan: ImportPlan, left_out: list[LeftOut]) -> dict[str,
             if fields := plan.pattern.read(name):
                 found[name] = fields
             else:
-                left_out.append(LeftOut(name, "its name does not fit the pattern"))
+                left_out.append(LeftOut(name, "its name does not match the pattern"))
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
     if not found:
-        first = f"the first is {names[0]!r}" if names else "it holds none"
-        raise FormatError(f"{folder}: no file fits --pattern {plan.pattern.text!r}; {first}")
-    labels.check_known(plan.renames, (fields["material"] for fields in found.values()))
+        first = f"the first file is {names[0]!r}" if names else "it holds no files"
+        raise FormatError(f"{folder}: no file matches --pattern {plan.pattern.text!r}; {first}")
+    labels.check_renames(plan.renames, (fields["material"] for fields in found.values()))
     for fields in found.values():
         fields["material"] = plan.renames.get(fields["material"], fields["material"])
     if why := labels.unsendable(sorted({fields["material"] for fields in found.values()})):
@@ -203,20 +217,24 @@ def _recording(path: Path, name: str, fields: Mapping[str, str], plan: ImportPla
     if values.dtype.kind == "b":
         values = values.astype(np.uint8)
     if values.dtype.kind not in "iuf" or values.ndim < 2 or not values.size:
-        raise FormatError(f"holds {values.dtype} {list(values.shape)}; frames x taxels are wanted")
+        raise FormatError(
+            f"holds {values.dtype} {list(values.shape)}; give an array of frames x taxels"
+        )
     at, time_s = _times(values, table, plan)
     frames = _frames(values, table, plan, at)
     if not np.isfinite(frames).all():
-        place = np.argwhere(~np.isfinite(frames))[0]
-        where = ", ".join(map(str, place[1:] + 1))
+        index = np.argwhere(~np.isfinite(frames))[0]
+        taxel = ", ".join(map(str, index[1:] + 1))
         raise FormatError(
-            f"frame {place[0] + 1}, taxel {where} is {frames[tuple(place)]}; fill it in or cut it away"
+            f"frame {index[0] + 1}, taxel {taxel} is {frames[tuple(index)]}; "
+            "fill it in or cut it away"
         )
     return Recording(name, fields, frames, time_s)
 
 
 def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, Array | None]:
-    """The number of the time column, where it is one of `values`, and the times [n] in seconds."""
+    """The number of the time column, None if `values` has no such column, and the times [n] in
+    seconds."""
     if not plan.time:
         return None, None
     name, _, unit = plan.time.rpartition(":")
@@ -227,7 +245,8 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
         return None, time_s
     if values.ndim != 2:
         raise FormatError(
-            f"has no times {name!r}; beside the frames it has {', '.join(table.vectors) or 'nothing'}"
+            f"has no times {name!r}; beside the frames it has "
+            f"{', '.join(table.vectors) or 'nothing'}"
         )
     (at,) = _columns(name, table.columns, values.shape[1], "--time", 1)
     return at, values[:, at] * sampling.UNITS_S[unit]
@@ -239,12 +258,13 @@ def _frames(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     if values.ndim > 2:
         if plan.columns or (shape and values.shape[1:] != shape):
             raise FormatError(
-                f"holds frames {list(values.shape[1:])}; leave --columns out, and --grid or give that one"
+                f"holds frames of shape {list(values.shape[1:])}; "
+                "leave --columns out, and leave --grid out or give that shape"
             )
         return values
     if not shape:
         raise FormatError(
-            f"has {values.shape[1]} columns; say with --grid how they lie, e.g. 4x4 for 16 taxels"
+            f"has {values.shape[1]} columns; give their layout with --grid, e.g. 4x4 for 16 taxels"
         )
     wide, want = values.shape[1], int(np.prod(shape))
     if plan.columns:
@@ -260,12 +280,12 @@ def _frames(values: Array, table: Table, plan: ImportPlan, time_column: int | No
             else "beside the time it has"
         )
         advice = (
-            "it has so many rows, so add --transpose"
+            f"it has {want} rows, so add --transpose"
             if len(values) == want
             else "see --columns and --grid"
         )
         raise FormatError(
-            f"{which} {len(numbers)} columns, a grid of {plan.grid} takes {want}; {advice}"
+            f"{which} {len(numbers)} columns, but a grid of {plan.grid} needs {want}; {advice}"
         )
     return values[:, numbers].reshape(len(values), *shape)
 
@@ -273,8 +293,10 @@ def _frames(values: Array, table: Table, plan: ImportPlan, time_column: int | No
 def _columns(
     text: str, names: Sequence[str], wide: int, option: str, most: int = 1 << 20
 ) -> list[int]:
-    """The numbers, from 0 on, of columns given by name, by a name with * in it, by number from 1
-    on, or as 2-17."""
+    """Column numbers, from 0, for a comma-separated list `text`.
+
+    Each entry is a name, a name with *, a number from 1, or a range such as 2-17.
+    """
     found: list[int] = []
     for part in (text,) if text in names else text.split(","):
         if part in names:
@@ -294,7 +316,7 @@ def _columns(
                 if names
                 else f"its {wide} columns have no names: use numbers"
             )
-            raise FormatError(f"{option}: no column is called {part!r}; {known}")
+            raise FormatError(f"{option}: there is no column {part!r}; {known}")
     if len(set(found)) < len(found) or len(found) > most:
         raise FormatError(
             f"{option} {text} names {'a column twice' if len(found) <= most else 'several columns'}"
@@ -305,8 +327,10 @@ def _columns(
 def _cuts(
     recordings: Sequence[Recording], plan: ImportPlan, left_out: list[LeftOut]
 ) -> tuple[list[Cut], float]:
-    """The windows of each recording, and the rate of all. Recordings that give none are left
-    out."""
+    """The windows of each recording, and their common frame rate in Hz.
+
+    Recordings without a window are added to `left_out`.
+    """
     rates = []
     for one in list(recordings):
         try:
@@ -328,7 +352,7 @@ def _cuts(
 
 
 def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) -> Cut:
-    """The windows of a recording; none, with the reason, where it is too short."""
+    """The windows of a recording; no windows, and the reason in `notes`, if it is too short."""
     window, longest = plan.window.frames(rate_hz), max(runs.parts, key=len)
     if plan.every:
         hop = plan.every.frames(rate_hz)
@@ -342,7 +366,7 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
         return Cut(
             one,
             np.empty(0),
-            f"has {len(longest)} frames{between}, a window takes {window}; see --window",
+            f"has {len(longest)} frames{between}, but a window needs {window}; see --window",
         )
     windows = np.stack([part[start : start + window] for part, start in starts])
     if runs.interpolated and not (one.frames % 1).any():
@@ -356,10 +380,10 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
 
 
 def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> tuple[str, str]:
-    """The data type of the set, and a line that says why: that of all recordings, else the first
-    that holds all counts.
+    """The data type of the set, and a sentence that gives the reason.
 
-    Recordings that the type `wanted` cannot hold are left out.
+    It is `wanted` if given, else the type of all recordings, else the first of DATA_TYPES that
+    holds all counts. Recordings that do not fit are added to `left_out`.
     """
     if wanted:
         for cut in cuts:
@@ -372,7 +396,7 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
     for cut in cuts:
         if all(reasons := [_why_not(cut.windows, name) for name in DATA_TYPES]):
             left_out.append(LeftOut(cut.recording.name, reasons[-1], broken=True))
-    out = {one.name for one in left_out}
+    out = {file.name for file in left_out}
     kept = [cut.windows for cut in cuts if cut.recording.name not in out]
     name = next(
         (name for name in DATA_TYPES if not any(_why_not(windows, name) for windows in kept)),
@@ -383,13 +407,16 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
     low, high = min(windows.min() for windows in kept), max(windows.max() for windows in kept)
     return (
         name,
-        f"counts from {low:g} to {high:g} fit {name}; if the skin announces another type, name it with --dtype",
+        f"counts from {low:g} to {high:g} fit {name}; "
+        "if the skin announces another type, name it with --dtype",
     )
 
 
 def _why_not(counts: Array, dtype: str) -> str:
-    """Why a data type cannot hold these counts, "" where it can; float32 rounds fractions, but no
-    whole number."""
+    """The reason why a data type cannot hold these counts, or "" if it can.
+
+    float32 may round fractions, but must hold whole numbers exactly.
+    """
     kind = np.dtype(dtype)
     low, high = (
         (-np.finfo(kind).max, np.finfo(kind).max)
@@ -403,7 +430,7 @@ def _why_not(counts: Array, dtype: str) -> str:
     elif not bad.any():
         bad, what = (
             (counts % 1 == 0) & (counts.astype(kind) != counts),
-            f"{dtype} would round it; take an offset away",
+            f"{dtype} would round it; subtract an offset",
         )
     if not bad.any():
         return ""
@@ -414,11 +441,12 @@ def _why_not(counts: Array, dtype: str) -> str:
 def _set(
     folder: Path, cuts: Sequence[Cut], rate_hz: float, dtype: str, plan: ImportPlan
 ) -> tuple[Dataset, list[str]]:
-    """All windows as one set, and what the numbers of its groups stand for."""
+    """All windows as one set, and notes that explain the numbers of its groups."""
     shapes = {cut.windows.shape[2:] for cut in cuts}
     if len(shapes) > 1:
         raise FormatError(
-            f"{folder}: frames differ in shape: {sorted(map(list, shapes))}; import each kind by itself"
+            f"{folder}: frames differ in shape: {sorted(map(list, shapes))}; "
+            "import each shape by itself"
         )
     count = [len(cut.windows) for cut in cuts]
     materials = sorted({cut.recording.fields["material"] for cut in cuts})

@@ -1,5 +1,4 @@
-"""Names of materials: which the box can send, and how others are renamed. In: names. Out: the same,
-or one error for all."""
+"""Names of materials: checks that the box can send them, and renames them."""
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ REMEDY = "give each another name with --rename OLD=NEW"
 
 
 def unsendable(names: Iterable[str]) -> str:
-    """Which of `names` the box cannot send, all in a line with what a label may be; "" where it can
-    send all."""
+    """A message that lists the `names` the box cannot send and the allowed characters, or ""."""
     if not (bad := [name for name in names if not LABEL.fullmatch(name)]):
         return ""
     listed = ", ".join(f"{name!r} ({len(name)} characters)" for name in bad)
@@ -27,15 +25,18 @@ def unsendable(names: Iterable[str]) -> str:
 
 
 def check(sweeps: Dataset) -> Dataset:
-    """The set itself. Raises FormatError listing every material that the box cannot send."""
+    """Return the set itself. Raises FormatError listing every material that the box cannot
+    send."""
     if why := unsendable(sweeps.materials):
         raise FormatError(f"{sweeps.source}: {why}; {REMEDY}")
     return sweeps
 
 
-def renames(texts: Sequence[str]) -> dict[str, str]:
-    """What --rename OLD=NEW says. Raises FormatError where one cannot be read, or one name gets
-    two."""
+def parse_renames(texts: Sequence[str]) -> dict[str, str]:
+    """New names by old names, from texts OLD=NEW of the option --rename.
+
+    Raises FormatError if a text cannot be read, or if an old name gets two new names.
+    """
     pairs: dict[str, str] = {}
     for text in texts:
         old, separator, new = text.rpartition("=")
@@ -48,19 +49,21 @@ def renames(texts: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-def check_known(pairs: Mapping[str, str], names: Iterable[str]) -> None:
-    """Raises FormatError where something is renamed that is not among `names`."""
+def check_renames(pairs: Mapping[str, str], names: Iterable[str]) -> None:
+    """Raises FormatError if an old name of `pairs` is not among `names`."""
     known = tuple(dict.fromkeys(names))
     for old in pairs:
         if old not in known:
             near = closest(old, known, cutoff=0.6)
             hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
-            raise FormatError(f"--rename: no material is called {old!r}; {hint}")
+            raise FormatError(f"--rename: there is no material {old!r}; {hint}")
 
 
 def renamed(sweeps: Dataset, pairs: Mapping[str, str]) -> Dataset:
-    """The set with other names of materials, in the same order; what gets the same name becomes one
-    material."""
+    """The set with new names of materials, in the same order.
+
+    Materials that get the same name are merged.
+    """
     if not set(pairs) & set(sweeps.materials):
         return sweeps
     names = [pairs.get(name, name) for name in sweeps.materials]

@@ -1,8 +1,8 @@
-"""MAT files of versions 5 to 7. In: their bytes. Out: the numeric arrays by name.
+"""Reads the numeric arrays of MAT files, versions 5 to 7, from their bytes.
 
-Written after MathWorks, MAT-File Format (R2023a). Readers in C trust sizes that a damaged file
-gives; here each is checked. Cells, structures, text and sparse arrays are passed over. Version 7.3
-is HDF5, which raw_files.py reads.
+Source: MathWorks, MAT-File Format (R2023a). Readers in C trust the sizes in a damaged file; this
+module checks each size. Cells, structures, text and sparse arrays are skipped. Version 7.3 is
+HDF5, which raw_files.py reads.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ STORED = {
     12: "i8",
     13: "u8",
 }
-"""Types of data on the disk, which may be smaller than that of the array."""
+"""NumPy types of the values on disk, by their number; smaller than the array's type if the values
+fit."""
 CLASSES = {
     6: "f8",
     7: "f4",
@@ -47,18 +48,18 @@ CLASSES = {
     14: "i8",
     15: "u8",
 }
-"""Classes of numeric arrays; all others are passed over."""
+"""NumPy types of numeric arrays, by the number of their class; all other classes are skipped."""
 COMPLEX, LOGICAL = 0x0800, 0x0200
 MOST_BYTES = 1 << 31
-"""Of one array when it is unpacked."""
+"""Largest size of one array after decompression."""
 
 
 def arrays(data: bytes) -> dict[str, Array]:
-    """All numeric arrays of a file. Raises FormatError where it is damaged, or of another
+    """All numeric arrays of a file, by name. Raises FormatError if the file is damaged or of another
     version."""
     order = ENDIAN.get(data[126:128], "")
     if not order:
-        raise FormatError("is no MAT file of version 5 to 7.3; save it with -v7")
+        raise FormatError("is not a MAT file of version 5 to 7.3; save it with -v7")
     found: dict[str, Array] = {}
     for kind, content in _elements(data[HEADER:], order):
         if kind == COMPRESSED:
@@ -81,25 +82,27 @@ def _unpacked(content: bytes) -> bytes:
 
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """(type, content) of each element. Raises FormatError where one goes beyond the end."""
+    """(type, content) of each element. Raises FormatError if an element exceeds the data."""
     at = 0
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
         start, end = at + 8, at + 8 + size
-        if kind >> 16:  # up to four bytes stand in the tag
+        if kind >> 16:  # a small element: its tag holds up to four bytes of content
             kind, size = kind & 0xFFFF, kind >> 16
             start, end = at + 4, at + 4 + size
             if size > 4:
-                raise FormatError(f"is damaged: {size} bytes at {at} where four have room")
+                raise FormatError(f"is damaged: {size} bytes at {at}, where at most 4 fit")
         if end > len(data):
-            raise FormatError(f"is damaged or cut off: {size} bytes at {at} go beyond its end")
+            raise FormatError(f"is damaged or cut off: {size} bytes at {at} exceed its end")
         yield kind, data[start:end]
         at = end if kind == COMPRESSED else at + 8 * math.ceil((end - at) / 8)
 
 
 def _matrix(data: bytes, order: str) -> tuple[str, Array] | None:
-    """Name and values of an array; None where it is not numeric. Raises FormatError where its parts
-    contradict."""
+    """Name and values of an array, or None if it is not numeric.
+
+    Raises FormatError if its shape, type and content do not fit together.
+    """
     parts = list(_elements(data, order))
     if len(parts) < 3 or len(parts[0][1]) < 4 or len(parts[1][1]) % 4:
         raise FormatError("is damaged: an array lacks its shape or name")

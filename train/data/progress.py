@@ -1,5 +1,4 @@
-"""Progress of long work: how much of it is done, and how long the rest will take. In: tasks as they
-begin or end. Out: lines."""
+"""Progress lines of long work: how many tasks are done, and how long the rest will take."""
 
 from __future__ import annotations
 
@@ -10,15 +9,15 @@ Clock = Callable[[], float]
 
 
 class ProgressLine(str):
-    """A line for people that knows its numbers, for a display that draws a bar. done, total:
-    tasks."""
+    """A progress line with its numbers of tasks, `done` of `total`, from which a display can draw a
+    bar."""
 
     done: int
     total: int
 
     @classmethod
     def of(cls, done: int, total: int, left_s: float | None, what: str) -> ProgressLine:
-        """left_s: how long the others will take, where it is known."""
+        """left_s: estimated time for the other tasks, None if unknown. what: the current task."""
         line = cls(
             f"{done}/{total} done{'' if left_s is None else f', {spoken(left_s)} left'} ({what})"
         )
@@ -27,10 +26,9 @@ class ProgressLine(str):
 
 
 class Progress:
-    """Logs how many tasks are done and how long the others will take, if they take as long on
-    average. clock: in s.
+    """Logs how many tasks are done, and how long the others will take at the same average.
 
-    done: tasks so far.
+    clock: returns seconds. done: finished tasks.
     """
 
     def __init__(
@@ -40,16 +38,16 @@ class Progress:
         self._start, self.done = clock(), 0
 
     def left(self, most: int) -> None:
-        """So many tasks are left at most: the total, where it is found out on the way."""
+        """Correct the total: at most `most` tasks are left. For work whose extent is found late."""
         self._total = self.done + most
 
     def __call__(self, what: str) -> None:
-        """One more task is done: `what`."""
+        """The task `what` is done."""
         self.done += 1
         self._show(what)
 
     def begin(self, what: str) -> None:
-        """A task begins, `what`; it is done when the next one begins."""
+        """The task `what` begins. It counts as done when the next task begins."""
         self._show(what)
         self.done += 1
 

@@ -1,8 +1,7 @@
-"""Time series that the package aeon ships, with their published splits. In: a name. Out: samples,
-labels, names, groups.
+"""Loads the time series that the package aeon ships, with their published splits.
 
-None was recorded with a skin: they show whether a method was tuned to one kind of sensor. Nothing
-is ever downloaded.
+They were not recorded with a skin. They show whether a method works only for one kind of sensor.
+Nothing is ever downloaded.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from appliance.core.sweep_set import Array
 
 PREFIX = "aeon:"
 RATE_HZ = 100.0
-"""Frames per second of all of them. The files state none; without one no feature in Hz could be
-computed."""
+"""Assumed frames per second of all series. The files state no rate, but features in Hz need one."""
 SETS: Mapping[str, str] = MappingProxyType(
     {
         "ACSF1": "100 + 100 sweeps of 10 appliances, 1460 frames of their power",
@@ -30,15 +28,15 @@ SETS: Mapping[str, str] = MappingProxyType(
         "OSULeaf": "200 + 242 sweeps of 6 leaves, 427 frames of their outline",
     }
 )
-"""What each holds: sweeps of the published training part + those of the test part."""
+"""The contents of each set: sweeps of the published training part + sweeps of the test part."""
 
 
 def load(name: str) -> tuple[Array, Array, tuple[str, ...], dict[str, Array]]:
     """(samples float32 [N, T, channels, 1], labels int [N], class names, groups) of one of SETS.
 
-    Groups: `split`, 0 for the published training part and 1 for the test part; `recording`, each
-    sweep its own number. Raises FormatError for another name, and where aeon or the set in it is
-    missing.
+    Groups: `split` is 0 for the published training part and 1 for the test part; `recording` is a
+    different number for each sweep. Raises FormatError for an unknown name, or if aeon or its copy
+    of the set is missing.
     """
     if name not in SETS:
         raise FormatError(
@@ -65,12 +63,13 @@ def _part(name: str, split: str) -> tuple[Array, Array]:
         raise FormatError(
             f"set {PREFIX + name!r} needs aeon ({e}); try pip install 'palpate-train[minirocket]'"
         ) from e
-    # load_classification would download what is not there
+    # load_classification would download a missing file
     if not (
         Path(aeon.datasets.__file__).parent / "data" / name / f"{name}_{split.upper()}.ts"
     ).is_file():
         raise FormatError(
-            f"this version of aeon does not hold {name}; try pip install 'palpate-train[minirocket]'"
+            f"this version of aeon does not hold {name}; "
+            "try pip install 'palpate-train[minirocket]'"
         )
     series, classes = aeon.datasets.load_classification(name, split=split)
     return series, classes

@@ -1,10 +1,9 @@
-"""Fetches recordings from a box over ssh. In: a host and its folder. Out: the same files here;
-existing ones stay.
+"""Fetches recordings from a box over ssh. Files that are already here stay as they are.
 
-The box needs sshd, a shell, find, sha256sum and tar, and no part of Palpate. It lists each file
-with its SHA-256; new files come in one stream, pair by pair (.npy and .json). A pair is read as a
-recording before it gets its file names: when the connection ends, no incomplete pair is left under
-them, and the next call continues with the rest.
+The box needs sshd, a shell, find, sha256sum and tar, but no part of Palpate. It lists each file
+with its SHA-256. New files come in one stream, pair by pair (.npy and .json). Each pair is checked
+as a recording before it is stored under its name. So a lost connection leaves no incomplete pair,
+and the next call fetches the rest.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ from train.data.progress import Progress
 
 FOLDER = f"{StoreConfig().folder}/sweeps"
 PAIR = (".json", ".npy")
-"""In the order in which they are written: an .npy never lacks its sidecar."""
+"""The files of a recording in the order in which they are written: an .npy always has its
+sidecar."""
 SSH_OPTIONS = (
     "BatchMode=yes",
     "ConnectTimeout=10",
@@ -38,26 +38,30 @@ SSH_OPTIONS = (
     "ServerAliveCountMax=3",
 )
 """ssh asks no questions, and a box that is silent for 15 s counts as disconnected."""
-AS_READER = 'if cd -- "$1" 2>/dev/null && test -r .; then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
+AS_READER = (
+    'if cd -- "$1" 2>/dev/null && test -r .; '
+    'then exec sh -c "$2" sh "$1"; else exec sudo -n sh -c "$2" sh "$1"; fi'
+)
+"""Runs script $2 in folder $1, with sudo only if the user cannot read the folder."""
 ABSENT = 44
-"""Exit code of LIST where the folder does not exist."""
+"""Exit code of LIST if the folder does not exist."""
 LIST = f"""test -e "$1" || exit {ABSENT}
 cd -- "$1" || exit
 find . -type f '(' -name '*.npy' -o -name '*.json' ')' -exec sha256sum -z -- {{}} +
 test $? -le 1"""
-"""find ends with 1 where a file was removed meanwhile: it reports that, and still lists the
-others."""
+"""Lists files with their SHA-256. Exit code 1 of find is accepted: a file was removed meanwhile,
+find reports that and lists the others."""
 SEND = 'cd -- "$1" && exec tar -c --null -T - -f -'
 LISTED = re.compile(rb"([0-9a-f]{64})  \./(.+)", re.S)
 MAX_BYTES = 1 << 30
-"""Of a file that is accepted."""
+"""Largest file that is accepted."""
 SHOWN = 5
-"""Names that a line of the report lists."""
+"""Largest number of names in a line of the report."""
 
 
 @dataclass(frozen=True)
 class RecordingHost:
-    """A box with recordings. options: of ssh, which take precedence over SSH_OPTIONS."""
+    """A box with recordings. options: further options of ssh, which override SSH_OPTIONS."""
 
     host: str
     folder: str = FOLDER
@@ -66,9 +70,9 @@ class RecordingHost:
     def run(
         self, script: str, stdin: IO[bytes] | int, stderr: IO[bytes]
     ) -> subprocess.Popen[bytes]:
-        """Start a script in the folder, as the user or, where that may not read it, with sudo.
+        """Start a script in the folder, with sudo if the user cannot read the folder.
 
-        Raises ApplianceError where ssh is not installed.
+        Raises ApplianceError if ssh is not installed.
         """
         ours = [part for option in SSH_OPTIONS for part in ("-o", option)]
         remote = shlex.join(["sh", "-c", AS_READER, "sh", self.folder, script])
@@ -86,10 +90,10 @@ class RecordingHost:
     def output(
         self, script: str, stdin: IO[bytes] | int = subprocess.DEVNULL
     ) -> Iterator[IO[bytes]]:
-        """The output of the script, which has ended when the context ends. Its messages go to
-        stderr.
+        """A context with the script's output; leaving it waits for the script's end.
 
-        Raises ApplianceError where the box cannot be reached or the script failed.
+        The script's messages go to stderr. Raises ApplianceError if the box cannot be reached or
+        the script fails.
         """
         with tempfile.TemporaryFile() as errors, self.run(script, stdin, errors) as process:
             try:
@@ -110,23 +114,24 @@ class RecordingHost:
             )
         if code == ABSENT:
             raise ApplianceError(
-                f"{self.host}: there is no {self.folder}: nothing was recorded yet, which makes it (`palpate record`); "
-                "or name another folder with --from"
+                f"{self.host}: there is no {self.folder}; "
+                "record something first (`palpate record`), or name another folder with --from"
             )
         if code:
             raise ApplianceError(
-                f"{self.host}: {self.folder} cannot be read; name another with --from, let the user into its group "
-                "(sudo usermod -aG palpate USER), or run the same command again"
+                f"{self.host}: {self.folder} cannot be read; name another folder with --from, "
+                "add the user to its group (sudo usermod -aG palpate USER), "
+                "or run the same command again"
             )
 
 
 @dataclass
 class PullReport:
-    """What happened to the recordings, by their names without suffix.
+    """The names of all recordings, without suffix, by what happened to them.
 
-    present: already here, and the same. incomplete: without .npy or .json on the box. relabelled:
-    with another .json on the box. different: with another .npy on the box. refused: with the
-    reason.
+    fetched: new here. present: already here, and the same. incomplete: .npy or .json is missing on
+    the box. relabelled: the .json on the box differs. different: the .npy on the box differs.
+    refused: not stored; the reason follows the name.
     """
 
     fetched: list[str] = field(default_factory=list)
@@ -138,11 +143,10 @@ class PullReport:
 
 
 def pull(box: RecordingHost, out: Path, report: PullReport, log: Callable[[str], None]) -> None:
-    """Fetch into `out` what is not there yet; what happens to each recording is added to `report`
-    at once.
+    """Fetch all recordings that are not yet in `out`; each result is added to `report` at once.
 
-    Raises ApplianceError where the box cannot be reached or read or the connection ends,
-    FormatError where it sends files that were not requested, OSError where `out` cannot be written.
+    Raises ApplianceError if the box cannot be reached or read or the connection ends, FormatError
+    if the box sends files that were not requested, and OSError if `out` cannot be written.
     """
     listed = listing(box)
     wanted = list(_new_recordings(listed, out, report))
@@ -159,27 +163,32 @@ def pull(box: RecordingHost, out: Path, report: PullReport, log: Callable[[str],
                 progress(name)
     if progress.done < len(wanted):
         raise ApplianceError(
-            f"{box.host}: only {progress.done} of {len(wanted)} recordings came; run the same command again"
+            f"{box.host}: only {progress.done} of {len(wanted)} recordings came; "
+            "run the same command again"
         )
 
 
 def listing(box: RecordingHost) -> dict[str, str]:
-    """The box's files with their SHA-256. Raises FormatError where it sends something else."""
+    """The SHA-256 of each file on the box, by its path. Raises FormatError if the box sends
+    something else."""
     with box.output(LIST) as stream:
         lines = stream.read().split(b"\0")
     listed = {}
     for line in filter(None, lines):
         if not (found := LISTED.fullmatch(line)):
             raise FormatError(
-                f"{box.host} sends {line!r} where a file should be; see that its shell prints nothing at login"
+                f"{box.host} sends {line!r} instead of a list of files; "
+                "see that its shell prints nothing at login"
             )
         listed[found[2].decode(errors="surrogateescape")] = found[1].decode()
     return listed
 
 
 def _new_recordings(listed: Mapping[str, str], out: Path, report: PullReport) -> Iterator[str]:
-    """Names without suffix of the recordings that are not here; all others are added to the
-    report."""
+    """The names, without suffix, of recordings that are not here yet.
+
+    All others are added to the report.
+    """
     for name in sorted({file.rpartition(".")[0] for file in listed}):
         if not name.isprintable() or name.startswith("/") or ".." in name.split("/"):
             report.refused.append(f"{name!r} (not a name for a file here)")
@@ -200,7 +209,7 @@ def _new_recordings(listed: Mapping[str, str], out: Path, report: PullReport) ->
 
 
 def _sha256(path: Path) -> str | None:
-    """The SHA-256 of a file here; None where there is none."""
+    """The SHA-256 of a local file, None if it does not exist."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -209,11 +218,11 @@ def _sha256(path: Path) -> str | None:
 
 
 def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Each recording of which both files came, in the order of `names`, which come in pairs.
+    """Each recording as soon as both of its files have arrived.
 
-    Raises FormatError where the archive holds anything but plain files that were requested: a path
-    out of the folder, a link, a device or a file of more than MAX_BYTES is refused. A stream that
-    is cut off ends the iteration.
+    names: the requested files. Raises FormatError if the archive holds anything else: a link, a
+    device, a path outside the folder, or a file of more than MAX_BYTES. A stream that is cut off
+    ends the iteration.
     """
     requested = set(names)
     received: dict[str, bytes] = {}
@@ -238,7 +247,7 @@ def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[
 def _keep(
     name: str, pair: Mapping[str, bytes], sha256: Mapping[str, str], out: Path, report: PullReport
 ) -> None:
-    """Store one recording, if it is what the box listed and can be read as a recording."""
+    """Store one recording if its hashes match the list and it can be read; else report why not."""
     try:
         for suffix, data in pair.items():
             if hashlib.sha256(data).hexdigest() != sha256[suffix]:

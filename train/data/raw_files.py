@@ -1,7 +1,6 @@
-"""Files in which laboratories keep one recording: CSV and other text, .npy, .npz, MAT, HDF5. In: a
-path. Out: its Table.
+"""Reads files with one recording: CSV and other text, .npy, .npz, MAT, HDF5.
 
-Nothing is unpickled. What is ambiguous is refused with the option that decides.
+Nothing is unpickled. An ambiguous file is refused, and the message names the option that decides.
 """
 
 from __future__ import annotations
@@ -27,15 +26,19 @@ from train.data.readers import HDF5, array_in
 Array = NDArray[Any]
 COMMENTS = ("#", "%")
 DELIMITERS = ("\t", ";", ",")
-"""The first that a line has separates its columns; else blanks do."""
+"""The first of these that occurs in a line separates its columns; without any, blanks do."""
 DAMAGED = (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What readers of damaged files raise."""
+"""Exceptions that the libraries raise for damaged files."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """One recording. values: [n, ...] numbers as the file has them, float64 of text. columns: their
-    names, () for none. vectors: one-dimensional arrays beside it, by name, such as times."""
+    """One recording.
+
+    values: [n, ...] numbers in the file's data type, float64 from text. columns: names of the
+    columns, () if unnamed. vectors: one-dimensional arrays beside the values, such as times, by
+    name.
+    """
 
     values: Array
     columns: tuple[str, ...] = ()
@@ -43,8 +46,10 @@ class Table:
 
 
 def read(path: Path, variable: str = "") -> Table:
-    """The recording in a file. variable: the array to take of a file that holds several. Raises
-    FormatError saying what is wrong, without the file's name."""
+    """The recording in a file. variable: the array to read from a file that holds several.
+
+    Raises FormatError whose message does not repeat the file's name.
+    """
     suffix = path.suffix.lower()
     try:
         if suffix == ".npy":
@@ -62,10 +67,9 @@ def read(path: Path, variable: str = "") -> Table:
 
 
 def _array(name: str, values: Array | bytes) -> Array:
-    """What numpy found under a name of an .npz: an array, or as it is what does not begin as
-    one."""
+    """Member `name` of an .npz. numpy returns bytes for a member that is not an array."""
     if isinstance(values, bytes):
-        raise ValueError(f"{name!r} is no array")
+        raise ValueError(f"{name!r} is not an array")
     return values
 
 
@@ -76,15 +80,14 @@ def _plain(values: Array) -> Table:
 
 
 def _mat(path: Path) -> dict[str, Array]:
-    """Arrays of a MAT file of any version; those of version 7.3 are HDF5 and have their axes the
-    other way round."""
+    """Arrays of a MAT file of any version. Version 7.3 is HDF5 with the axes reversed."""
     if h5py.is_hdf5(path):
         return {name: values.T for name, values in _hdf5(path).items()}
     return mat_files.arrays(path.read_bytes())
 
 
 def _hdf5(path: Path) -> dict[str, Array]:
-    """All numeric arrays of an HDF5 file by their paths in it, those in groups too."""
+    """All numeric arrays of an HDF5 file, those in groups too, by their paths in it."""
     names: list[str] = []
 
     def keep(name: str, found: Any) -> None:
@@ -101,12 +104,12 @@ def _hdf5(path: Path) -> dict[str, Array]:
 
 
 def _printable(name: str) -> str:
-    """A name out of a file as a terminal can show it: a damaged one may hold anything."""
+    """A name from a file, safe for a terminal: names in a damaged file may hold any bytes."""
     return name if name.isprintable() else repr(name)
 
 
 def _chosen(arrays: Mapping[str, Array], variable: str) -> Table:
-    """The one array of frames, or the one called `variable`, and the vectors beside it."""
+    """The only array of frames, or the array `variable`, with the vectors beside it."""
     numbers = {name: values for name, values in arrays.items() if values.dtype.kind in "biuf"}
     tables = {
         name: values
@@ -135,8 +138,10 @@ def _chosen(arrays: Mapping[str, Array], variable: str) -> Table:
 
 
 def _text(data: bytes) -> Table:
-    """Numbers in lines, perhaps after lines of text, the first of which that has as many cells
-    names the columns."""
+    """Lines of numbers, possibly after lines of text.
+
+    The first line of text with as many cells as the numbers names the columns.
+    """
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise FormatError("is UTF-16; save it as UTF-8")
     lines = data.decode("utf-8-sig", errors="replace").splitlines()
@@ -158,24 +163,33 @@ def _text(data: bytes) -> Table:
         line.rstrip().endswith(delimiter) for _, line in body
     ):  # the last column is empty
         body = [(i, line.rstrip()[: -len(delimiter)]) for i, line in body]
-    try:
-        plain = [line for _, line in body]
-        values = np.loadtxt(
-            plain, np.float64, comments=None, delimiter=delimiter, ndmin=2, quotechar='"'
-        )
-    except ValueError as e:
-        raise FormatError(_fault(body, delimiter) or str(e)) from e
-    wide = values.shape[1]
+    values = _numbers(body, delimiter)
     heads = [line for _, line in kept[:first]] + [
         line.lstrip("#% ") for line in lines if line.startswith(COMMENTS)
     ]
+    return Table(values, _column_names(heads, delimiter, values.shape[1]))
+
+
+def _numbers(rows: Sequence[tuple[int, str]], delimiter: str | None) -> Array:
+    """float64 [rows, columns] of numbered lines. Raises FormatError naming the first bad line."""
+    try:
+        lines = [line for _, line in rows]
+        return np.loadtxt(
+            lines, np.float64, comments=None, delimiter=delimiter, ndmin=2, quotechar='"'
+        )
+    except ValueError as e:
+        raise FormatError(_fault(rows, delimiter) or str(e)) from e
+
+
+def _column_names(heads: Sequence[str], delimiter: str | None, wide: int) -> tuple[str, ...]:
+    """The cells of the first of `heads` that has `wide` cells, () if there is none."""
     named = ([cell.strip() for cell in cells(line, delimiter)] for line in heads)
     named = (head[:-1] if head[-1:] == [""] else head for head in named)
-    return Table(values, next((tuple(head) for head in named if len(head) == wide), ()))
+    return next((tuple(head) for head in named if len(head) == wide), ())
 
 
 def cells(line: str, delimiter: str | None) -> list[str]:
-    """The cells of a line; None separates at blanks."""
+    """The cells of a line. delimiter: None separates at blanks."""
     return next(csv.reader([line], delimiter=delimiter)) if delimiter else line.split()
 
 
@@ -193,7 +207,7 @@ def _is_number(text: str) -> bool:
 
 
 def _fault(rows: Sequence[tuple[int, str]], delimiter: str | None) -> str:
-    """Where the first line stands that is not like the first one, and why."""
+    """A message about the first line that differs from line 1 or is not numeric; "" if none."""
     wide = len(cells(rows[0][1], delimiter))
     for i, line in rows:
         found = cells(line, delimiter)
@@ -201,5 +215,5 @@ def _fault(rows: Sequence[tuple[int, str]], delimiter: str | None) -> str:
             return f"line {i} has {len(found)} columns, line {rows[0][0]} has {wide}"
         for column, text in enumerate(found, 1):
             if not _is_number(text):
-                return f"line {i}, column {column} is {text!r}, which is no number"
+                return f"line {i}, column {column} is {text!r}, which is not a number"
     return ""

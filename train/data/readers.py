@@ -28,7 +28,7 @@ TACTMAT_HZ = 750.0
 """Rate of the TactMat data, which neither the file nor its page states: that of the same
 laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
 SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
-NAMED = ("position", "session")
+NAMED_GROUPS = ("position", "session")
 """What a recording may name, beside its material."""
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to a window that it does not classify."""
@@ -55,7 +55,7 @@ class RecordedSweep:
         return cls(path, *load_recording(path), sidecar(path))
 
     @property
-    def why_not(self) -> str:
+    def exclusion(self) -> str:
         """Why it is not trained on, in one word: not a whole window, or a skin that the box
         refused; "" where it is.
 
@@ -96,7 +96,7 @@ def read(path: Path, kind: type[Set]) -> Set:
             f"{path.name}: not a sweep set: there is no such file; name an .npz, an HDF5 file or a folder of recordings"
         )
     if path.is_dir():
-        return recordings(path, kind)
+        return read_folder(path, kind)
     try:
         path.open("rb").close()
     except OSError as e:
@@ -104,7 +104,7 @@ def read(path: Path, kind: type[Set]) -> Set:
             f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}"
         ) from e
     if path.suffix in HDF5 or h5py.is_hdf5(path):
-        return hdf5(path, kind)
+        return read_hdf5(path, kind)
     if path.suffix.lower() in FRAMES:
         raise FormatError(
             f"{path.name}: not a sweep set, but a file of frames; {IMPORT.format(path.parent)}"
@@ -112,7 +112,7 @@ def read(path: Path, kind: type[Set]) -> Set:
     return load_file(path, kind)
 
 
-def hdf5(path: Path, kind: type[Set]) -> Set:
+def read_hdf5(path: Path, kind: type[Set]) -> Set:
     """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises
     FormatError."""
     try:
@@ -201,7 +201,7 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
             )
 
 
-def recorded(folder: Path) -> list[RecordedSweep]:
+def read_recorded(folder: Path) -> list[RecordedSweep]:
     """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of
     their names.
 
@@ -212,7 +212,7 @@ def recorded(folder: Path) -> list[RecordedSweep]:
     paths = sorted(folder.rglob("*.npy"))
     if not any(path.with_suffix(".json").exists() for path in paths):
         raise FormatError(
-            f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_instead(folder)}"
+            f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_advice(folder)}"
         )
     return [RecordedSweep.load(path) for path in paths]
 
@@ -228,7 +228,7 @@ def check_folder(folder: Path) -> None:
         ) from e
 
 
-def _instead(folder: Path) -> str:
+def _advice(folder: Path) -> str:
     """What to do with a folder without recordings of the box."""
     others = Counter(
         path.suffix.lower()
@@ -242,12 +242,12 @@ def _instead(folder: Path) -> str:
     return "record some, or name another folder"
 
 
-def ok(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
+def usable(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
     """Those that are trained on."""
-    return [one for one in recorded if not one.why_not]
+    return [one for one in recorded if not one.exclusion]
 
 
-def recordings(folder: Path, kind: type[Set]) -> Set:
+def read_folder(folder: Path, kind: type[Set]) -> Set:
     """The set of all sweeps that the box recorded in `folder` and below; each is a recording.
 
     Its label is its material. Groups are position and session, with the numbers that they have as
@@ -255,13 +255,13 @@ def recordings(folder: Path, kind: type[Set]) -> Set:
     OBJECT was ever signalled. Sweeps that are not trained on are counted in `source`. Raises
     FormatError naming the file that is broken, lacks a name or is of another format.
     """
-    return joined(recorded(folder), folder, kind)
+    return from_recorded(read_recorded(folder), folder, kind)
 
 
-def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
+def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
     """What `recordings` gives, of sweeps that were read already."""
-    kept = ok(recorded)
-    left = Counter(one.why_not for one in recorded if one.why_not)
+    kept = usable(recorded)
+    left = Counter(one.exclusion for one in recorded if one.exclusion)
     source = f"{folder} (left out: {counted(left)})" if left else str(folder)
     if not kept:
         raise FormatError(
@@ -270,7 +270,7 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
     for one in kept:
         _check(one, kept[0].format)
     groups = {"group_recording": np.arange(len(kept))}
-    for name in NAMED:
+    for name in NAMED_GROUPS:
         texts = [getattr(one.sweep, name) for one in kept]
         if any(texts):
             if "" in texts:
@@ -286,7 +286,7 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
             ]
         )
     materials = [one.sweep.material for one in kept]
-    samples, unloaded, moved = one_level(
+    samples, unloaded, moved = align_tare(
         np.stack([one.sweep.frames.taxels for one in kept]),
         np.stack([one.unloaded for one in kept]),
     )
@@ -298,7 +298,7 @@ def joined(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> 
     return build({"samples": samples} | about | groups, source, kind)
 
 
-def one_level(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
+def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
     """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if
     they had been tared alike: those whose unloaded skin lies elsewhere than that of most, by what
     counts as a load, are moved by the difference.

@@ -1,9 +1,8 @@
-"""When frames were taken. In: sampling times of a recording. Out: its rate, and runs of frames that
-are evenly apart.
+"""Finds a recording's frame rate from its sampling times, and its runs of evenly spaced frames.
 
-Times come from clocks that round, drivers that deliver late, and programs that lose frames. What is
-even is kept as it is; what wanders is interpolated linearly onto even times; no run goes over a
-gap.
+Times come from clocks that round, drivers that deliver late, and programs that lose frames. Frames
+at even times are kept unchanged. Frames at uneven times are interpolated linearly onto even times.
+A run ends at a gap.
 """
 
 from __future__ import annotations
@@ -19,23 +18,25 @@ from appliance.core.errors import FormatError
 Array = NDArray[Any]
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 GAP_FRAMES = 3.5
-"""Longer than this many frames it is a gap: three frames or more are missing, as the box counts a
-gap."""
+"""An interval longer than this many frames is a gap: three or more frames are missing. The box
+counts gaps in the same way."""
 MOST_ROUNDING = 1.0
-"""Range of the deviations from even times, in frames, that a clock's rounding explains."""
+"""Largest range of deviations from even times, in frames, that a clock's rounding explains."""
 SAME_RATE, NEAR_RATE = 0.01, 0.05
-"""Relative differences of rates: up to the first, frames are taken as they are; up to the second
-they are interpolated."""
+"""Relative differences of rates: up to the first, frames are kept unchanged; up to the second, they
+are interpolated."""
 FEWEST_BURSTS = 5
-"""So many gaps that together are longer than all else lie between bursts."""
-REMEDY = "where frames are even and only their times are not, give --rate in place of --time"
-BURSTS = f"its frames come in bursts, so their times say when a program read them; {REMEDY}"
+"""This many gaps that add up to more than half of the time show that frames came in bursts."""
+REMEDY = "if only the times are uneven, not the frames, give --rate instead of --time"
+BURSTS = (
+    "its frames come in bursts, so their times are those at which a program read them; " + REMEDY
+)
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Frames that are evenly apart. parts: float or as recorded, [n, ...] each. gaps: how many lie
-    between them. interpolated: whether any part was."""
+    """Evenly spaced frames. parts: [n, ...] each, in the recorded type or, if interpolated, float.
+    gaps: number of gaps between the parts. interpolated: whether any part was interpolated."""
 
     parts: tuple[Array, ...]
     gaps: int = 0
@@ -43,11 +44,11 @@ class Runs:
 
 
 def measured_hz(time_s: Array) -> float:
-    """The rate of a recording: of all its intervals that are no gaps. Raises FormatError where time
-    does not go on."""
+    """The mean frame rate of a recording, without its gaps. Raises FormatError if its times do not
+    increase."""
     if not np.isfinite(time_s).all():
         raise FormatError(
-            f"the time of frame {int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1} is no number"
+            f"the time of frame {int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1} is not a number"
         )
     steps = np.diff(time_s)
     if not len(steps):
@@ -55,7 +56,7 @@ def measured_hz(time_s: Array) -> float:
     if len(back := np.flatnonzero(steps < 0)):
         raise FormatError(f"the time of frame {back[0] + 2} is before that of frame {back[0] + 1}")
     if not steps.any():
-        raise FormatError("all its times are the same; give --rate in place of --time")
+        raise FormatError("all its times are the same; give --rate instead of --time")
     usual = float(np.median(steps))
     if not usual:  # a clock too coarse for the rate, or bursts
         rate_hz = float(len(steps) / steps.sum())
@@ -69,13 +70,16 @@ def measured_hz(time_s: Array) -> float:
 
 
 def nominal_hz(rates: Array) -> float:
-    """The rate of a set whose recordings have these: their median, to three digits."""
+    """The rate of a set from its recordings' rates: their median, to three digits."""
     return float(f"{np.median(rates):.3g}")
 
 
 def runs(frames: Array, time_s: Array, rate_hz: float) -> Runs:
-    """The runs of `frames` [n, ...], sampled at `time_s` [n], at `rate_hz`. Raises FormatError for
-    another rate, or times that stand still where frames are not even."""
+    """The runs of `frames` [n, ...], sampled at `time_s` [n], at `rate_hz`.
+
+    Raises FormatError if the recording's own rate differs too much, or if uneven frames share a
+    time.
+    """
     own_hz = measured_hz(time_s)
     if abs(own_hz / rate_hz - 1) > NEAR_RATE:
         raise FormatError(

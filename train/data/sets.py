@@ -244,7 +244,7 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     )
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
     if unloaded is not None:  # each set is at a level by itself; that of the other may be another
-        samples, unloaded, moved = readers.one_level(samples, unloaded)
+        samples, unloaded, moved = readers.align_tare(samples, unloaded)
         source += moved
     return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded)
 

@@ -40,22 +40,25 @@ def describe(spec: str) -> str:
                 *_unsendable(whole.materials),
             ]
         )
-    recorded = readers.recorded(folder)
+    recorded = readers.read_recorded(folder)
     named, names = _named(recorded)
-    whole = readers.joined(named, folder, Dataset)
-    lines = [*description(whole, names), *(f"  {line}" for line in half_known(whole))]
-    kept = [one.sweep for one in readers.ok(recorded)]
+    whole = readers.from_recorded(named, folder, Dataset)
+    lines = [*description(whole, names), *(f"  {line}" for line in partly_unknown_tare(whole))]
+    kept = [one.sweep for one in readers.usable(recorded)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
         lines.append(
             f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours"
         )
     try:
-        readers.joined(recorded, folder, Dataset).require_materials()
+        readers.from_recorded(recorded, folder, Dataset).require_materials()
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
     return "\n".join(
-        [*lines, *_unsendable(sorted({one.sweep.material for one in readers.ok(recorded)} - {""}))]
+        [
+            *lines,
+            *_unsendable(sorted({one.sweep.material for one in readers.usable(recorded)} - {""})),
+        ]
     )
 
 
@@ -74,10 +77,10 @@ def warnings_of(sweeps: Dataset) -> list[str]:
         lines.append(
             f"warning: materials without a sweep: {', '.join(empty)}; record some, or leave them out with --only"
         )
-    return lines + half_known(sweeps)
+    return lines + partly_unknown_tare(sweeps)
 
 
-def half_known(sweeps: Dataset) -> list[str]:
+def partly_unknown_tare(sweeps: Dataset) -> list[str]:
     """A line where some sweeps know the unloaded skin and others do not: whether these compare
     cannot be told."""
     if sweeps.unloaded is None:
@@ -103,8 +106,8 @@ def _unsendable(materials: Iterable[str]) -> list[str]:
 def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
     """The recordings, UNNAMED where some have a name and others none, and the names of the groups'
     numbers."""
-    kept, names = [one.sweep for one in readers.ok(recorded)], {}
-    groups = [by for by in readers.NAMED if any(getattr(sweep, by) for sweep in kept)]
+    kept, names = [one.sweep for one in readers.usable(recorded)], {}
+    groups = [by for by in readers.NAMED_GROUPS if any(getattr(sweep, by) for sweep in kept)]
 
     def name(one: RecordedSweep) -> RecordedSweep:
         missing: dict[str, Any] = {
@@ -114,7 +117,7 @@ def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Name
 
     named = [name(one) for one in recorded]
     for by in groups:
-        texts = [getattr(one.sweep, by) for one in readers.ok(named)]
+        texts = [getattr(one.sweep, by) for one in readers.usable(named)]
         names[by] = dict(zip(readers.numbered(texts).tolist(), texts, strict=True))
     return named, names
 
@@ -148,7 +151,7 @@ def description(sweeps: Dataset, names: Names) -> list[str]:
         lines += [
             f"    confounded: {why}" for why in _confounded(shown, counts > 0, sweeps.materials)
         ]
-        if by in readers.NAMED and len(values) <= MAX_COLUMNS:
+        if by in readers.NAMED_GROUPS and len(values) <= MAX_COLUMNS:
             lines += [f"    {line}" for line in table(sweeps.materials, shown, counts)]
     return lines
 

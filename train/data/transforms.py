@@ -1,8 +1,7 @@
-"""Reductions: the same sweeps with fewer frames, taxels or bits. In: a Dataset, a Change. Out: a
-Dataset.
+"""Reductions of a sweep set: the same sweeps with fewer frames, taxels or bits.
 
-Each change is one that an integrator can set on a sensor, and is done here as it would be there.
-Only the length of the window is set on the box, which takes the middle of each sweep in any case.
+Each change models a setting of the sensor. Only the length of the window is a setting of the box,
+which always takes the middle of each sweep.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from train.data.sets import Dataset
 
 Array = NDArray[Any]
 BANDS = 6
-"""Of a taxel's spectrum, equally wide on a logarithmic scale: its contribution to the classes is
-judged by them."""
+"""Number of bands of a taxel's spectrum, equally wide on a logarithmic scale. Taxels are ranked by
+the log powers in them."""
 RIDGE = 0.1
-"""Variance of each band that counts as noise. With more, a second copy of a taxel would add
-something; less relies on too few sweeps."""
+"""Variance of each band that counts as noise. With a larger value a copy of a taxel would still
+count as useful; a smaller value trusts the scatter of few sweeps too much."""
 BATCH = 32
-"""Sweeps whose spectra are in memory at the same time."""
+"""Number of sweeps whose spectra are in memory at the same time."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What is left out; by default nothing.
+    """A reduction; the default changes nothing.
 
-    window: share of the frames that is kept, the middle. rate: so many frames are averaged into one
-    by the readout board, without any other filter. taxels: those that are kept, with all axes,
-    numbered row by row; () for all. bits: so many of the lowest are cut off.
+    window: share of the frames to keep, from the middle. rate: number of consecutive frames that
+    the readout board averages into a frame, without any other filter. taxels: taxels to keep with
+    all their axes, numbered row by row; () keeps all. bits: number of lowest bits to cut off.
     """
 
     window: float = 1.0
@@ -41,9 +40,11 @@ class Change:
     bits: int = 0
 
     def of(self, sweeps: Dataset) -> Dataset:
-        """The changed sweeps, of the same data type. A grid remains one where whole rows and
-        columns are left, else the taxels form one column. Raises FormatError where no frame is
-        left."""
+        """The changed sweeps, in the same data type.
+
+        The taxels stay a grid if whole rows and columns are kept, else they form a single column.
+        Raises FormatError if no frame is left.
+        """
         x = sweeps.samples
         if self.taxels:
             x = _kept(x, self.taxels)
@@ -57,9 +58,9 @@ class Change:
             x = x[:, first : first + frames]
         if x is sweeps.samples:
             return sweeps
-        unloaded = sweeps.unloaded  # of fewer taxels nothing is known
+        unloaded = sweeps.unloaded
         if x.shape[2:] != sweeps.samples.shape[2:]:
-            unloaded = None
+            unloaded = None  # its shape would no longer fit
         return replace(sweeps, samples=x, rate_hz=sweeps.rate_hz / self.rate, unloaded=unloaded)
 
     def __str__(self) -> str:
@@ -93,8 +94,7 @@ def _kept(x: Array, taxels: tuple[int, ...]) -> Array:
 
 
 def _coarse(x: Array, bits: int) -> Array:
-    """Integers lose their lowest bits; floating-point counts are taken as eight bits over the range
-    of the set."""
+    """`x` without its lowest `bits`. Float counts are treated as 8 bits over the set's range."""
     if x.dtype.kind != "f":
         coarse: Array = x >> bits << bits
         return coarse
@@ -112,14 +112,13 @@ def _averaged(x: Array, rate: int) -> Array:
     return (mean if x.dtype.kind == "f" else np.rint(mean)).astype(x.dtype)
 
 
-def order(sweeps: Dataset) -> list[int]:
-    """Taxels by how well they separate materials, the best first: the last one is the first to be
-    removed.
+def rank_taxels(sweeps: Dataset) -> list[int]:
+    """All taxels, ordered by how well they separate the materials, the best first.
 
     Backward elimination (Marill and Green 1963) by Fisher's criterion trace(W^-1 B) (Fukunaga 1990,
-    sec. 10.2) of the log powers in BANDS bands of each taxel, on all its axes, scaled to variance 1
-    and with RIDGE in W, the scatter within materials. Removing one taxel from the inverse is a step
-    in closed form, so that nothing is trained.
+    sec. 10.2). Its features are the log powers in BANDS bands of each taxel, on all its axes,
+    scaled to variance 1. W is the scatter within materials plus RIDGE. Removing a taxel updates the
+    inverse in closed form; nothing is trained.
     """
     format, powers = sweeps.format, _powers(sweeps.samples)  # [N, M, BANDS]
     n, taxels, bands = len(powers), format.rows * format.cols, format.axes * BANDS
@@ -148,8 +147,7 @@ def order(sweeps: Dataset) -> list[int]:
 
 
 def _powers(samples: Array) -> Array:
-    """Log power [N, M, BANDS] of sweeps, the mean of each taxel and axis subtracted; M = R * C *
-    A."""
+    """Log power [N, M, BANDS] of sweeps [N, T, R, C(, A)] without their means; M = R * C * A."""
     n, frames = samples.shape[:2]
     bins = np.geomspace(1, max(frames // 2 + 1, 2), BANDS + 1)
     starts = np.minimum(bins.astype(int)[:-1], frames // 2)

@@ -158,7 +158,7 @@ def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
 def check(found: Parity) -> None:
     """Raises ExportRefused, with the number, its limit and what to try, where int8 differs too much
     from float."""
-    apart, lost = found.apart, found.lost
+    apart, lost = found.answers, found.accuracy
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
     hint = "drop training sweeps that are unlike all others, or record more"

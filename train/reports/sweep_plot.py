@@ -113,7 +113,7 @@ def source(what: str) -> SweepSource:
         one = _recorded(readers.RecordedSweep.load(path))
         return SweepSource(what, 1, lambda number: one)
     if path.is_dir():
-        found = readers.ok(readers.recorded(path))
+        found = readers.usable(readers.read_recorded(path))
         return SweepSource(what, len(found), lambda number: _recorded(found[number]))
     labelled = sets.load(what, 1)
     return SweepSource(what, len(labelled), lambda number: of_set(labelled, number))
@@ -142,7 +142,7 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
         raise FormatError(
             f"{one.path}: has no frames, its status is {sweep.status}; choose one that is ok"
         )
-    named = [f"{by} {name}" for by in readers.NAMED if (name := getattr(sweep, by))]
+    named = [f"{by} {name}" for by in readers.NAMED_GROUPS if (name := getattr(sweep, by))]
     notes = [f"{one.path.name}, sweep {sweep.id}: {sweep.status}", str(one.format)]
     if sweep.lost:
         notes.append(f"{sweep.lost} frames lost, filled in from their neighbours")

@@ -166,8 +166,8 @@ def _taxels(trials: Trials) -> Iterator[Step]:
     it is part of the test."""
     format = trials.sweeps.format
     count = format.rows * format.cols
-    orders = [transforms.order(trials.sweeps.take(~part.out)) for part in trials.parts]
-    overall = transforms.order(trials.sweeps)
+    orders = [transforms.rank_taxels(trials.sweeps.take(~part.out)) for part in trials.parts]
+    overall = transforms.rank_taxels(trials.sweeps)
     n = 2 ** ((count - 1).bit_length() - 1) if count > 1 else 0
     while n:
         change = [Change(taxels=tuple(sorted(order[:n]))) for order in orders]

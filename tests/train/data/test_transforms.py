@@ -97,7 +97,7 @@ def test_a_taxel_goes_with_all_its_axes():
     told = textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]})
     plain = textured({0: [1, 1, 1, 1]})
     three = replace(told, samples=np.stack([plain.samples, told.samples, plain.samples], axis=-1))
-    found = transforms.order(three)
+    found = transforms.rank_taxels(three)
     assert set(found[:2]) == {2, 7}
     assert sorted(found) == list(range(9))
 
@@ -126,7 +126,7 @@ def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12
 
 def test_the_informative_taxels_come_first():
     """Two taxels that each separate half of the materials, anywhere on the skin."""
-    assert set(transforms.order(textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]}))[:2]) == {2, 7}
+    assert set(transforms.rank_taxels(textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]}))[:2]) == {2, 7}
 
 
 def test_one_of_two_that_tell_the_same_stays():
@@ -135,7 +135,7 @@ def test_one_of_two_that_tell_the_same_stays():
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]
-    first = transforms.order(Dataset(x, sweeps.labels, sweeps.materials, 100.0))
+    first = transforms.rank_taxels(Dataset(x, sweeps.labels, sweeps.materials, 100.0))
     assert first[0] in (4, 6)
     assert first[1] == 2
 
@@ -149,5 +149,5 @@ def test_any_sweeps_have_an_order(kind: str):
         if kind == "silent"
         else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
     )
-    found = transforms.order(Dataset(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
+    found = transforms.rank_taxels(Dataset(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
     assert sorted(found) == list(range(shape[2] * shape[3]))

@@ -172,7 +172,7 @@ def test_a_bundle_is_compared_without_float(fitted: Fit):
     """Each tensor against itself, before it is rounded; a graph without int8 is named."""
     reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
-    assert (found.apart, found.lost, {layer.against for layer in found.layers}) == (
+    assert (found.answers, found.accuracy, {layer.against for layer in found.layers}) == (
         None,
         None,
         {"itself"},
