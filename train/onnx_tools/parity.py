@@ -98,15 +98,15 @@ class AccuracyLoss:
 class Parity:
     """The comparison of a model's two forms on some sweeps.
 
-    apart, lost: None where there is no float form. tap_sum: the largest sum of the integer taps of
+    answers, accuracy: None where there is no float model. tap_sum: the largest sum of the integer taps of
     one filter and taxel in the first convolution: 0 where no offset changes the answer, -1 where
     there is no convolution in int8.
     """
 
     sweeps: int
     int8_right: int
-    apart: AnswerDifference | None
-    lost: AccuracyLoss | None
+    answers: AnswerDifference | None
+    accuracy: AccuracyLoss | None
     tap_sum: int
     layers: tuple[Layer, ...]
 
@@ -117,7 +117,7 @@ class Parity:
     def summary(self) -> dict[str, Any]:
         """The part for a manifest: of the tensors only the worst."""
         figures: dict[str, Any] = {}
-        for part in (self.apart, self.lost):
+        for part in (self.answers, self.accuracy):
             figures |= asdict(part) if part else {}
         if not self.layers:  # no tensor is in int8
             return figures
@@ -370,7 +370,7 @@ def _sqnr(want: Array, have: Array) -> float:
 def table(parity: Parity) -> str:
     """All of it as text."""
     lines = []
-    if (apart := parity.apart) and (lost := parity.lost):
+    if (apart := parity.answers) and (lost := parity.accuracy):
         lines.append(
             f"labels equal {apart.agreement:.4f}, expected loss {100 * apart.expected_loss:.2f} points; a probability differs by up to {apart.probability_difference:.4f} "
             f"(mean of sweeps {apart.probability_mean:.4f}), a logit by up to {apart.logit_difference:.3f} ({apart.logit_mean:.3f})"

@@ -47,9 +47,9 @@ def test_a_name_that_fits_in_several_ways_is_refused():
     [
         ("{trial}.csv", "does not say where the material stands"),
         ("{material}_{a}_{a}.csv", "'a' stands twice"),
-        ("{material}_{A}.csv", "'A' stands twice or is no name; use small letters"),
-        ("{material}_{a.csv", "a brace without its other one"),
-        ("{material}_{a:x}.csv", "'x' is no kind"),
+        ("{material}_{A}.csv", "'A' stands twice or is not a name; use lower-case letters"),
+        ("{material}_{a.csv", "has an unmatched brace"),
+        ("{material}_{a:x}.csv", "'x' is not a kind of field"),
         ("{material}_{recording}.csv", "each file is a recording"),
     ],
 )

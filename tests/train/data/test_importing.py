@@ -109,7 +109,7 @@ def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
         {"columns": "s0,3,s2-,5"},
     ):
         if "s2-" in str(given):
-            assert "no column is called 's2-'" in reasons(tmp_path, **given)["cork_1.csv"]
+            assert "there is no column 's2-'" in reasons(tmp_path, **given)["cork_1.csv"]
         else:
             np.testing.assert_array_equal(taken(tmp_path, **given).sweeps.samples[0], whole)
     turned = taken(tmp_path, columns="s3,4,3,s0").sweeps.samples[0]
@@ -168,7 +168,7 @@ def test_no_window_goes_over_a_gap(tmp_path: Path):
     why = reasons(tmp_path, time="time:ms", rate_hz=100.0, window=Length("26", "--window"))[
         "cork_1.csv"
     ]
-    assert why == "has 25 frames in a row (1 gaps), a window takes 26; see --window"
+    assert why == "has 25 frames in a row (1 gaps), but a window needs 26; see --window"
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
         ("int16", 40000, "a count is 40000, and int16 holds -32768 to 32767"),
         ("uint16", -1, "a count is -1, and uint16 holds 0 to 65535"),
         ("int16", 0.5, "a count is 0.5, and int16 holds whole numbers"),
-        ("", 16777217, "a count is 16777217, and float32 would round it; take an offset away"),
+        ("", 16777217, "a count is 16777217, and float32 would round it; subtract an offset"),
         (
             "",
             1e300,
@@ -223,9 +223,9 @@ BAD = {
     "short line": (GOOD.encode() + b"1,2,3\n", "line 21 has 3 columns, line 1 has 4"),
     "word": (
         b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n",
-        "line 22, column 3 is 'x', which is no number",
+        "line 22, column 3 is 'x', which is not a number",
     ),
-    "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is '', which is no number"),
+    "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is '', which is not a number"),
     "nan": (
         GOOD.encode() + b"1,nan,3,4\n",
         "frame 21, taxel 1, 2 is nan; fill it in or cut it away",
@@ -233,13 +233,13 @@ BAD = {
     "UTF-16": (GOOD.encode("utf-16"), "is UTF-16; save it as UTF-8"),
     "wide": (
         b"1,2,3,4,5\n" * 20,
-        "it has 5 columns, a grid of 2x2 takes 4; see --columns and --grid",
+        "it has 5 columns, but a grid of 2x2 needs 4; see --columns and --grid",
     ),
     "taxels x frames": (
         b"1,2,3,4,5\n" * 4,
-        "it has 5 columns, a grid of 2x2 takes 4; it has so many rows, so add --transpose",
+        "it has 5 columns, but a grid of 2x2 needs 4; it has 4 rows, so add --transpose",
     ),
-    "few": (b"1,2,3,4\n" * 9, "has 9 frames, a window takes 10; see --window"),
+    "few": (b"1,2,3,4\n" * 9, "has 9 frames, but a window needs 10; see --window"),
     "noise": (bytes(range(256)) * 9, "holds no line of numbers"),
 }
 
@@ -257,8 +257,16 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
 @pytest.mark.parametrize(
     ("suffix", "save", "why"),
     [
-        ("npy", lambda p: np.save(p, np.zeros(9)), "holds float64 [9]; frames x taxels are wanted"),
-        ("npy", lambda p: np.save(p, np.array(["a"])), "holds <U1 [1]; frames x taxels"),
+        (
+            "npy",
+            lambda p: np.save(p, np.zeros(9)),
+            "holds float64 [9]; give an array of frames x taxels",
+        ),
+        (
+            "npy",
+            lambda p: np.save(p, np.array(["a"])),
+            "holds <U1 [1]; give an array of frames x taxels",
+        ),
         (
             "npy",
             lambda p: np.save(p, np.array([{}]), allow_pickle=True),
@@ -268,10 +276,10 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "npy",
             lambda p: np.save(p, np.zeros((20, 3, 3))),
-            "holds frames [3, 3]; leave --columns out",
+            "holds frames of shape [3, 3]; leave --columns out",
         ),
         ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
-        ("npz", lambda p: zipped(p, "a.npy", b"nothing"), "cannot be read: 'a' is no array"),
+        ("npz", lambda p: zipped(p, "a.npy", b"nothing"), "cannot be read: 'a' is not an array"),
         (
             "npz",
             lambda p: np.savez(p, a=COUNTS, b=COUNTS),
@@ -280,7 +288,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "mat",
             lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
-            "is no MAT file of version 5 to 7.3; save it with -v7",
+            "is not a MAT file of version 5 to 7.3; save it with -v7",
         ),
         ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
         (
@@ -322,15 +330,15 @@ def test_an_array_is_chosen_and_turned(tmp_path: Path):
             np.r_[np.arange(30), 5, np.arange(31, 40)] * 10.0,
             "the time of frame 31 is before that of frame 30",
         ),
-        (np.zeros(40), "all its times are the same; give --rate in place of --time"),
+        (np.zeros(40), "all its times are the same; give --rate instead of --time"),
         (np.arange(40) // 8 * 80.0, "its frames come in bursts"),
         (np.arange(40) // 4 * 40.0 + np.arange(40) % 4 * 0.1, "its frames come in bursts"),
         (np.arange(40) * 20.0, "is sampled at 50 Hz, the set at 100 Hz; import it by itself"),
         (
             np.r_[0:10, 12:30, 29, 30:41] * 10.0,
-            "frames 28 and 29 of a run have the same time; where frames are even",
+            "frames 28 and 29 of a run have the same time; if only the times are uneven",
         ),
-        (np.r_[np.nan, 1:40] * 10.0, "the time of frame 1 is no number"),
+        (np.r_[np.nan, 1:40] * 10.0, "the time of frame 1 is not a number"),
     ],
 )
 def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
@@ -349,7 +357,7 @@ def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: 
     [
         (
             {"rate_hz": None},
-            "how fast frames follow is not known; give --rate HZ, or --time COLUMN:UNIT",
+            "the frame rate is not known; give --rate HZ, or --time COLUMN:UNIT",
         ),
         ({"time": "t"}, "--time t names no unit; write t:s, :ms, :us or :ns"),
         ({"grid": "4"}, "--grid 4 cannot be read; write ROWSxCOLUMNS"),
@@ -385,7 +393,7 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
         text(tmp_path / f"{name}_1.csv")
     s = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).sweeps
     assert (s.materials, s.labels.tolist()) == (("ab", "felt"), [0, 1, 0])
-    with pytest.raises(FormatError, match="no material is called 'felz'; did you mean 'felt'"):
+    with pytest.raises(FormatError, match="there is no material 'felz'; did you mean 'felt'"):
         taken(tmp_path, renames={"felz": "wool"})
 
 
@@ -395,9 +403,11 @@ def test_shapes_that_differ_are_refused(tmp_path: Path):
     np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
     with pytest.raises(FormatError, match=r"frames differ in shape: \[\[2, 2\], \[2, 3\]\]"):
         taken(tmp_path, grid="")
-    with pytest.raises(FormatError, match="is no folder"):
+    with pytest.raises(FormatError, match="is not a folder"):
         taken(tmp_path / "cork_1.npy")
-    with pytest.raises(FormatError, match=r"no file fits --pattern .*; the first is 'cork_1.npy'"):
+    with pytest.raises(
+        FormatError, match=r"no file matches --pattern .*; the first file is 'cork_1.npy'"
+    ):
         taken(tmp_path, pattern=NamePattern("{material}.csv"))
 
 

@@ -92,8 +92,8 @@ def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "is no MAT file of version 5 to 7.3; save it with -v7"),
-        (WHOLE[False][:-40], "is damaged or cut off: .* bytes at .* go beyond its end"),
+        (b"", "is not a MAT file of version 5 to 7.3; save it with -v7"),
+        (WHOLE[False][:-40], "is damaged or cut off: .* bytes at .* exceed its end"),
         (WHOLE[True][:-9], "is damaged"),
         (
             WHOLE[False][:160] + b"\x09" + WHOLE[False][161:],

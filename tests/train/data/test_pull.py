@@ -56,7 +56,7 @@ class Ground:
 
     def pull(self, *more: str) -> None:
         """The command."""
-        args = parser().parse_args(
+        args = parser("pull").parse_args(
             ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
         )
         args.run(args)
@@ -367,7 +367,7 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
     with pytest.raises(
         ApplianceError,
-        match=r"^user@box: /nowhere cannot be read; name another with --from, let .*",
+        match=r"^user@box: /nowhere cannot be read; name another folder with --from, .*",
     ):
         pull.pull(
             RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
@@ -379,7 +379,7 @@ def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
     """The folder does not exist, and sudo may look."""
     ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
     with pytest.raises(
-        ApplianceError, match=r"^user@box: there is no /nowhere: nothing was recorded yet"
+        ApplianceError, match=r"^user@box: there is no /nowhere; record something first"
     ):
         pull.pull(
             RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None

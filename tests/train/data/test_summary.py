@@ -26,7 +26,7 @@ def lines(s: sets.Dataset) -> list[str]:
 
 def command(*words: str) -> None:
     """The command `sets`."""
-    args = parser().parse_args(["sets", *words])
+    args = parser("sets").parse_args(["sets", *words])
     args.run(args)
 
 

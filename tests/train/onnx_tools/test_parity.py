@@ -189,7 +189,7 @@ def test_the_command_reports_fits_and_bundles(fitted: Fit, tmp_path: Path):
     quantized_bundle.export(fitted, tmp_path / "bundle", "close", "1", "")
     table = quantized_bundle.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "parity.json")
     figures = json.loads((tmp_path / "parity.json").read_bytes())
-    assert figures["lost"]["total"] == len(fitted.held)
+    assert figures["accuracy"]["total"] == len(fitted.held)
     assert len(figures["layers"]) == len(measured(fitted).layers)
     assert figures["set"] == "close"
     assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
