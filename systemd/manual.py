@@ -1,8 +1,9 @@
 """The manual's references, made from the code, and the manual as one text for the box.
 
-A page below docs/ holds a marker such as `<!-- palpate: settings -->` where a reference belongs.
-The site and the text for the box replace it by tables of the settings, commands and exit codes
-that this checkout has. So no reference can be stale.
+A page below docs/ holds a pair of markers, `<!-- palpate: settings -->` and `<!-- /palpate -->`, where
+a reference belongs; the text between them is for readers of the source. The site and the text for
+the box replace it by tables of the settings or commands of this checkout. So no reference can be
+stale.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ BOX_PAGES = (
     "reference/glossary.md",
 )
 """Pages below docs/ that the box holds as one text, in this order."""
-MARKER = re.compile(r"(?m)^<!-- palpate: ([a-z-]+) -->$")
+MARKER = re.compile(r"(?ms)^<!-- palpate: ([a-z-]+) -->\n.*?^<!-- /palpate -->$")
 TITLE = """\
 # Palpate: the manual
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import manual
-from manual import ROOT
+from manual import BOX_PAGES, ROOT
 
 from train.cli.main import PROGRAM
 from train.studies.command import PROGRAM as STUDIES
@@ -30,11 +30,15 @@ REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
 CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
 CHAPTERS = {
     "Tutorials": ["docs/tutorials/first-model", "docs/tutorials/first-start"],
-    "How-to": ["docs/how-to/*", "docs/robots/README", "docs/robots/*", "docs/board-checklist"],
+    "How-to": [
+        "docs/how-to/*",
+        "docs/robots/README",
+        "docs/robots/*",
+        "docs/board-checklist",
+    ],
     "Reference": ["docs/reference/*", "firmware_config/PROTOCOL", "firmware_config/*/README"],
     "Explanation": [
         "docs/explanation/*",
-        "docs/*",
         "docs/architecture",
         "docs/security",
         "docs/skins",
@@ -49,7 +53,8 @@ CHAPTERS = {
         "docs/data/trials/*",
     ],
 }
-"""Captions of the contents, and their pages, without .md."""
+"""Captions of the contents, and their pages, without .md. Pages of one pattern are in the order of
+the manual for the box, then by name."""
 
 
 def main() -> int:
@@ -171,16 +176,23 @@ def contents(names: list[str]) -> str:
     taken: set[str] = {"README.md"}
     text = "\n"
     for caption, patterns in CHAPTERS.items():
-        listed = [
-            name
-            for pattern in patterns
-            for name in names
-            if re.fullmatch(f"{pattern}.md".replace("*", "[^/]*"), name) and name not in taken
-        ]
-        listed = [name for name in dict.fromkeys(listed) if not taken.add(name)]  # type: ignore[func-returns-value]
+        listed: list[str] = []
+        for pattern in patterns:
+            fits = re.compile(f"{pattern}.md".replace("*", "[^/]*"))
+            found = [name for name in names if fits.fullmatch(name) and name not in taken]
+            listed += sorted(found, key=_order)
+            taken.update(found)
         lines = "\n".join(name.removesuffix(".md") for name in listed)
         text += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{lines}\n```\n"
     return text
+
+
+def _order(name: str) -> tuple[int, str]:
+    """For pages of one pattern: README first, then the order of the manual for the box."""
+    if name.endswith("README.md"):
+        return -1, name
+    below = name.removeprefix("docs/")
+    return (BOX_PAGES.index(below) if below in BOX_PAGES else len(BOX_PAGES)), name
 
 
 if __name__ == "__main__":
