@@ -178,13 +178,13 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
     material = np.array(sweeps.materials)[sweeps.labels]
     known = np.isin(material, manifest.labels)
     given = np.empty(len(sweeps), object)
-    statuses: Counter[str] = Counter()
-    hinted, moved = 0, Counter[str]()
+    statuses, displaced, unsure_right = Counter[str](), Counter[str](), 0
     for i, verdict in verdicts(classifier, sweeps):
         statuses[str(verdict.status)] += 1
         given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
-        hinted += verdict.status is Status.UNSURE and verdict.label == material[i]
-        moved.update([verdict.displacement] if verdict.displacement else [])
+        unsure_right += verdict.status is Status.UNSURE and verdict.label == material[i]
+        displaced.update([verdict.displacement] if verdict.displacement else [])
+    by_material = {name: Counter(given[material == name].tolist()) for name in present}
     clusters, by = _clusters(sweeps)
     return BundleScore(
         {"name": manifest.name, "version": manifest.version, "id": classifier.bundle.id},
@@ -192,20 +192,12 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
         (given == material)[known],
         None if clusters is None else clusters[known],
         by,
-        {
-            name: Counter(given[material == name].tolist())
-            for name in present
-            if name in manifest.labels
-        },
+        {name: found for name, found in by_material.items() if name in manifest.labels},
         statuses,
-        hinted,
+        unsure_right,
         _recordings(classifier, sweeps.take(known)),
-        {
-            name: Counter(given[material == name].tolist())
-            for name in present
-            if name not in manifest.labels
-        },
-        moved,
+        {name: found for name, found in by_material.items() if name not in manifest.labels},
+        displaced,
     )
 
 

@@ -159,11 +159,8 @@ def learn(
     unfinished: a file that keeps the training from time to time, and from which it goes on with the
     same bits.
     """
-    rng, n = torch.Generator().manual_seed(seed), len(sweeps)
-    rounds = -(-recipe.steps * recipe.batch // n)
-    order = torch.cat([torch.randperm(n, generator=rng) for _ in range(rounds)])[
-        : recipe.steps * recipe.batch
-    ]
+    rng = torch.Generator().manual_seed(seed)
+    order = _order(len(sweeps), recipe, rng)
     model = model.to(device)
     optimizer = torch.optim.AdamW(
         model.parameters(), recipe.peak_rate, weight_decay=recipe.weight_decay
@@ -182,9 +179,8 @@ def learn(
     picks = order.split(recipe.batch)[len(cost) :]
     done, begun = len(cost), time.monotonic()
     model.train().dropout = recipe.dropout
-    for step, (pick, counts) in enumerate(
-        zip(picks, float_batches(sweeps.samples, picks), strict=True), len(cost) + 1
-    ):
+    batches_of_sweeps = zip(picks, float_batches(sweeps.samples, picks), strict=True)
+    for step, (pick, counts) in enumerate(batches_of_sweeps, done + 1):
         x = perturbed(augment(model.prepare(counts), rng), recipe, rng).to(device)
         optimizer.zero_grad()
         with torch.autocast(device, torch.bfloat16, enabled=bfloat16):
@@ -199,6 +195,12 @@ def learn(
     averaged = average.module
     assert isinstance(averaged, type(model))
     return averaged.cpu().fused(), cost
+
+
+def _order(n: int, recipe: TrainingRecipe, rng: Generator) -> Tensor:
+    """The numbers of the sweeps of all batches, in shuffled rounds."""
+    wanted = recipe.steps * recipe.batch
+    return torch.cat([torch.randperm(n, generator=rng) for _ in range(-(-wanted // n))])[:wanted]
 
 
 def _schedule(optimizer: torch.optim.Optimizer, recipe: TrainingRecipe) -> lr_scheduler.LRScheduler:

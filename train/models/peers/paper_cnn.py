@@ -218,18 +218,10 @@ def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ..
     recipe = replace(PAPER_RECIPE, steps=max(steps, MIN_STEPS))
 
     def paper(name: str, about: str, build: Build) -> Method:
-        """As printed: trained on everything, so that no temperature is found."""
-        return network_method(
-            name,
-            about,
-            build,
-            recipe,
-            log,
-            calibrated=False,
-            bfloat16=effort.bfloat16,
-            int8=INT8_NODES,
-            unfinished=effort.unfinished,
-        )
+        """As printed: trained on all sweeps, without a temperature."""
+        kept, half = effort.unfinished, effort.bfloat16
+        more: dict[str, Any] = {"calibrated": False, "bfloat16": half, "unfinished": kept}
+        return network_method(name, about, build, recipe, log, int8=INT8_NODES, **more)
 
     return (
         paper(

@@ -220,12 +220,7 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
         ):
             row.append(value)
         triangle.append(beside)
-    solved: dict[int, str] = {}
-    for i in reversed(range(ACTIVE)):
-        for later, value in solved.items():
-            amounts[i] = g("Sub", amounts[i], g("Mul", triangle[later][i], value))
-        solved[i] = g("Div", amounts[i], lengths[i])
-    values = [solved[i] for i in range(ACTIVE)]
+    values = _solved(g, amounts, lengths, triangle)
     return g(
         "ScatterElements",
         zeros,
@@ -234,6 +229,20 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
         axis=1,
         reduction="add",
     )
+
+
+def _solved(
+    g: GraphBuilder, amounts: list[str], lengths: list[str], triangle: list[list[str]]
+) -> list[str]:
+    """The amounts of the chosen atoms themselves, by back substitution from those of orthogonal
+    directions."""
+    solved: dict[int, str] = {}
+    for i in reversed(range(ACTIVE)):
+        amount = amounts[i]
+        for later, value in solved.items():
+            amount = g("Sub", amount, g("Mul", triangle[later][i], value))
+        solved[i] = g("Div", amount, lengths[i])
+    return [solved[i] for i in range(ACTIVE)]
 
 
 def _unit(vectors: Array) -> Array:

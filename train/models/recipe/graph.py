@@ -1,17 +1,15 @@
-"""The graphs of the compact network. In: its weights and, for int8, ranges. Out: the model `sweep`
--> its features.
+"""The graphs of the compact network: `sweep` -> its features, in float and in int8.
 
-Float and int8 have the same nodes. In int8 everything is an integer up to the mean responses: the
-first convolution takes bytes as they come from the sensor, for its integer taps sum to zero and no
-offset matters, and the means are integer sums. So all machines give the same bits there. The filter
-bank is in int8 only where counts are bytes: wider counts lose too much in one.
+Both have the same nodes. In int8 everything is an integer up to the mean responses: the first
+convolution takes bytes as they come from the sensor, because its integer taps sum to zero and no
+offset matters, and the means are integer sums. Therefore all machines compute the same bits up to
+there. The filter bank is in int8 only if counts are bytes: wider counts lose too much in a byte.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -31,9 +29,11 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Prepared:
-    """Taxels as the first convolution takes them. x: their values [n, R * C, T] in units of `step`.
-    rounded: the bytes [n, T, R * C] that these come from, "" where they were not rounded; zero: the
-    byte that stands for 0."""
+    """Taxels as input of the first convolution.
+
+    x: their values [n, R * C, T] in units of `step`. rounded: the bytes [n, T, R * C] that `x` was
+    made of, "" if there are none; zero: the byte that stands for 0.
+    """
 
     x: str
     step: float
@@ -43,19 +43,19 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Ranges:
-    """The ranges of int8. counts: of a raw count on either side of its level; raw counts that are
-    bytes do not need it. responses: of each stage, in the scaled units of the network."""
+    """The ranges of int8. counts: of a raw count on either side of its level, which raw counts that
+    are bytes do not need. responses: of each stage, in the scaled units of the network."""
 
     counts: float
     responses: tuple[float, ...]
 
 
 def level_frames(window: int, architecture: Architecture) -> int:
-    """Over how many frames the level of raw counts that are not bytes is averaged: the first tenth,
-    or the whole window.
+    """Number of frames over which the level of wide raw counts is averaged: the first tenth if
+    kernels sum to zero, else the whole window.
 
-    Kernels that sum to zero need no level, but int8 does. The first tenth is known by the time of
-    every early answer.
+    Kernels that sum to zero need no level, but int8 does. The first tenth is known before every
+    early answer.
     """
     return max(window // PREFIXES, 1) if architecture.zero_sum(window) else window
 
@@ -69,62 +69,26 @@ def trunk_graph(
     prefixes: bool = False,
     keep_means: bool = False,
 ) -> onnx.ModelProto:
-    """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 where
-    `ranges` are given.
+    """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 if there
+    are `ranges`. The bands of the spectrum are the last features, in float.
 
-    tenths: `tenths` float32 [1, PREFIXES, F] instead, features of the first tenth, the first two
-    tenths and so on. Row d depends on no frame after (d + 1) / PREFIXES of the window, as long as
-    later frames repeat the newest one (frames that have not come yet have no noise) or no taxel is
-    attenuated. A stage that has no response by then counts as silent. The bands of the spectrum are
-    the last features, in float.
+    prefixes: `tenths` float32 [1, PREFIXES, F] instead, the features of each prefix of the window.
+    Row d depends on no frame after (d + 1) / PREFIXES of the window, as long as later frames repeat
+    the newest one (frames that have not come yet have no noise) or no taxel is attenuated. A stage
+    that has no response by then counts as silent.
     """
-    g, parts = GraphBuilder(), []
-    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
-    attenuation = _attenuation(g, raw, format)
-    own = (
-        ranges if format.dtype == "uint8" else None
-    )  # a byte does not hold wider counts, see decision 11
-    prepared = cache(
-        lambda some: _prepared(g, format, scale, architecture, raw, attenuation, some, prefixes)
-    )
-    if architecture.channels:
-        parts.append(
-            _log_means(g, format, architecture, weights, prepared(ranges), ranges, prefixes)
-        )
-    if architecture.pools:
-        rowwise = prefixes and not architecture.zero_sum(format.window)
-        asked = bank.Pooling(own is not None, architecture.pools > 1, prefixes, rowwise)
-        parts += bank.pooled(
-            g, format, bank.Bank.of(weights), prepared(own).x, prepared(own).step, asked
-        )
-    if architecture.distribution:
-        taxels = prepared(own)
-        # whole numbers, whose sums are exact in floats: all machines find the same frames above a
-        # level
-        x = (
-            graph_builder.channels_first(g, taxels.rounded, 1.0, taxels.zero)
-            if taxels.rounded
-            else taxels.x
-        )
-        some = distribution.Levels.of(weights)
-        parts.append(
-            distribution.pooled(g, format, some, x, taxels.step, own is not None, prefixes)
-        )
-    if keep_means:
-        counts = each_frame(format.window).known_steps(format.window, prefixes)
-        parts.append(
-            g("Mul", _levels(g, g("Cast", raw, to=FLOAT), format, counts), g.constant(scale))
-        )
-    if architecture.spectrum:
-        parts.append(
-            spectrum.nodes(g, raw, attenuation, format, scale, architecture.mains_hz, prefixes)
-        )
+    nodes = _TrunkNodes(format, scale, architecture, ranges, prefixes)
+    parts = nodes.stages(weights) if architecture.channels else []
+    parts += nodes.bank(weights) if architecture.pools else []
+    parts += nodes.distribution(weights) if architecture.distribution else []
+    parts += nodes.means() if keep_means else []
+    parts += nodes.spectrum() if architecture.spectrum else []
     size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
+    g = nodes.g
     features = graph_builder.side_by_side(g, parts)
     shape = [1, PREFIXES, size] if prefixes else [1, size]
-    output = g(
-        "Reshape", features, g.constant(shape, "int64"), output="tenths" if prefixes else "features"
-    )
+    name = "tenths" if prefixes else "features"
+    output = g("Reshape", features, g.constant(shape, "int64"), output=name)
     return g.model(format, output, *shape[1:])
 
 
@@ -151,153 +115,169 @@ def layout(
     }
 
 
-def _log_means(
-    g: GraphBuilder,
-    format: SweepFormat,
-    architecture: Architecture,
-    weights: Mapping[str, Array],
-    taxels: Prepared,
-    ranges: Ranges | None,
-    prefixes: bool,
-) -> str:
-    """The stages: log mean responses [1, 1 or PREFIXES, sum of channels]."""
-    zero_sum, sums, factors = architecture.zero_sum(format.window), [], []
-    rowwise, x, step = prefixes and not zero_sum, taxels.x, taxels.step
-    stages, channels = architecture.stages(format.window), architecture.channels
-    for i, (stage, size) in enumerate(zip(stages, channels, strict=True)):
-        w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
+class _TrunkNodes:
+    """The nodes of a trunk, part by part. raw: counts [1, T, R * C]. attenuation: [1, 1, R * C],
+    the factor of each taxel; see architectures.NoiseLimit."""
+
+    def __init__(
+        self,
+        format: SweepFormat,
+        scale: float,
+        architecture: Architecture,
+        ranges: Ranges | None = None,
+        prefixes: bool = False,
+    ) -> None:
+        self.g, self._format, self._scale = GraphBuilder(), format, scale
+        self._architecture, self._ranges, self._prefixes = architecture, ranges, prefixes
+        self._zero_sum = architecture.zero_sum(format.window)
+        self._rowwise = prefixes and not self._zero_sum
+        # a byte does not hold wider counts: fixed features of these stay in float (decision 11)
+        self._own = ranges if format.dtype == "uint8" else None
+        shape = self.g.constant([1, format.window, format.channels], "int64")
+        self.raw = self.g("Reshape", "sweep", shape)
+        self.attenuation = self._attenuation()
+        self._prepared: dict[Ranges | None, Prepared] = {}
+
+    def stages(self, weights: Mapping[str, Array]) -> list[str]:
+        """Log mean responses [1, 1 or PREFIXES, sum of channels]."""
+        g, window, ranges = self.g, self._format.window, self._ranges
+        taxels, sums, factors = self.prepared(ranges), [], []
+        x, step = taxels.x, taxels.step
+        stages, channels = self._architecture.stages(window), self._architecture.channels
+        for i, (stage, size) in enumerate(zip(stages, channels, strict=True)):
+            w, b = weights[f"convs.{i}.weight"], weights[f"convs.{i}.bias"]
+            if ranges is None:
+                taps = g.constant(w * step), g.constant(b)
+                x = response = g("Relu", g("Conv", x, *taps, strides=[stage.stride]))
+                step = 1.0
+            else:
+                taps = graph_builder.int8_weights(g, w, b, step, self._zero_sum and not i)
+                y = g("Conv", x, *taps, strides=[stage.stride])
+                step = ranges.responses[i] / 255
+                response = graph_builder.quantized(g, y, step)
+                if i < len(channels) - 1:  # else onnxruntime would run a node without a use
+                    x = graph_builder.counts_of(g, response, step)
+            counts = stage.known_steps(window, self._prefixes)
+            x_t = g("Transpose", response, perm=[0, 2, 1])
+            whole = ranges is not None
+            sums.append(graph_builder.sums(g, x_t, stage.steps, counts, whole, self._rowwise))
+            factors.append(graph_builder.mean_factors(g, step, counts, size, self._rowwise))
+        total = graph_builder.side_by_side(g, sums)
+        total = g("Cast", total, to=FLOAT) if ranges else total
+        means = g("Mul", total, graph_builder.side_by_side(g, factors))
+        log = g("Log", g("Add", means, g.constant(FLOOR)))
+        if not self._rowwise:
+            return [log]
+        return [g("Reshape", log, g.constant([1, PREFIXES, sum(channels)], "int64"))]
+
+    def bank(self, weights: Mapping[str, Array]) -> list[str]:
+        """See bank.pooled."""
+        pools, int8 = self._architecture.pools, self._own is not None
+        how = bank.Pooling(int8, pools > 1, self._prefixes, self._rowwise)
+        taxels = self.prepared(self._own)
+        filters = bank.Bank.of(weights)
+        return bank.pooled(self.g, self._format, filters, taxels.x, taxels.step, how)
+
+    def distribution(self, weights: Mapping[str, Array]) -> list[str]:
+        """See distribution.pooled."""
+        g, taxels = self.g, self.prepared(self._own)
+        x = taxels.x
+        if taxels.rounded:
+            # whole numbers, whose sums are exact in floats: all machines find the same frames
+            # above a level
+            x = graph_builder.channels_first(g, taxels.rounded, 1.0, taxels.zero)
+        levels, int8 = distribution.Levels.of(weights), self._own is not None
+        return [distribution.pooled(g, self._format, levels, x, taxels.step, int8, self._prefixes)]
+
+    def means(self) -> list[str]:
+        """Scaled means of the taxels [1, 1 or PREFIXES, R * C]."""
+        g, window = self.g, self._format.window
+        counts = each_frame(window).known_steps(window, self._prefixes)
+        levels = self._levels(g("Cast", self.raw, to=FLOAT), counts)
+        return [g("Mul", levels, g.constant(self._scale))]
+
+    def spectrum(self) -> list[str]:
+        """See spectrum.nodes."""
+        given = self._format, self._scale, self._architecture.mains_hz, self._prefixes
+        return [spectrum.nodes(self.g, self.raw, self.attenuation, *given)]
+
+    def prepared(self, ranges: Ranges | None) -> Prepared:
+        """Taxels in units of what is left to the weights of the first convolution.
+
+        Bytes stay bytes if the kernels sum to zero. From other counts the level is subtracted. If
+        that is the mean of the whole window, and prefixes are wanted, each prefix has a level and a
+        row of its own: [PREFIXES, R * C, T].
+        """
+        if ranges not in self._prepared:
+            self._prepared[ranges] = self._prepare(ranges)
+        return self._prepared[ranges]
+
+    def _prepare(self, ranges: Ranges | None) -> Prepared:
+        g, format, scale = self.g, self._format, self._scale
+        if format.dtype == "uint8" and self._zero_sum and ranges:
+            return self._rounded(self._attenuated_bytes(), scale, 0)
+        x = g("Cast", self.raw, to=FLOAT)
+        if format.dtype == "uint8" and self._zero_sum:
+            x = g("Mul", x, self.attenuation)
+            return Prepared(g("Transpose", x, perm=[0, 2, 1]), scale)
+        counts = [level_frames(format.window, self._architecture)]
+        if self._rowwise:
+            counts = each_frame(format.window).known_steps(format.window, self._prefixes)
+        x = g("Sub", x, self._levels(x, counts, self._rowwise))
+        x = g("Mul", x, g("Mul", self.attenuation, g.constant(scale)))
         if ranges is None:
-            x = response = g(
-                "Relu", g("Conv", x, g.constant(w * step), g.constant(b), strides=[stage.stride])
-            )
-            step = 1.0
-        else:
-            y = g(
-                "Conv",
-                x,
-                *graph_builder.int8_weights(g, w, b, step, zero_sum and not i),
-                strides=[stage.stride],
-            )
-            step = ranges.responses[i] / 255
-            response = graph_builder.quantized(g, y, step)
-            if (
-                i < len(channels) - 1
-            ):  # after the last stage nothing would use it, and onnxruntime would still run it
-                x = graph_builder.counts_of(g, response, step)
-        counts = stage.known_steps(format.window, prefixes)
-        over_time = g("Transpose", response, perm=[0, 2, 1])
-        sums.append(
-            graph_builder.sums(g, over_time, stage.steps, counts, ranges is not None, rowwise)
-        )
-        factors.append(graph_builder.mean_factors(g, step, counts, size, rowwise))
-    total = graph_builder.side_by_side(g, sums)
-    total = g("Cast", total, to=FLOAT) if ranges else total
-    log = g(
-        "Log", g("Add", g("Mul", total, graph_builder.side_by_side(g, factors)), g.constant(FLOOR))
-    )
-    return g("Reshape", log, g.constant([1, PREFIXES, sum(channels)], "int64")) if rowwise else log
+            return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
+        step = ranges.counts * scale / (MIDDLE - 1)
+        return self._rounded(graph_builder.quantized(g, x, step, MIDDLE), step, MIDDLE)
 
+    def _rounded(self, rounded: str, step: float, zero: int) -> Prepared:
+        x = graph_builder.channels_first(self.g, rounded, step, zero)
+        return Prepared(x, step, rounded, zero)
 
-def _prepared(
-    g: GraphBuilder,
-    format: SweepFormat,
-    scale: float,
-    architecture: Architecture,
-    raw: str,
-    attenuation: str,
-    ranges: Ranges | None,
-    prefixes: bool,
-) -> Prepared:
-    """Raw counts [1, T, R * C] -> taxels in units of what is left to the first convolution's
-    weights.
+    def _attenuation(self) -> str:
+        g, window = self.g, self._format.window
+        step, ranked = NOISE_LIMIT.step(window), NOISE_LIMIT.rank(self._format.channels) + 1
+        older, newer = (g("Cast", self._every(step, start), to=FLOAT) for start in (0, 1))
+        noise = g("ReduceMean", g("Abs", g("Sub", newer, older)), axes=[1])
+        inputs = [noise, g.constant([ranked], "int64")]
+        g.nodes.append(helper.make_node("TopK", inputs, ["strongest", "who"], axis=2))
+        limit = g("Mul", g("ReduceMin", "strongest", axes=[2]), g.constant(NOISE_LIMIT.times))
+        largest = np.finfo(np.float32).max
+        limit = g("Where", g("Greater", limit, g.constant(0)), limit, g.constant(largest))
+        return g("Div", limit, g("Max", noise, limit))
 
-    Bytes stay bytes where the kernels sum to zero. From other counts the level is subtracted; where
-    that is the mean of the whole window, and tenths are wanted, each tenth has a level and a row of
-    its own: [PREFIXES, R * C, T].
-    """
-    zero_sum = architecture.zero_sum(format.window)
-    if format.dtype == "uint8" and zero_sum and ranges:
-        return _rounded(g, _attenuated_bytes(g, raw, attenuation, format, scale), scale, 0)
-    x = g("Cast", raw, to=FLOAT)
-    if format.dtype == "uint8" and zero_sum:
-        return Prepared(g("Transpose", g("Mul", x, attenuation), perm=[0, 2, 1]), scale)
-    rowwise = prefixes and not zero_sum
-    frames = [level_frames(format.window, architecture)]
-    counts = each_frame(format.window).known_steps(format.window, prefixes) if rowwise else frames
-    x = g("Sub", x, _levels(g, x, format, counts, rowwise))
-    x = g("Mul", x, g("Mul", attenuation, g.constant(scale)))
-    if ranges is None:
-        return Prepared(g("Transpose", x, perm=[0, 2, 1]), 1.0)
-    step = ranges.counts * scale / (MIDDLE - 1)
-    return _rounded(g, graph_builder.quantized(g, x, step, MIDDLE), step, MIDDLE)
+    def _every(self, step: int, start: int) -> str:
+        """Raw counts of every step-th frame from `start` on, but not of a last frame that has no
+        neighbour."""
+        ends = (self.g.constant([n], "int64") for n in (start, self._format.window - 1 + start, 1))
+        return self.g("Slice", self.raw, *ends, self.g.constant([step], "int64"))
 
+    def _attenuated_bytes(self) -> str:
+        """Attenuated raw counts [1, T, R * C] as bytes; exact where the factor is 1."""
+        g, format, scale = self.g, self._format, self._scale
+        factors = graph_builder.quantized(g, self.attenuation, 1 / 255)
+        shape = g.constant([1, format.window, format.channels], "int64")
+        factors = g("Expand", factors, shape)
+        counts = graph_builder.counts_of(g, self.raw, scale)
+        product = g("Mul", counts, graph_builder.counts_of(g, factors, 1 / 255))
+        return graph_builder.quantized(g, product, scale)
 
-def _rounded(g: GraphBuilder, rounded: str, step: float, zero: int) -> Prepared:
-    return Prepared(graph_builder.channels_first(g, rounded, step, zero), step, rounded, zero)
-
-
-def _attenuation(g: GraphBuilder, raw: str, format: SweepFormat) -> str:
-    """Raw counts [1, T, R * C] -> the factor of each taxel [1, 1, R * C]; see
-    architectures.NoiseLimit."""
-    step, ranked = NOISE_LIMIT.step(format.window), NOISE_LIMIT.rank(format.channels) + 1
-    older, newer = (
-        g(
-            "Cast",
-            g(
-                "Slice",
-                raw,
-                *(g.constant([n], "int64") for n in (at, format.window - 1 + at, 1, step)),
-            ),
-            to=FLOAT,
-        )
-        for at in (0, 1)
-    )
-    noise = g("ReduceMean", g("Abs", g("Sub", newer, older)), axes=[1])
-    g.nodes.append(
-        helper.make_node(
-            "TopK", [noise, g.constant([ranked], "int64")], ["strongest", "who"], axis=2
-        )
-    )
-    limit = g("Mul", g("ReduceMin", "strongest", axes=[2]), g.constant(NOISE_LIMIT.times))
-    limit = g(
-        "Where", g("Greater", limit, g.constant(0)), limit, g.constant(np.finfo(np.float32).max)
-    )
-    return g("Div", limit, g("Max", noise, limit))
-
-
-def _attenuated_bytes(
-    g: GraphBuilder, raw: str, attenuation: str, format: SweepFormat, scale: float
-) -> str:
-    """Bytes [1, T, R * C] times `attenuation` [1, 1, R * C], as bytes; exact where that is 1."""
-    quantized = graph_builder.quantized(g, attenuation, 1 / 255)
-    expanded = g("Expand", quantized, g.constant([1, format.window, format.channels], "int64"))
-    product = g(
-        "Mul", graph_builder.counts_of(g, raw, scale), graph_builder.counts_of(g, expanded, 1 / 255)
-    )
-    return graph_builder.quantized(g, product, scale)
-
-
-def _levels(
-    g: GraphBuilder, x: str, format: SweepFormat, counts: list[int], rowwise: bool = False
-) -> str:
-    """Raw counts [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C] or,
-    rowwise, with a row each."""
-    taxels = format.channels
-    sums = graph_builder.sums(g, x, format.window, counts, rowwise=rowwise)
-    return g("Mul", sums, graph_builder.mean_factors(g, 1.0, counts, taxels, rowwise))
+    def _levels(self, x: str, counts: list[int], rowwise: bool = False) -> str:
+        """Raw counts [1, T, R * C] -> means over the first `counts` frames, [1, len(counts), R * C]
+        or, rowwise, with a row each."""
+        sums = graph_builder.sums(self.g, x, self._format.window, counts, rowwise=rowwise)
+        size = self._format.channels
+        return self.g("Mul", sums, graph_builder.mean_factors(self.g, 1.0, counts, size, rowwise))
 
 
 def bank_responses(
     format: SweepFormat, scale: float, architecture: Architecture, filters: bank.Bank
 ) -> Iterator[tuple[Array, onnx.ModelProto]]:
-    """For each of bank.groups the numbers of its filters and the float model that gives their
-    responses, float32 [1, steps, filters]."""
+    """For each of bank.groups the numbers of its filters and the float model of their responses,
+    float32 [1, steps, filters]."""
     for numbers, _ in bank.groups(filters):
-        g = GraphBuilder()
-        raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
-        taxels = _prepared(
-            g, format, scale, architecture, raw, _attenuation(g, raw, format), None, False
-        )
+        nodes = _TrunkNodes(format, scale, architecture)
+        g, taxels = nodes.g, nodes.prepared(None)
         y, (stage,) = bank.responses(g, format, filters.take(numbers), taxels.x, taxels.step, False)
         g("Identity", y, output="responses")
         yield numbers, g.model(format, "responses", stage.steps, len(numbers))

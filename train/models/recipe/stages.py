@@ -1,10 +1,8 @@
-"""Training of the compact network. In: a Dataset and a seed. Out: a Fit, which holds the network
-and the sweeps it saw.
+"""Training of the compact network, and a fit of it alone.
 
 The convolutions are trained by gradient descent on augmented sweeps. Then shrinkage LDA in closed
-form replaces the head, once for the network and once for its int8 trunk. Groups that were held out
-decide how many stages the heads see, and give one temperature that makes probabilities honest. No
-random state outside is read or changed.
+form replaces the head, once for the network and once for its int8 trunk. Held-out groups decide how
+many stages the heads see, and the temperature. No random state outside is read or changed.
 """
 
 from __future__ import annotations
@@ -54,10 +52,10 @@ and the int8 trunk."""
 
 @dataclass(frozen=True)
 class FitRecipe(training.TrainingRecipe):
-    """How the compact network is trained.
+    """The training of the compact network.
 
     augmentation: of the training sweeps, None for `default_augmentation`; it replaces gain and
-    noise. keep_means: see Compact; the convolutions never see the means, the closed-form head does.
+    noise. keep_means: see Compact; the closed-form head sees the means, the convolutions never do.
     """
 
     steps: int = 600
@@ -67,7 +65,7 @@ class FitRecipe(training.TrainingRecipe):
     keep_means: bool = False
 
     def json(self) -> dict[str, Any]:
-        """What a fit and its bundle's manifest record."""
+        """The entry `recipe` of a fit and of the manifest of its bundle."""
         fields = asdict(self)
         return fields | {"scene": fields.pop("augmentation")}
 
@@ -80,8 +78,8 @@ def fit_network(
     architecture: Architecture = DEFAULT,
     unfinished: Path | None = None,
 ) -> Fit:
-    """Train on `sweeps`, less those that `hold_out` takes. Raises FormatError as it does, and for
-    windows too short."""
+    """A finished fit of a network alone, trained on the sweeps that `hold_out` leaves. Raises
+    FormatError as `hold_out`, and if the window is too short."""
     sides = hold_out(sweeps, seed)
     return finished(fit_network_on(*sides, seed, recipe, log, architecture, unfinished))
 
@@ -96,8 +94,8 @@ def fit_network_on(
     architecture: Architecture = DEFAULT,
     unfinished: Path | None = None,
 ) -> Fit:
-    """Train on `train`; `held` gives temperature and validation. by: the group that separates the
-    two, for the record. unfinished: see training.learn."""
+    """A network trained on `train`; `held` gives temperature and validation. by: the group that
+    separates the two, for the record. unfinished: see training.learn."""
     format, bands = train.format, spectrum.count(train.format)
     if not (architecture.channels or bands):
         raise FormatError(
@@ -106,36 +104,19 @@ def fit_network_on(
     augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(format.window))
     recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
-        torch.manual_seed(seed)
-        model, cost = (
-            Compact(format, len(train.materials), scale, architecture=architecture),
-            Cost(),
-        )
-        if architecture.channels:
-            with torch.enable_grad():
-                change = augmenter(format, augmentation)
-                model, cost = learn(
-                    model, train, recipe, seed, log, augment=change, unfinished=unfinished
-                )
-        else:
-            model = model.fused()
-        model.keep_means, model.architecture = (
-            recipe.keep_means,
-            replace(architecture, spectrum=bands > 0),
-        )
+        model, cost = _learned(train, scale, seed, recipe, log, architecture, unfinished)
+        model.keep_means = recipe.keep_means
+        model.architecture = replace(architecture, spectrum=bands > 0)
         ranges = model.ranges(train.samples)
         inputs = _head_inputs(model, ranges, train, held, copies(train, augmentation, seed, COPIES))
-        model, weights = _select_depth(
-            model, inputs, np.tile(train.labels, COPIES + 1), held.labels
-        )
+        labels = np.tile(train.labels, COPIES + 1)
+        model, weights = _select_depth(model, inputs, labels, held.labels)
         logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
-    right = int(np.sum(logits.argmax(1) == held.labels))
-    kept = recipe.json() | {"mains_hz": architecture.mains_hz}
     about = {
         "seed": seed,
-        "recipe": kept,
+        "recipe": recipe.json() | {"mains_hz": architecture.mains_hz},
         "held_out_by": by,
-        "validation": accuracy_figure(right, len(held)),
+        "validation": accuracy_figure(int(np.sum(logits.argmax(1) == held.labels)), len(held)),
     }
     ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
     plan = HeadPlan((HeadPart(tuple(range(weights["head.weight"].shape[1])), copies=True),))
@@ -153,22 +134,37 @@ def train_stages(
 ) -> tuple[dict[str, Array], graph.Ranges]:
     """Stages trained on all of `sweeps`, whose counts are multiplied by `scale`: their weights as
     graph.trunk_graph takes them, and ranges for int8. unfinished: see training.learn."""
-    assert recipe.augmentation
     with one_thread(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        change = augmenter(sweeps.format, recipe.augmentation)
-        model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
-        model, _ = learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
-        weights = {
-            name: values for name, values in model.weights().items() if name.startswith("convs.")
-        }
+        model, _ = _learned(sweeps, scale, seed, recipe, log, architecture, unfinished)
+        weights = {k: v for k, v in model.weights().items() if k.startswith("convs.")}
         return weights, model.ranges(sweeps.samples)
+
+
+def _learned(
+    sweeps: Dataset,
+    scale: float,
+    seed: int,
+    recipe: FitRecipe,
+    log: Log,
+    architecture: Architecture,
+    unfinished: Path | None,
+) -> tuple[Compact, Cost]:
+    """A fused network trained on `sweeps`, and the cost of each step. Without stages there is
+    nothing to train."""
+    assert recipe.augmentation
+    torch.manual_seed(seed)
+    model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
+    if not architecture.channels:
+        return model.fused(), []
+    change = augmenter(sweeps.format, recipe.augmentation)
+    with torch.enable_grad():
+        return learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
 
 
 def _head_inputs(
     model: Compact, ranges: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]
 ) -> HeadInputs:
-    """What the heads see of the training sweeps with their copies, and of those held out: (float,
+    """The features of the training sweeps with their copies, and of the held-out sweeps: (float,
     int8)."""
     trunk = graph.trunk_graph(
         model.format,
@@ -192,12 +188,11 @@ def _head_inputs(
 def _select_depth(
     model: Compact, inputs: HeadInputs, labels: Array, held_labels: Array
 ) -> tuple[Compact, dict[str, Array]]:
-    """The network that the heads see, cut, and all weights of a Fit.
+    """The network, cut to the features that its heads see, and all weights of a Fit.
 
-    The heads see the first stages, with the spectrum or without: the choice with the least cross
-    entropy on the held-out sweeps, and among equal ones the smallest. The rest is cut off. Later
-    stages fit the training sweeps too closely, and a head that was fitted to these trusts them too
-    much.
+    The heads see the first stages, with the spectrum or without: the choice with the lowest cross
+    entropy on the held-out sweeps, and among equal ones the smallest. The rest is cut off, because
+    later stages overfit, and a head that was fitted to the same sweeps relies on them too much.
     """
     convolved, total = sum(model.architecture.channels), inputs[1][0].shape[1]
     bands = model.architecture.spectrum * spectrum.count(model.format)
@@ -221,7 +216,8 @@ def _select_depth(
         )
     _, depth, with_bands, heads = min(candidates, key=lambda candidate: candidate[0])
     model = model.cut(depth, with_bands)
-    head_weights = {  # what all materials have in common changes no probability, and costs float32 precision
+    # a term that all materials share changes no probability, and costs float32 precision
+    head_weights = {
         f"{name}.{k}": v - v.mean(axis=0)
         for name, head in zip(("head", "int8"), heads, strict=True)
         for k, v in zip(("weight", "bias"), head, strict=True)
@@ -232,8 +228,8 @@ def _select_depth(
 
 
 def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
-    """`augment` for sweeps of `form`, as the training loop calls it: in PyTorch, seeded by its
-    generator."""
+    """`augment` for sweeps of `format` as the training loop calls it: in PyTorch, with the seed from
+    its generator."""
     rows = format.rows if format.cols > 1 else 1
 
     def change(x: Tensor, rng: Generator) -> Tensor:
@@ -245,7 +241,7 @@ def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
 
 @torch.no_grad()
 def features(model: Network, sweeps: Dataset) -> Array:
-    """What the head sees of each sweep, float32 [N, F]."""
+    """The features of each sweep that the head sees, float32 [N, F]."""
     return np.concatenate(
         [model.head_input(x).numpy() for x in float_batches(sweeps.samples, batches(len(sweeps)))]
     )
