@@ -93,12 +93,20 @@ def write(path: Path) -> None:
 
 
 def _plain(page: str) -> str:
-    """A page without pictures and links; headings below its title one level down."""
+    """A page without pictures, with links as text; headings below its title one level down."""
     text = re.sub(r"(?s)<!-- as text:\n\n(.*?)\n*-->", r"\1", page)
     text = re.sub(r"(?s)<!--.*?-->\n?", "", text)
     text = re.sub(r"(?m)^!\[[^\]]*\]\([^)]*\)\n\n?", "", text)
-    text = re.sub(r"\[([^\]]+)\]\([^)]+\)", r"\1", text)
+    text = re.sub(r"\[([^\]]+)\]\(([^)#]+)[^)]*\)", _reference, text)
     return re.sub(r"(?m)^(#{2,}) ", r"#\1 ", text)
+
+
+def _reference(link: re.Match[str]) -> str:
+    """A link as text: its words, and the section if the target is a part of the manual."""
+    for number, name in enumerate(BOX_PAGES, 1):
+        if Path(name).name == Path(link[2]).name:
+            return f"{link[1]} (section {number})"
+    return link[1]
 
 
 def settings_tables() -> str:
