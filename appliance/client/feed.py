@@ -49,7 +49,8 @@ def _line(text: bytes) -> dict[str, Any]:
         ) from e
     if line["type"] == "hello" and line.get("schema") != FEED_SCHEMA:
         raise FormatError(
-            f"the box speaks schema {line.get('schema')!r} of the feed, this reader {FEED_SCHEMA}; update one of them"
+            f"the box speaks schema {line.get('schema')!r} of the feed, this reader "
+            f"{FEED_SCHEMA}; update one of them"
         )
     return dict(line)
 

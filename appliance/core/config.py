@@ -332,7 +332,8 @@ def _board_file(folder: Path, board: Any, where: str) -> Path:
     if not (isinstance(board, str) and board in known):
         there = ", ".join(known) or "none"
         raise ConfigError(
-            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: {there}"
+            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: "
+            f"{there}"
         )
     return known[board]
 
@@ -361,7 +362,8 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
-                f"{where}: {section} = {shown(content)} is not a section; write [{section}], its keys below"
+                f"{where}: {section} = {shown(content)} is not a section; write [{section}], its "
+                "keys below"
             )
         named = {f"{section}.{last}": value for last, value in content.items()}
         yield from read_table(
@@ -389,6 +391,7 @@ def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
             if line in taken:
                 first = f"{taken[line]} ({sources[taken[line]]})"
                 raise ConfigError(
-                    f'{sources[name]}: {name} = {line!r} is the line of {first} already; give each its own line, or ""'
+                    f"{sources[name]}: {name} = {line!r} is the line of {first} already; give "
+                    'each its own line, or ""'
                 )
             taken[line] = name

@@ -57,7 +57,8 @@ class SweepSet:
         x = self.samples
         if x.ndim not in (4, 5) or 0 in x.shape or x.shape[4:] == (1,):
             raise self._error(
-                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], none empty, "
+                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], "
+                "none empty, "
                 "and axes after them only where there are several"
             )
         if x.dtype.name not in DATA_TYPES:
@@ -83,7 +84,8 @@ class SweepSet:
         level, wanted = self.unloaded, (len(x), 2, *x.shape[2:])
         if level is not None and (level.shape != wanted or level.dtype.kind != "f"):
             raise self._error(
-                f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: mean and standard deviation "
+                f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: "
+                "mean and standard deviation "
                 "of the unloaded skin for each sweep, or leave it out"
             )
 
@@ -93,7 +95,8 @@ class SweepSet:
         if len(outside):
             i = outside[0]
             raise self._error(
-                f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, from 0 on"
+                f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, "
+                "from 0 on"
             )
         if len(set(self.materials)) < n:
             raise self._error(
@@ -141,7 +144,8 @@ def _typed(z: Any, name: str) -> Array:
         if "allow_pickle" not in str(e):
             raise
         raise ValueError(
-            f"{name} holds objects, which are not read; save np.array({name}, dtype=str), or numbers"
+            f"{name} holds objects, which are not read; save np.array({name}, dtype=str), or "
+            "numbers"
         ) from e
 
 
@@ -160,7 +164,8 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
     missing = {"samples", "labels", "materials", "rate_hz"} - set(arrays)
     if missing:
         raise FormatError(
-            f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, materials, rate_hz"
+            f"{source}: lacks {', '.join(sorted(missing))}; a sweep set holds samples, labels, "
+            "materials, rate_hz"
         )
     if arrays["materials"].ndim != 1 or arrays["materials"].dtype.kind != "U":
         raise FormatError(
@@ -194,7 +199,8 @@ def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     number = {name: i for i, name in enumerate(materials.tolist())}
     if unknown := sorted(set(given.ravel().tolist()) - number.keys()):
         raise FormatError(
-            f"{source}: label {unknown[0]!r} is not among the materials {materials.tolist()}; add it there"
+            f"{source}: label {unknown[0]!r} is not among the materials {materials.tolist()}; add "
+            "it there"
         )
     return arrays | {
         "materials": materials,

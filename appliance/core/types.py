@@ -320,7 +320,8 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
         status = Status(content.pop("status"))
         if type(schema) is not int or not 1 <= schema <= SCHEMA:
             raise FormatError(
-                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update one of them"
+                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update "
+                "one of them"
             )
         if table.dtype != _record_dtype(format) or table.ndim != 1:
             raise FormatError(

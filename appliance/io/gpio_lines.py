@@ -40,8 +40,10 @@ def check_binding(gpio: Any) -> None:
     """Raise LineError unless `gpio` is the libgpiod v2 binding or a double of it."""
     if not (hasattr(gpio, "request_lines") and hasattr(gpio, "LineSettings")):
         raise LineError(
-            f"module gpiod {getattr(gpio, '__version__', 'of unknown version')} is not the libgpiod v2 binding; "
-            "pip install 'gpiod>=2' (Debian's python3-libgpiod 1.6 shadows it: remove it or use a virtual environment)"
+            f"module gpiod {getattr(gpio, '__version__', 'of unknown version')} is not the "
+            "libgpiod v2 binding; "
+            "pip install 'gpiod>=2' (Debian's python3-libgpiod 1.6 shadows it: remove it or use a "
+            "virtual environment)"
         )
 
 
@@ -70,7 +72,8 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
                     raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
                 near = closest(name, places, 3) or sorted(places)[:3]
                 raise LineError(
-                    f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists them all"
+                    f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists "
+                    "them all"
                 )
             case several:
                 where = " and ".join(f"{path} line {offset}" for path, offset in several)
@@ -106,7 +109,8 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
             ) from e
     if not chips and not denied:
         raise LineError(
-            "this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one on USB; "
+            "this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one "
+            "on USB; "
             "without lines leave `board` out and set trigger.mode to serial, key or timed"
         )
     return places, denied
@@ -197,7 +201,8 @@ class Lines:
             return
         if not 0 <= code < self.capacity:
             raise LineError(
-                f"code {code} does not fit {len(self._bits)} class bits; wire more lines in output.class_bits"
+                f"code {code} does not fit {len(self._bits)} class bits; wire more lines in "
+                "output.class_bits"
             )
         self._write({name: bool(code >> i & 1) for i, name in enumerate(self._bits)})
         self._clock.sleep_until(self._clock.now_ns() + self._settle_ns)

@@ -142,7 +142,8 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
     payload = taxels.astype(_DTYPES[code], copy=False).tobytes()
     if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
         raise FormatError(
-            f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype} do not fit a packet of {MAX_PAYLOAD} bytes; send fewer"
+            f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype} do not fit a packet of "
+            f"{MAX_PAYLOAD} bytes; send fewer"
         )
     head = HEADER.pack(
         MAGIC,
@@ -271,7 +272,8 @@ def unpack_identity(payload: bytes) -> Identity:
     longer one."""
     if len(payload) < _IDENTITY.size:
         raise FormatError(
-            f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check the firmware"
+            f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check "
+            "the firmware"
         )
     protocol, major, minor, patch, board, serial = _IDENTITY.unpack_from(payload)
     return Identity(protocol, (major, minor, patch), _text(board), _text(serial))
@@ -296,7 +298,8 @@ def unpack_format(payload: bytes) -> SkinFormat:
     axes is unknown."""
     if len(payload) < _FORMAT.size:
         raise FormatError(
-            f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the firmware"
+            f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the "
+            "firmware"
         )
     rows, cols, code, axes, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
     if code >= len(DATA_TYPES):
@@ -305,7 +308,8 @@ def unpack_format(payload: bytes) -> SkinFormat:
         )
     if axes > MOST_AXES:
         raise FormatError(
-            f"{axes} axes of each taxel are more than the {MOST_AXES} that there can be; check the firmware"
+            f"{axes} axes of each taxel are more than the {MOST_AXES} that there can be; check "
+            "the firmware"
         )
     return SkinFormat(
         rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1

@@ -1,7 +1,8 @@
-"""A readout board on a serial port: finds and opens the port, sends bytes, reads what has come.
+"""Finds and opens the serial port of a skin, sends bytes and reads. Errors become a SensorError
+that explains the failure.
 
-In: the path of a port or its USB ids. Out: bytes, or a SensorError that explains what failed. With
-`request` it carries PROTOCOL.md, part 1; skins of other protocols use `write` and `read` alone.
+A readout board that speaks PROTOCOL.md, part 1, is used through `request`, all other skins through
+`write` and `read`.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from appliance.io.link import REPLY_MS, TTY_BYTES, reply_to
 from appliance.io.serial_port import PortInfo
 
 BAUD = 115200
-"""Where nothing else is set; a port that is USB down to the microcontroller has no speed and
-ignores it."""
+"""Default baud rate. A microcontroller with its own USB ignores the rate."""
 COLLECT_NS = 8_000_000
-"""Least time between two reads, as between two packets of a readout board at 750 Hz: a port at 2
-Mbaud is ready some thousand times a second, and every turn of the loop costs more than the bytes of
-one. Times of frames do not suffer, since the fit takes the promptest arrivals. Half of it after a
-read of half of what a port holds, and no pause after a full one."""
+"""Least time between two reads, which is the time between two packets of a readout board at 750 Hz.
+A port at 2 Mbaud is ready some thousand times a second, and a turn of the loop costs more than the
+few bytes that it would read. Times of frames do not suffer, since the fit uses the promptest
+arrivals. The pause is half as long after a read of half of the port's buffer, and left out after a
+full buffer."""
 
 
 class SerialLink:
@@ -46,7 +47,7 @@ class SerialLink:
         wait: Callable[[int, float], bool] = wait_readable,
     ) -> None:
         self.path, self._clock, self._wait = path, clock, wait
-        self._next_ns = 0  # the next read
+        self._next_ns = 0  # time of the next read
         try:
             self._port = serial_port.open_alone(path, baud, opener)
         except (OSError, ValueError) as e:  # SerialException is an OSError
@@ -59,7 +60,7 @@ class SerialLink:
         return reply_to(request, self.read, self._clock) if length else b""
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises SensorLost if the port is gone or takes nothing for
+        """Send all of `data`. Raises SensorLost if the port is gone or accepts nothing for
         REPLY_MS."""
         while data:
             try:
@@ -85,20 +86,21 @@ class SerialLink:
             raise _lost(self.path, e) from e
         if not data:
             raise _lost(self.path, OSError(errno.ENODEV, "end of file"))
-        parts = 2 - 2 * len(data) // TTY_BYTES  # 2, 1 from half on, 0 of a full one
+        # 2; from half of the buffer on 1; 0 for a full buffer
+        parts = 2 - 2 * len(data) // TTY_BYTES
         self._next_ns = self._clock.now_ns() + max(0, parts) * COLLECT_NS // 2
         return data
 
     def close(self) -> None:
-        """Release the port. A board of PROTOCOL.md is asked to stop first."""
+        """Release the port."""
         serial_port.close(self._port)
 
 
 class BoardLink(SerialLink):
-    """A serial port with a board that speaks PROTOCOL.md."""
+    """The serial port of a readout board that speaks PROTOCOL.md."""
 
     def close(self) -> None:
-        """Ask the board to stop, unless it is gone, and release the port."""
+        """Ask the readout board to stop, unless it is gone, and release the port."""
         with contextlib.suppress(SensorError):
             self.request(packets.Request.STOP, 0)
         super().close()
@@ -114,9 +116,9 @@ def open_board(
 
 def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:
     """The path of the first port with one of the USB `ids` (vendor, product) and this serial
-    number, "" for any.
+    number; "" fits any.
 
-    Raises SensorAbsent naming the ports that there are.
+    Raises SensorAbsent with a list of the existing ports.
     """
     ids, ports = list(ids), list(ports)
     for port in ports:
@@ -127,14 +129,15 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
     number = f" and serial number {serial_number}" if serial_number else ""
     there = ", ".join(map(str, ports)) or "none"
     raise SensorAbsent(
-        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port with --port (sensor.port)"
+        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port "
+        "with --port (sensor.port)"
     )
 
 
 def _be_prompt(port: Any) -> None:
-    """Let a USB adapter pass on what it has without collecting it for 16 ms, and leave DTR up when
-    the port is closed: many boards restart when it rises, and would never be ready for a program
-    that tries again."""
+    """Make a USB adapter pass bytes on without collecting them for 16 ms, and leave DTR up when the
+    port is closed. Many readout boards restart when DTR rises, so they would never be ready for a
+    program that opens the port again and again."""
     with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
         port.set_low_latency_mode(True)
     with contextlib.suppress(termios.error, OSError):
@@ -144,11 +147,12 @@ def _be_prompt(port: Any) -> None:
 
 
 def _refused(path: str, e: Exception) -> SensorError:
-    """Why a port could not be opened."""
+    """The SensorError for a port that could not be opened."""
     code = getattr(e, "errno", None)
     if serial_port.is_held(e):
         return SensorBusy(
-            f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows which"
+            f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows "
+            "which"
         )
     if code == errno.EACCES:
         return SensorDenied(
@@ -166,6 +170,7 @@ def _refused(path: str, e: Exception) -> SensorError:
 def _lost(path: str, e: OSError) -> SensorLost:
     if e.errno in (errno.ENODEV, errno.EIO, errno.ENXIO):
         return SensorLost(
-            f"the skin on {path} was unplugged (errno {e.errno}); plug it in again, it is taken up by itself"
+            f"the skin on {path} was unplugged (errno {e.errno}); plug it in again, it is taken "
+            "up by itself"
         )
     return SensorLost(f"{path} failed: {e}; trying again, check its cable if this stays")

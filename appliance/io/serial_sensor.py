@@ -1,8 +1,7 @@
-"""A skin on a serial port that does not speak PROTOCOL.md, as its profile describes it. In: a port,
-a clock. Out: Frames.
+"""A skin on a serial port that does not speak PROTOCOL.md: the bytes of the port become Frames as
+the skin's profile describes.
 
-It only listens, but for the commands of the profile: a skin that is not the expected one is told
-nothing else.
+Only the commands of the profile are sent, and nothing else, since the skin may be another device.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from appliance.io.usb_sensor import LinkSensor, TransferObserver
 
 
 class BytePort(Protocol):
-    """An opened port, as `SerialLink`."""
+    """An opened port, as SerialLink is."""
 
     def write(self, data: bytes) -> None:
         """Send all of `data`. Raises SensorError."""
@@ -36,26 +35,24 @@ class BytePort(Protocol):
         """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorError."""
         ...
 
-    def close(self) -> None:
-        """Release the port."""
-        ...
+    def close(self) -> None: ...
 
 
 class ProfileLink:
-    """A port whose skin is asked to stop before it is released, if its profile says how."""
+    """A port whose skin gets the stop commands of its profile before the port is released."""
 
     def __init__(self, port: BytePort, stop: Iterable[bytes]) -> None:
         self._port, self._stop = port, list(stop)
         self.read = port.read
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """These skins know no requests."""
+        """Raises SensorMismatch: these skins do not answer requests."""
         raise SensorMismatch(
             f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}"
         )
 
     def close(self) -> None:
-        """Send the commands for stopping, unless the skin is gone, and release the port."""
+        """Send the stop commands, unless the skin is gone, and release the port."""
         with contextlib.suppress(SensorError):
             for command in self._stop:
                 self._port.write(command)
@@ -63,9 +60,9 @@ class ProfileLink:
 
 
 class SerialSensor(LinkSensor):
-    """A skin on a serial port, read as its profile says.
+    """A skin on a serial port, read as its profile describes.
 
-    open_port: makes a port from path and baud rate. ports: the serial ports that there are.
+    open_port: opens a port, given path and baud rate. ports: lists the serial ports of the machine.
     """
 
     announced = False
@@ -99,7 +96,7 @@ class SerialSensor(LinkSensor):
         self._check_format()
         there = self._ports()
         path = self._config.port or find(self._profile.ids, self._config.serial, there)
-        node = os.path.realpath(path)  # a name by id is a link
+        node = os.path.realpath(path)  # a path in /dev/serial/by-id is a link
         info = next((port for port in there if port.path in (path, node)), PortInfo(path))
         port = self._open_port(path, self._profile.baud)
         try:
@@ -116,7 +113,7 @@ class SerialSensor(LinkSensor):
         return link, packets.Identity(0, (0, 0, 0), self._config.skin, info.serial)
 
     def _check_format(self) -> None:
-        """Raises SensorMismatch where the bundle's format is not what the skin can send."""
+        """Raises SensorMismatch if the skin cannot send the bundle's format."""
         sent, wanted = self._profile.format, self._format
         able = (
             wanted.rate_hz in self._profile.rates_hz
@@ -125,8 +122,10 @@ class SerialSensor(LinkSensor):
         if sent.skin != wanted.skin or not able:
             rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
             raise SensorMismatch(
-                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at {rates} Hz, wanted is "
-                f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a bundle for this skin"
+                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at "
+                f"{rates} Hz, wanted is "
+                f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a "
+                "bundle for this skin"
             )
 
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
@@ -135,6 +134,7 @@ class SerialSensor(LinkSensor):
         return SensorMismatch(
             f"the skin sent bytes for {self._config.silence_ms} ms, "
             f"but no frame of profile {self._config.skin} "
-            f"({shown(self._profile.format.shape)} {self._profile.number}); correct sensor.skin, sensor.grid or "
+            f"({shown(self._profile.format.shape)} {self._profile.number}); correct sensor.skin, "
+            "sensor.grid or "
             "sensor.baud; `palpate skin detect` listens for what fits"
         )

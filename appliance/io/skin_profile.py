@@ -224,7 +224,8 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
         near = closest(name, there)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(there) or 'none'}"
         raise ConfigError(
-            f"sensor.skin = {shown(name)} has no profile in {' or '.join(map(str, folders))}; {hint}"
+            f"sensor.skin = {shown(name)} has no profile in {' or '.join(map(str, folders))}; "
+            f"{hint}"
         )
     path = there[name]
     try:
@@ -286,7 +287,8 @@ def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
         raise ConfigError(
-            f"sensor.{key} is for skins that do not say it; this one speaks PROTOCOL.md, so remove it"
+            f"sensor.{key} is for skins that do not say it; this one speaks PROTOCOL.md, so "
+            "remove it"
         )
     grid = _GRID.fullmatch(config.grid)
     if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
@@ -300,7 +302,8 @@ def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
         if profile.rates_hz and config.rate_hz not in profile.rates_hz:
             allowed = ", ".join(f"{rate:g}" for rate in profile.rates_hz)
             raise ConfigError(
-                f"sensor.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of {allowed}"
+                f"sensor.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of "
+                f"{allowed}"
             )
         changes["rate_hz"] = config.rate_hz
     if config.baud:
@@ -319,6 +322,7 @@ def warning(format: SweepFormat) -> str:
         return ""
     finest = ceil(20 * SLIDE_MM_S / format.rate_hz) / 10
     return (
-        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s textures finer than {finest:g} mm "
+        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s "
+        f"textures finer than {finest:g} mm "
         "cannot be told apart; slide slower, or tell materials apart by stiffness and shape"
     )

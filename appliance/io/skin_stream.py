@@ -1,8 +1,9 @@
-"""From the bytes of a skin to Frames, whatever its profile. In: what was read, and when. Out:
-Frames with numbers and host times, and counts of what was lost; no I/O.
+"""Converts the bytes of a skin of any profile to Frames with numbers and host times, and counts
+lost frames. It does no I/O.
 
-Skins with a clock and a count go the way of PROTOCOL.md (`usb_sensor.Stream`). For all others,
-frames are counted as they come, and their times are fitted to their arrivals.
+A skin with a clock and a frame count is handled as PROTOCOL.md defines (`usb_sensor.Stream`). For
+all others, frames are numbered in the order of arrival, and their times are fitted to their
+arrivals.
 """
 
 from __future__ import annotations
@@ -25,30 +26,29 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import FrameStream, SensorCounters, Stream
 
 RATE_WANDER = 0.05
-"""Largest relative difference between the measured rate and the expected one. Oscillators of
-microcontrollers differ by 1 %, their loops by some more; from 5 % on, textures would be taken for
-others that are as much finer or coarser."""
+"""Largest relative difference between the measured rate and the expected rate. Oscillators of
+microcontrollers differ by 1 %, their loops by a little more. From 5 % on, a texture would be taken
+for another that is finer or coarser by as much."""
 _FIT = {"settle_s": 0.5, "span_s": 2.5, "step_s": 0.1, "max_ppm": 1.2e6 * RATE_WANDER}
-"""Of the fit of arrivals (DeviceClock). A short past: a loop that becomes slower by 2 % is 20 ms
-late before it is followed."""
+"""Parameters of the fit of arrivals (DeviceClock). It looks back only a short time, so that a loop
+that slows down by 2 % is followed once it is 20 ms late."""
 SUSPECT_NS, SUSPECT_FRAMES = 60_000_000, 3
-"""Frames that come later than this are held back until it is known whether others are missing
-before them."""
+"""Frames later than this are held back until it is known whether frames before them are missing."""
 _STEP_NS, _STEP_FRAMES = 250_000_000, 8
-"""Arrivals are judged by steps of this length."""
+"""Length of the steps in which arrivals are judged."""
 _STEPS = 8
 _SLACK_NS = 5_000_000
-"""Delays of USB and of the host that say nothing about the skin."""
+"""Delays up to this come from USB and from the host, not from the skin."""
 _SAME_NS = 2_000_000
-"""Lateness that differs by less from one step to the next does not grow."""
+"""Lateness counts as constant if it differs by less than this from one step to the next."""
 _STEADY = 0.25
-"""Largest difference between the paces of steps that are compared."""
+"""Largest relative difference between the paces of steps that are compared."""
 _PARTLY = 0.75
-"""Garbage of a quarter of a frame, or of so much more than whole frames, was one frame more."""
+"""Garbage counts as one more lost frame if a quarter of a frame is left over."""
 
 
 def stream(profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> FrameStream:
-    """The stream of a profile that sends sweeps of `format`."""
+    """The stream for a profile and the format of its sweeps."""
     if profile.codec == "palpate":
         return Stream(format, counters)
     codec = skin_codecs.codec(profile)
@@ -58,8 +58,8 @@ def stream(profile: SkinProfile, format: SweepFormat, counters: SensorCounters) 
 
 
 def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacked:
-    """Frames with count and clock as packets of consecutive frames. Raises SensorMismatch for
-    another grid."""
+    """Group frames that have a count and a clock into packets of consecutive frames. Raises
+    SensorMismatch for another grid."""
     found = codec(Rest(), data)
     if found.wrong:
         raise SensorMismatch(_of_another(found.wrong))
@@ -79,12 +79,13 @@ def _of_another(why: str) -> str:
 
 
 class CountedStream:
-    """Frames of a skin without a clock: numbered as they come, timed by a fit of their arrivals.
+    """Frames of a skin without a clock, numbered in the order of arrival and timed by a fit of
+    their arrivals.
 
-    A frame is never taken for newer than it is: what piled up while nobody read keeps the times
-    that its numbers give. Where the driver has thrown bytes away, frames stay late for good. Then
-    they are held back, and once that is certain numbers begin a new epoch and the missing ones are
-    counted, as far as the time that they take tells.
+    A frame must not get a time later than its true time. Frames that piled up while the host did
+    not read keep the times that follow from their numbers. If the driver has thrown bytes away, all
+    later frames stay late. They are held back until that is certain. Then numbering begins a new
+    epoch, and the missing frames are counted as far as the lateness shows them.
     """
 
     def __init__(self, profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> None:
@@ -97,25 +98,24 @@ class CountedStream:
         self._begin()
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first."""
         self._counters.enumerations += 1
         self._counters.garbage_bytes += 0 if self._count else self._skipped
         self._begin()
 
     @property
     def loss_known(self) -> bool:
-        """Whether each lost frame is seen."""
+        """Whether every lost frame is seen."""
         return bool(self._wrap)
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the times are known: DeviceClock.quality."""
+        """Accuracy of the times: DeviceClock.quality."""
         return self._fit.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """The frames that a read has completed, which ended at `arrival_ns`.
+        """The frames that are completed by a read that ended at `arrival_ns`.
 
-        Raises SensorMismatch if they are of another grid or come at another rate.
+        Raises SensorMismatch if they have another grid or come at another rate.
         """
         begin = self._bytes - len(self._rest.data)
         self._bytes += len(data)
@@ -131,7 +131,7 @@ class CountedStream:
         return self._timed(numbers, found.taxels, arrived_ns, piled=len(data) >= TTY_BYTES)
 
     def _begin(self) -> None:
-        """Begin a new epoch with the next bytes."""
+        """Begin a new enumeration with the next bytes."""
         self._rest, self._bytes = Rest(), 0
         self._arrivals.clear()
         self._count = self._skipped = 0  # frames so far, garbage after the last
@@ -139,7 +139,7 @@ class CountedStream:
         self._anew()
 
     def _anew(self) -> None:
-        """Numbers and times begin anew."""
+        """Begin a new epoch: numbers and times start again."""
         self._epoch += 1
         self._next, self._last_ns = 0, 0
         self._fit = DeviceClock(**_FIT)
@@ -148,16 +148,16 @@ class CountedStream:
         self._fitted = False
 
     def _numbered(self, found: Decoded) -> NDArray[np.int64]:
-        """The number of each frame in this epoch. Counts frames, garbage, and what is missing
-        between them."""
+        """The number of each frame in this epoch. Counts frames, garbage and missing frames."""
         n, first = len(found), not self._count
-        before = self._skipped + (int(found.skipped[0]) if n else found.garbage)  # the next frame
+        # before the next frame
+        before = self._skipped + (int(found.skipped[0]) if n else found.garbage)
         if not n:
             self._skipped = before
             self._counters.garbage_bytes += 0 if first else found.garbage
             return np.empty(0, np.int64)
         self._skipped = found.garbage - int(found.skipped.sum())
-        # the rest of a frame that was under way when the port was opened is no garbage
+        # the rest of a frame that was being sent when the port was opened is not garbage
         uncounted = (
             min(before, round(found.size)) - (before - int(found.skipped[0])) if first else 0
         )
@@ -175,14 +175,14 @@ class CountedStream:
         return numbers
 
     def _gaps(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """How many sequence numbers are missing before each frame."""
+        """Number of missing sequence numbers before each frame."""
         before = int(counts[0]) - 1 if self._sent is None else self._sent
         self._sent = int(counts[-1])
         return (np.diff(counts, prepend=before) - 1) % self._wrap
 
     def _arrival(self, end: int) -> int:
-        """When the read came that holds the byte before `end`; a frame may be known for one only
-        with the next one."""
+        """Time of the read that contains the byte before `end`. A codec may recognize a frame only
+        when the next frame comes, so the read can be an earlier read."""
         while self._arrivals[0][0] < end:
             self._arrivals.popleft()
         return self._arrivals[0][1]
@@ -190,8 +190,8 @@ class CountedStream:
     def _timed(
         self, numbers: NDArray[np.int64], taxels: NDArray[Any], arrived_ns: int, *, piled: bool
     ) -> Frames:
-        """Frames with times, after those that were held back; none while they are held back
-        themselves."""
+        """Frames with times, together with the frames that were held back before them. Empty if
+        these frames are held back."""
         last = int(numbers[-1])
         late_ns = self._late(last, arrived_ns)
         suspect = late_ns > max(SUSPECT_NS, SUSPECT_FRAMES * self._format.period_ns)
@@ -209,8 +209,8 @@ class CountedStream:
         return Frames.joined([*held, frames]) if held else frames
 
     def _late(self, number: int, arrived_ns: int) -> int:
-        """How much later frame `number` came than it should have; the fit learns from it unless
-        that is far too much."""
+        """Lateness of frame `number` in nanoseconds. The fit learns from it unless it is far too
+        large."""
         device_ns = round(number * self._format.period_ns)
         if self._fitted:
             late_ns = arrived_ns - self._fit.to_host_ns(device_ns)
@@ -221,7 +221,7 @@ class CountedStream:
         return arrived_ns - self._fit.to_host_ns(device_ns)
 
     def _times(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Host times of frames [n]. A better fit may move them back; they never run backwards."""
+        """Host times of frames [n]. A better fit may move them back, but they never run backwards."""
         first, last = int(numbers[0]), int(numbers[-1])
         first_ns, last_ns = (
             self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last)
@@ -240,19 +240,20 @@ class CountedStream:
         if pace and abs(pace - 1) > RATE_WANDER:
             wanted = self._format.rate_hz
             raise SensorMismatch(
-                f"the skin sends {pace * wanted:.1f} frames a second, {wanted:g} are expected ({100 * (pace - 1):+.0f} %, "
-                f"at most {100 * RATE_WANDER:g}); set sensor.rate_hz for new recordings, or let it send {wanted:g}"
+                f"the skin sends {pace * wanted:.1f} frames a second, {wanted:g} are expected "
+                f"({100 * (pace - 1):+.0f} %, "
+                f"at most {100 * RATE_WANDER:g}); set sensor.rate_hz for new recordings, or let "
+                f"it send {wanted:g}"
             )
 
 
 class ArrivalWatch:
-    """Decides from arrivals whether frames are missing that nobody has counted, and how fast they
-    come.
+    """Decides from arrivals whether uncounted frames are missing, and measures the rate.
 
-    While a backlog is read, frames come faster than the skin takes them and are less and less late.
-    Where they come at an even pace and stay as late as they are, nothing is piled up any more, so
-    frames are missing. pace: frames a second as a share of what is expected, over some steps of an
-    even pace; 0 while that is not known.
+    While the host reads a backlog, frames come faster than the skin takes them, and their lateness
+    falls. If they come at an even pace and their lateness is constant, there is no backlog any
+    more, so frames are missing. pace: measured rate as a share of the expected rate, over several
+    steps of an even pace; 0 while unknown.
     """
 
     def __init__(self, period_ns: float) -> None:
@@ -269,10 +270,10 @@ class ArrivalWatch:
         self.pace = 0.0
 
     def missing(self, number: int, arrival_ns: int, late_ns: int, *, piled: bool) -> int:
-        """How many frames are missing, as far as is certain now; 0 if none. late_ns: lateness of
-        the frame `number`. piled: more was waiting when it was read."""
+        """Number of missing frames as far as it is certain, else 0. late_ns: lateness of frame
+        `number`. piled: more bytes were waiting when it was read."""
         self.pace = 0.0
-        # a host that reads once in a while finds frames that came at any time since it last did
+        # if the host reads rarely, a frame may have come at any time since the last read
         late_ns -= (
             max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns)) if self._begun else 0
         )
@@ -292,7 +293,7 @@ class ArrivalWatch:
         return self._judge()
 
     def _judge(self) -> int:
-        """Set the pace if it is known; the number of missing frames."""
+        """Set the pace if it is known; return the number of missing frames."""
         paces = [frames * self._period_ns / passed_ns for frames, passed_ns, _ in self._steps]
         even = max(paces, default=0) < (1 + _STEADY) * min(paces, default=0)
         if even and len(paces) == _STEPS:
@@ -305,7 +306,6 @@ class ArrivalWatch:
             min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns)
             and abs(now_ns - before_ns) < _SAME_NS
         )
-        # whatever it is: after some steps at the right pace, what is still late will not become
-        # prompt any more
+        # after several steps at the right pace, frames that are still late will stay late
         stuck = bool(self.pace) and abs(self.pace - 1) <= RATE_WANDER and now_ns > self._suspect_ns
         return max(1, round(now_ns / self._period_ns)) if stays or stuck else 0

@@ -59,7 +59,8 @@ def open_board(settings: Config, devices: Devices) -> SkinLink:
     chosen = profile(settings)
     if chosen.codec != "palpate":
         raise ConfigError(
-            f'sensor.skin = "{settings.sensor.skin}" sends what its maker defines (codec "{chosen.codec}"), not PROTOCOL.md; '
+            f'sensor.skin = "{settings.sensor.skin}" sends what its maker defines (codec '
+            f'"{chosen.codec}"), not PROTOCOL.md; '
             'take sensor.skin = "palpate" for a board that does'
         )
     return open_link(_config(settings, chosen), devices.backend, devices.clock)
@@ -100,7 +101,8 @@ def described(text: str) -> SweepFormat:
     found = _FORM.fullmatch(text.strip())
     if not found:
         raise ConfigError(
-            f"--format {text}: not understood; give rows x columns (x axes), data type and frames per second, "
+            f"--format {text}: not understood; give rows x columns (x axes), data type and frames "
+            "per second, "
             "for example 5x3:float32:100 or 4x4x3:int16:250"
         )
     rows, cols, axes, dtype, rate = found.groups()

@@ -1,8 +1,5 @@
-"""A readout board on USB: finds, opens and claims it, sends requests, reads bulk transfers
-(PROTOCOL.md, part 1).
-
-In: a pyusb backend. Out: bytes, or a SensorError that explains the errno.
-"""
+"""Finds, opens and claims a readout board on USB, sends requests and reads bulk transfers
+(PROTOCOL.md, part 1). Errors of libusb become a SensorError that explains the errno."""
 
 from __future__ import annotations
 
@@ -35,19 +32,20 @@ DTR, RTS = 1, 2
 
 
 class Context(libusb1._LibUSB):  # type: ignore[misc]
-    """A context of libusb that lives as long as a device it has found: libusb frees it otherwise,
-    and pyusb does not look.
+    """A libusb context that lives as long as the devices that it has found. libusb frees devices
+    with their context, and pyusb does not prevent that.
 
-    libusb strikes a board that fails with ENODEV off its context's list, and lists it again when it
-    is plugged in, but not when only its driver was taken away and given back. So `open_board` looks
-    through a new context after each failure, where pyusb alone keeps one for ever.
+    libusb removes a device from its context's list when it fails with ENODEV. It lists the device
+    again when it is plugged in, but not when only its driver was detached and attached. So
+    `open_board` searches through a new context after each failure. pyusb alone keeps one context
+    for ever.
     """
 
     newest: Context | None = None
 
     @classmethod
     def chosen(cls) -> Context | None:
-        """The newest context, made where there is none; None where libusb is not installed."""
+        """The newest context, made if there is none; None if libusb is not installed."""
         if cls.newest is None and (loaded := libusb1.get_backend()):
             cls.newest = cls(loaded.lib)
         return cls.newest
@@ -65,7 +63,7 @@ class Context(libusb1._LibUSB):  # type: ignore[misc]
 
 
 class VendorLink:
-    """An opened vendor-class board: control requests and one bulk IN endpoint."""
+    """An opened readout board of the vendor class: control requests and one bulk IN endpoint."""
 
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._device, self._number, self._clock = device, interface.bInterfaceNumber, clock
@@ -91,8 +89,8 @@ class VendorLink:
     def read(self, size: int, timeout_ms: int) -> bytes:
         """One bulk transfer of at most `size` bytes; b"" if none came within `timeout_ms`.
 
-        Raises SensorOverflow for a larger one, else SensorError. A stalled endpoint is cleared for
-        the next read.
+        Raises SensorOverflow for a larger transfer, else SensorError. A stalled endpoint is cleared
+        for the next read.
         """
         try:
             return bytes(self._device.read(self._in, size, timeout_ms))
@@ -105,15 +103,15 @@ class VendorLink:
             raise _explain(e) from e
 
     def close(self) -> None:
-        """Ask the board to stop, unless it is gone, and release it."""
+        """Ask the readout board to stop, unless it is gone, and release it."""
         with contextlib.suppress(SensorError):
             self.request(packets.Request.STOP, 0)
         _let_go(self._device)
 
 
 class AcmLink(VendorLink):
-    """An opened CDC-ACM board: requests are single bytes on bulk OUT, replies come as packets on
-    bulk IN."""
+    """An opened readout board of the class CDC-ACM: requests are single bytes on bulk OUT, replies
+    come as packets on bulk IN."""
 
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
@@ -129,11 +127,11 @@ class AcmLink(VendorLink):
         ]
 
     def _raise_dtr(self) -> None:
-        """Tell the board that somebody reads, as the kernel's driver does (SET_CONTROL_LINE_STATE,
-        USB PSTN 1.2, 6.3.12).
+        """Signal that the host reads, as the kernel's driver does (SET_CONTROL_LINE_STATE, USB PSTN
+        1.2, 6.3.12).
 
-        Without it TinyUSB, and with it MicroPython, overwrites what it has not yet sent. A board
-        need not know the request.
+        Without this signal TinyUSB, and so MicroPython, overwrites unsent data. A readout board may
+        refuse the request.
         """
         configuration = self._device.get_active_configuration()
         control = [i.bInterfaceNumber for i in configuration if i.bInterfaceClass == CDC_CONTROL]
@@ -150,8 +148,8 @@ class AcmLink(VendorLink):
 
 
 def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
-    """Find and claim the configured board. Raises SensorError if it is absent, held, refused or of
-    another kind."""
+    """Find and claim the configured readout board. Raises SensorError if it is absent, held,
+    refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
         bus = backend or Context.chosen()
@@ -166,7 +164,8 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
     if device is None:
         serial = f" with serial number {config.serial}" if config.serial else ""
         raise SensorAbsent(
-            f"no skin {ids}{serial} on USB ({len(found)} with other numbers); check cable, power and udev rule"
+            f"no skin {ids}{serial} on USB ({len(found)} with other numbers); check cable, power "
+            "and udev rule"
         )
     link, wanted = (AcmLink, 10) if config.link == "acm" else (VendorLink, 255)
     try:
@@ -182,7 +181,7 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
 
 
 def _let_go(device: usb.core.Device) -> None:
-    """Release a device; the next search has a context of its own."""
+    """Release a device. The next search uses a new context."""
     usb.util.dispose_resources(device)
     Context.newest = None
 
@@ -194,17 +193,18 @@ def _serial(device: usb.core.Device) -> str:
         raise _explain(e) from e
     except UnicodeDecodeError as e:
         raise SensorMismatch(
-            f"the skin's serial number is no text ({e}); check its firmware"
+            f"the skin's serial number is not text ({e}); check its firmware"
         ) from e
     except ValueError as e:  # pyusb raises it if the string descriptors may not be read
         raise SensorDenied(
-            f"the skin's serial number cannot be read ({e}); install the udev rule, join group plugdev"
+            f"the skin's serial number cannot be read ({e}); install the udev rule, join group "
+            "plugdev"
         ) from e
 
 
 def _configuration(device: usb.core.Device) -> Any:
-    """The active configuration; set only if there is none, since setting it again resets the
-    board."""
+    """The active configuration. It is set only if there is none, since setting it again resets the
+    device."""
     try:
         return device.get_active_configuration()
     except usb.core.USBError:
@@ -222,7 +222,8 @@ def _endpoint(interface: Any, direction: int) -> int:
     )
     if endpoint is None:
         raise SensorMismatch(
-            f"the skin's interface has no bulk endpoint {'IN' if direction else 'OUT'}; check its firmware"
+            f"the skin's interface has no bulk endpoint {'IN' if direction else 'OUT'}; check its "
+            "firmware"
         )
     return int(endpoint.bEndpointAddress)
 
@@ -249,7 +250,8 @@ def _explain(e: usb.core.USBError) -> SensorError:
         )
     if e.errno == errno.EACCES:
         return SensorDenied(
-            "the skin may not be opened by this user (errno 13); install the udev rule, join group plugdev"
+            "the skin may not be opened by this user (errno 13); install the udev rule, join "
+            "group plugdev"
         )
     if e.errno == errno.EBUSY:
         return SensorBusy(
@@ -260,5 +262,6 @@ def _explain(e: usb.core.USBError) -> SensorError:
             "the skin was unplugged (errno 19); plug it in again, it is taken up by itself"
         )
     return SensorLost(
-        f"the skin failed ({e.strerror or e}, errno {e.errno}); trying again, check its cable if this stays"
+        f"the skin failed ({e.strerror or e}, errno {e.errno}); trying again, check its cable if "
+        "this stays"
     )

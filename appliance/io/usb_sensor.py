@@ -1,8 +1,8 @@
-"""A skin that speaks PROTOCOL.md, also when it is unplugged and plugged in again. In: a link, a
-clock. Out: Frames, state.
+"""A skin whose readout board speaks PROTOCOL.md: bytes of a link become Frames. The skin may be
+unplugged and plugged in again.
 
-No failure of the link makes `read` raise: it returns no frames, `state` and `trouble` say why, and
-it tries again.
+`read` does not raise for a failure of the link. It then returns no frames, `state` and `trouble`
+give the reason, and it tries again.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from appliance.io import packets
 from appliance.io.link import SkinLink
 
 RATE_TOLERANCE = 0.01
-"""Largest relative difference between the board's rate and the bundle's: 1 %, since crystals and
-timers differ."""
+"""Largest relative difference between the rate of the readout board and that of the bundle: 1 %,
+for the tolerances of crystals and timers."""
 STAMPS_NS = 5_000_000
-"""Largest jitter of a board's time stamps: it may count milliseconds, or be delayed by an
-interrupt. Windows do not move by that."""
+"""Largest jitter of the time stamps. The readout board may count milliseconds, or be delayed by an
+interrupt; windows do not move by that."""
 
 PROOF_NS = 5_000_000_000
-"""Time in which a skin that announces nothing can turn out to be the wrong one. If it does, the
-next attempt has to run this long without a fault before the skin counts as streaming: READY does
-not come and go with a wrong skin."""
+"""Time in which a skin that announces nothing can turn out to be the wrong skin. If it does, it
+must then send frames for as long without a fault before it counts as streaming. Otherwise READY
+would come and go with a wrong skin."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
@@ -46,10 +46,10 @@ _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 class SensorCounters:
     """Counts since the program started.
 
-    frames: received. lost_frames: missing in the count of sequence numbers. stale_frames: repeated
-    or late ones, left out. garbage_bytes: bytes in no packet. overflows: transfers larger than the
-    read. fifo_overflows: packets whose OVERFLOW flag says that the board's FIFO was full.
-    enumerations: times the board was found and started.
+    frames: received. lost_frames: missing in the sequence numbers. stale_frames: repeated or late,
+    and left out. garbage_bytes: bytes outside of packets. overflows: transfers larger than the
+    read. fifo_overflows: packets with the flag OVERFLOW, set when the FIFO of the readout board was
+    full. enumerations: times the skin was found and started.
     """
 
     frames: int = 0
@@ -62,38 +62,36 @@ class SensorCounters:
 
 
 class Sensor(Protocol):
-    """The source of frames, as the loop uses it."""
+    """The source of frames for the loop."""
 
     @property
     def state(self) -> str:
-        """`streaming`, or what prevents it (PROTOCOL.md, states of the skin)."""
+        """`streaming`, or the state that prevents it (PROTOCOL.md, states of the skin)."""
         ...
 
     @property
     def trouble(self) -> SensorError | None:
-        """Why it is not streaming and what to do; None while it streams."""
+        """The reason why it is not streaming, with a remedy; None while it streams."""
         ...
 
     @property
     def identity(self) -> packets.Identity | None:
-        """The board's name and version, once it was asked."""
+        """Name and version of the readout board; None before it was asked."""
         ...
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the board's time is known: DeviceClock.quality."""
+        """Accuracy of the times: DeviceClock.quality."""
         ...
 
     @property
     def loss_known(self) -> bool:
-        """Whether each lost frame is seen. Where it is not, `lost_frames` holds what can be
-        inferred from times."""
+        """Whether every lost frame is seen. If not, `lost_frames` counts only the losses that can
+        be inferred from times."""
         ...
 
     @property
-    def counters(self) -> SensorCounters:
-        """Counts since the program started."""
-        ...
+    def counters(self) -> SensorCounters: ...
 
     def read(self) -> Frames:
         """The frames since the last call; an empty Frames after a bounded wait."""
@@ -101,8 +99,8 @@ class Sensor(Protocol):
 
 
 OPENED = "opened"
-"""Passed to observers when a skin was opened: a new enumeration begins. It is not a state: the
-skin keeps its former state until its first frame arrives."""
+"""Given to observers when a skin was opened, which begins a new enumeration. It is not a state: the
+skin keeps its last state until its first frame."""
 
 
 class TransferObserver(Protocol):
@@ -118,31 +116,32 @@ class TransferObserver(Protocol):
 
 
 class FrameStream(Protocol):
-    """Converts the bytes of one skin to Frames with unwrapped numbers and host times; no I/O."""
+    """Converts the bytes of a skin to Frames with unwrapped numbers and host times. It does no I/O."""
 
     @property
     def loss_known(self) -> bool:
-        """Whether each lost frame is seen: the skin counts its frames."""
+        """Whether every lost frame is seen, as the skin counts its frames."""
         ...
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the skin's time is known: DeviceClock.quality."""
+        """Accuracy of the times: DeviceClock.quality."""
         ...
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, the clock starts
-        again."""
+        """Begin an enumeration, also the first: frame numbers get the next epoch, and the clock
+        starts again."""
         ...
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """The frames of what was read until `arrival_ns`. Raises SensorMismatch."""
+        """The frames in bytes that were read until `arrival_ns`. Raises SensorMismatch."""
         ...
 
 
 class Stream:
-    """Converts the bytes of one board to Frames with unwrapped numbers and host times; no I/O.
-    Damaged data is counted. unpack: finds the packets in bytes, as `packets.unpack`."""
+    """Converts the bytes of a readout board to Frames with unwrapped numbers and host times. It
+    does no I/O, and counts damaged data. unpack: finds the packets in bytes, as `packets.unpack`
+    does."""
 
     loss_known = True
 
@@ -165,8 +164,8 @@ class Stream:
         )
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, the device clock
-        starts again."""
+        """Begin an enumeration, also the first: frame numbers get the next epoch, and the device
+        clock starts again."""
         self._counters.enumerations += 1
         self._position = packets.StreamPosition(self._position.epoch + 1)
         self._device, self._mark = DeviceClock(), None
@@ -174,23 +173,23 @@ class Stream:
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the board's time is known: DeviceClock.quality."""
+        """Accuracy of the times: DeviceClock.quality."""
         return self._device.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
         """The frames of a transfer that ended at `arrival_ns`.
 
-        Raises SensorMismatch if they have another format, or if the board's clock disagrees with
-        its frame count.
+        Raises SensorMismatch if they have another format, or if the device clock disagrees with the
+        frame count.
         """
         unpacked = self._unpack(self._leftover + data)
         self._leftover = unpacked.leftover
         self._counters.garbage_bytes += unpacked.garbage
         for p in unpacked.packets:
             if p.taxels.shape[1:] != self._shape or p.taxels.dtype != self._dtype:
-                form = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
+                sent = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
                 raise SensorMismatch(
-                    f"the skin sent {form}, but it had announced {self._format}; check its firmware"
+                    f"the skin sent {sent}, but it had announced {self._format}; check its firmware"
                 )
             self._counters.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
         fresh, position, lost, stale = packets.follow(unpacked.packets, self._position)
@@ -198,8 +197,7 @@ class Stream:
             self._device, self._mark = DeviceClock(), None
         self._position = position
         now = [item for item in fresh if item[0] >> EPOCH_BITS == position.epoch]
-        # frames from before a restart of the board in the same transfer have no host time and count
-        # as lost
+        # frames from before a restart within the same transfer have no host time and count as lost
         self._counters.lost_frames += (
             lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
         )
@@ -207,8 +205,8 @@ class Stream:
         return self._stamp(now, arrival_ns)
 
     def _stamp(self, fresh: list[tuple[int, packets.Packet]], arrival_ns: int) -> Frames:
-        """Frames of packets [(number of the first frame, packet)] of one epoch, with numbers and
-        host times."""
+        """Give numbers and host times to packets [(number of the first frame, packet)] of one
+        epoch."""
         if not fresh:
             return Frames.empty(self._format)
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
@@ -231,11 +229,11 @@ class Stream:
         return runs[0] if len(runs) == 1 else Frames.joined(runs)
 
     def _check_pace(self, first: int, start_ns: int) -> None:
-        """Compare the board's clock with its frame count. If they disagree, host times and the
-        windows cut by them are wrong.
+        """Compare the device clock with the frame count. If they disagree, host times and windows
+        are wrong.
 
-        The reference is a frame up to one second ago: a jump of either is detected at once, a wrong
-        rate within that second. Raises SensorMismatch.
+        The reference is a frame up to one second ago, so a jump of either is detected at once, and
+        a wrong rate within that second. Raises SensorMismatch.
         """
         self._mark = self._mark or (first, start_ns)
         counted_ns = round((first - self._mark[0]) * self._format.period_ns)
@@ -243,7 +241,8 @@ class Stream:
         slack_ns = max(STAMPS_NS, self._format.period_ns) + RATE_TOLERANCE * counted_ns
         if abs(passed_ns - counted_ns) > slack_ns:
             raise SensorMismatch(
-                f"the skin's clock went on {passed_ns / 1e6:.1f} ms during frames of {counted_ns / 1e6:.1f} ms; "
+                f"the skin's clock went on {passed_ns / 1e6:.1f} ms during frames of "
+                f"{counted_ns / 1e6:.1f} ms; "
                 "starting it again, check its firmware if this stays"
             )
         if counted_ns >= 1_000_000_000:
@@ -251,12 +250,12 @@ class Stream:
 
 
 class LinkSensor(ABC):
-    """A skin behind a link: what all skins have in common.
+    """The part of a sensor that is common to all skins behind a link.
 
     States: `streaming`, from the first frame on; or `absent`, `busy`, `denied`, `mismatch`, `lost`,
-    `silent`, where `trouble` says what to do. A skin that is plugged in again is a new enumeration:
-    its frames get a new epoch in `seq` and a new clock. announced: the skin says what it sends
-    when it is opened.
+    `silent`, with a remedy in `trouble`. A skin that is plugged in again begins a new enumeration:
+    its frames get a new epoch in `seq` and a new clock. announced: the skin reports its format when
+    it is opened.
     """
 
     announced = True
@@ -280,27 +279,27 @@ class LinkSensor(ABC):
         self._quiet_ns = 0  # time spent reading since the last frame
         self._unheard = 0  # bytes since then
         self._opened_ns = 0
-        self._proof_ns = 0  # how long it has to send before it counts as streaming
+        self._proof_ns = 0  # time for which frames must come before the skin counts as streaming
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """How well the skin's time is known: DeviceClock.quality."""
+        """Accuracy of the times: DeviceClock.quality."""
         return self._stream.clock
 
     @property
     def loss_known(self) -> bool:
-        """Whether each lost frame is seen."""
+        """Whether every lost frame is seen."""
         return self._stream.loss_known
 
     def read(self) -> Frames:
-        """Frames that have come since the last call; waits at most `timeout_ms`."""
+        """The frames since the last call; waits at most `timeout_ms`."""
         if self._link is None and not self._connect():
             return Frames.empty(self._format)
         begun = self._clock.now_ns()
         data = self._transfer()
         now = self._clock.now_ns()
-        # a read that took longer than its timeout was not scheduled: the skin may have been sending
-        # all the time
+        # a read that took longer than its timeout was not scheduled, and the skin may have been
+        # sending
         self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
         frames, before = Frames.empty(self._format), self.counters.frames
         wrong: SensorMismatch | None = None
@@ -314,7 +313,7 @@ class LinkSensor(ABC):
             self._quiet_ns = self._unheard = 0
             if self.state != "streaming" and self._proven(now):
                 self._set_state("streaming", None)
-        if data and self._tap:  # after the state in which its frames are used
+        if data and self._tap:  # after the state, which a replay needs before these frames
             self._tap.transfer(now, data)
         if wrong:
             early = now - self._opened_ns < PROOF_NS
@@ -327,7 +326,6 @@ class LinkSensor(ABC):
         return now_ns - self._opened_ns >= self._proof_ns
 
     def close(self) -> None:
-        """Stop the skin and release it."""
         if self._link:
             link, self._link = self._link, None
             link.close()
@@ -339,15 +337,15 @@ class LinkSensor(ABC):
 
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         """The trouble of a skin that sent no frame for `silence_ms`. bytes_came: it sent other
-        bytes. The message has no figure that changes each time, so that it is logged once."""
+        bytes. The message contains no measured figure, so that the log shows it once."""
         return SensorSilent(
             f"the skin is there but sent no frame for {self._config.silence_ms} ms; "
             "starting it again"
         )
 
     def _connect(self) -> bool:
-        """Find, open, check and start the skin; False, with state and trouble set, if that
-        fails."""
+        """Find, open, check and start the skin. If that fails, state and trouble are set, and the
+        result is False."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
             self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
@@ -365,7 +363,7 @@ class LinkSensor(ABC):
         return True
 
     def _transfer(self) -> bytes:
-        """What one read gives; b"" if nothing came. If the link has failed it is dropped."""
+        """The bytes of one read, b"" if none came. A link that has failed is dropped."""
         assert self._link
         try:
             return self._link.read(self._config.read_bytes, self._config.timeout_ms)
@@ -376,14 +374,14 @@ class LinkSensor(ABC):
         return b""
 
     def _check_silence(self) -> None:
-        """Restart a skin that is connected but has sent no complete frame in `silence_ms` of
-        reading."""
+        """Open a skin again that has sent no complete frame in `silence_ms` of reading."""
         if self._link and self._quiet_ns > self._config.silence_ms * 1_000_000:
             self._drop(self._no_frame(bytes_came=self._unheard > 0))
 
     def _drop(self, why: SensorError, proof_ns: int = 0) -> None:
-        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: how long it
-        then has to send before it counts as streaming; 0: one frame is enough."""
+        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: time for
+        which it must then send frames before it counts as streaming; 0: its first frame is enough.
+        """
         self.close()
         self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
@@ -396,14 +394,14 @@ class LinkSensor(ABC):
 
 
 def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
-    """Whether a skin sends what a bundle or a recording wants; the length of a window is no matter
-    of the skin."""
+    """Whether the frames of a skin suit a bundle or a recording. The length of the window does not
+    matter: the box cuts it."""
     same_rate = abs(skin.rate_hz / wanted.rate_hz - 1) <= RATE_TOLERANCE
     return (skin.shape, skin.dtype) == wanted.skin and same_rate
 
 
 class UsbSensor(LinkSensor):
-    """The skin's readout board on USB or on a serial port (PROTOCOL.md, part 1)."""
+    """A skin whose readout board speaks PROTOCOL.md, part 1, on USB or on a serial port."""
 
     def __init__(
         self,
@@ -422,8 +420,10 @@ class UsbSensor(LinkSensor):
             who, skin = ask(link)
             if not fits(skin, self._format):
                 raise SensorMismatch(
-                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, wanted is "
-                    f"{self._format}; plug in the skin that it was trained for, or deploy a bundle for this one"
+                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, "
+                    "wanted is "
+                    f"{self._format}; plug in the skin that it was trained for, or deploy a "
+                    "bundle for this one"
                 )
             link.request(packets.Request.START, 0)
         except SensorError:
@@ -433,13 +433,14 @@ class UsbSensor(LinkSensor):
 
 
 def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
-    """What a board says about itself. Raises SensorMismatch if it is not as PROTOCOL.md says, or of
-    another version."""
+    """Identity and format of a readout board. Raises SensorMismatch if a reply is not as
+    PROTOCOL.md defines, or of another version."""
     try:
         who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
         if who.protocol != packets.VERSION:
             raise SensorMismatch(
-                f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol {who.protocol}, "
+                f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol "
+                f"{who.protocol}, "
                 f"this box speaks {packets.VERSION}; update the older of them"
             )
         return who, packets.unpack_format(board.request(packets.Request.FORMAT, 64))
@@ -448,9 +449,9 @@ def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
 
 
 def open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
-    """Find and open the configured board. Raises SensorError if it is absent, held, refused or of
-    another kind."""
-    # each kind is imported when it is used: most boxes use one of them for ever
+    """Find and open the configured readout board. Raises SensorError if it is absent, held, refused
+    or of another kind."""
+    # imported when it is used, since most boxes use one kind of link
     if config.link == "serial":
         from appliance.io import serial_link
 

@@ -33,6 +33,7 @@ def check_bits(codes: int, labels: Sequence[str]) -> None:
     """Raises ConfigError if there are fewer `codes` than labels and the code 0 need."""
     if codes <= len(labels):
         raise ConfigError(
-            f"{len(labels)} labels and the code 0 do not fit output.class_bits, which have {codes} codes; "
+            f"{len(labels)} labels and the code 0 do not fit output.class_bits, which have "
+            f"{codes} codes; "
             "wire more lines, or none"
         )

@@ -60,11 +60,13 @@ class ContactPositions:
                 or not all(map(_length, values))
             ):
                 raise BundleError(
-                    f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle again"
+                    f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle "
+                    "again"
                 )
         if len(self.rows_mm) != len(self.cols_mm):
             raise BundleError(
-                f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where each position has one "
+                f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where "
+                "each position has one "
                 "of both; export the bundle again"
             )
 

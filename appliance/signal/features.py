@@ -166,7 +166,8 @@ def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
         )
     if frames < width:
         raise FormatError(
-            f"{frames} frames are too few for H-features at {rate_hz:g} Hz; use at least {width}, or L"
+            f"{frames} frames are too few for H-features at {rate_hz:g} Hz; use at least {width}, "
+            "or L"
         )
     return width, min(width // 2, math.floor(_clean(HIGH_HZ[1] * width / rate_hz)))
 

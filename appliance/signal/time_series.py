@@ -28,7 +28,8 @@ def of(taxels: NDArray[Any]) -> Array:
     float64 [M, T]. Raises FormatError for an array that is no sweep or not finite."""
     if taxels.ndim not in (3, 4) or taxels.size == 0:
         raise FormatError(
-            f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns (x axes), none of them 0"
+            f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns (x axes), "
+            "none of them 0"
         )
     x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)
     if not np.isfinite(x).all():

@@ -45,7 +45,8 @@ MARGIN = 8
 
 _NAME_SKIN = "name another skin with --skin, or use --sim replay:FILE"
 _NAME_BUNDLE = (
-    "name a bundle for this skin with --set classifier.bundle=DIR; palpate record --sim skin --skin NAME, palpate-train fit "
+    "name a bundle for this skin with --set classifier.bundle=DIR; palpate record --sim skin "
+    "--skin NAME, palpate-train fit "
     "and export make one"
 )
 
@@ -190,7 +191,8 @@ def load(path: Path, format: SweepFormat | None) -> SweepSet:
     sweeps = load_file(path, SweepSet)
     if format not in (None, sweeps.format):
         raise FormatError(
-            f"{path} holds {sweeps.format}, {format} is wanted; name its bundle with --set classifier.bundle=DIR"
+            f"{path} holds {sweeps.format}, {format} is wanted; name its bundle with --set "
+            "classifier.bundle=DIR"
         )
     return sweeps
 

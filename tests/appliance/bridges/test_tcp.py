@@ -290,7 +290,8 @@ def test_it_ends_with_the_service_manager(box: SpeakingBox):
 def test_bridges_need_neither_numpy_nor_onnxruntime():
     """A fresh process with all of a bridge loaded; the options alone load nothing of one."""
     code = (
-        "import sys; import appliance.bridges.command, appliance.bridges.modbus, appliance.bridges.tcp;"
+        "import sys; import appliance.bridges.command, appliance.bridges.modbus, "
+        "appliance.bridges.tcp;"
         "print({m.split('.')[0] for m in sys.modules} & {'numpy', 'onnxruntime', 'usb', 'gpiod'})"
     )
     options = "import sys; import appliance.cli.parser; print({'asyncio', 'appliance.bridges.server'} & {*sys.modules})"

@@ -366,7 +366,8 @@ def test_the_client_needs_pyserial_alone():
     box but core."""
     code = (
         "import sys; import appliance.client.box; names = set(sys.modules);"
-        "print(sorted({n.split('.')[0] for n in names} & {'numpy', 'onnxruntime', 'usb', 'gpiod', 'serial'}),"
+        "print(sorted({n.split('.')[0] for n in names} & {'numpy', 'onnxruntime', 'usb', 'gpiod', "
+        "'serial'}),"
         "sorted({n.split('.')[1] for n in names if n.startswith('appliance.')}))"
     )
     done = subprocess.run(

@@ -329,7 +329,8 @@ def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
     """What the comment of a board file draws: {pin: name}, {role: name}, a role with its arrow as
     seen from the box."""
     rows = re.findall(
-        r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w ]+))?$",
+        r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
+        r"]+))?$",
         _page(board),
         re.MULTILINE,
     )

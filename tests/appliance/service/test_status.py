@@ -180,8 +180,8 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     text = status_file.text()
     assert "bundle   none" in text  # while sweeps are recorded
     assert (
-        "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, plugged in 2 t"
-        in text
+        "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, "
+        "plugged in 2 t" in text
     )
     assert "serial   4 sentences dropped, since nobody read them" in text
     assert status.exit_code(status_file.read()) == 69
@@ -293,7 +293,8 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
         ),
         (
             replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
-            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; taxel 2.3",
+            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; "
+            "taxel 2.3",
         ),
         (
             replace(SHORT, status=Status.ABORTED),
