@@ -14,7 +14,7 @@ MAX_LINE = 128
 """Characters of a sentence or command."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 """What no field may hold."""
-_FORM = re.compile(
+_PATTERN = re.compile(
     rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<kind>[A-Za-z]{0,16})(?:[, ](?P<text>[ -#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
 )
 
@@ -81,7 +81,7 @@ def read(line: bytes) -> Sentence:
         return Sentence("", error=f"line of over {MAX_LINE} characters without an end")
     # the kind holds letters only: of a command it is sent back, and noise could displace the fields
     # of the answer
-    match = _FORM.fullmatch(line.strip())
+    match = _PATTERN.fullmatch(line.strip())
     if not match:  # examples are given without what a sentence cannot hold
         return Sentence("", error=f"not a command; send for example {TALKER} ID")
     kind, body = match["kind"].decode(), match["body"].decode()

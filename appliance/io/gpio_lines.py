@@ -1,8 +1,8 @@
-"""GPIO lines by name. In: line names and the module gpiod. Out: line requests; READY, BUSY, FAULT,
-DECIDED, class bits and RESULT VALID as levels.
+"""Finds GPIO lines by name, requests them and drives the outputs READY, BUSY, FAULT, DECIDED, class
+bits and RESULT VALID.
 
-Everything goes through libgpiod v2; the module itself (`import gpiod`, or the simulator's double)
-is passed in.
+All access is through libgpiod v2. The module (`import gpiod`, or the simulator's double) is passed
+in.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 MAX_CHIPS = 256
 """Largest number of GPIO devices in the kernel (GPIO_DEV_MAX)."""
 QUEUE = 1024
-"""Length of the kernel's event queue of one request, the largest that it grants; when full it drops
-the oldest event."""
+"""Length of the kernel's event queue of one request, the largest that it grants. A full queue drops
+its oldest event."""
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
@@ -37,7 +37,7 @@ _ADVICE = {
 
 
 def check_binding(gpio: Any) -> None:
-    """Raise LineError unless `gpio` is the libgpiod v2 binding or a double of it."""
+    """Raises LineError unless `gpio` is the libgpiod v2 binding or a double of it."""
     if not (hasattr(gpio, "request_lines") and hasattr(gpio, "LineSettings")):
         raise LineError(
             f"module gpiod {getattr(gpio, '__version__', 'of unknown version')} is not the "
@@ -48,10 +48,10 @@ def check_binding(gpio: Any) -> None:
 
 
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
-    """Name -> (path of its chip, offset on it), searched on all chips of this machine.
+    """Map each name to (path of its chip, offset), searching all chips of this machine.
 
-    Raises LineError for a name that is given twice, missing or ambiguous, for chips that may not be
-    opened, and if there is no chip.
+    Raises LineError if a name is given twice, missing or ambiguous, if a chip may not be opened,
+    and if there is no chip.
     """
     if len(set(names)) < len(names):
         raise LineError(
@@ -84,7 +84,7 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
 
 
 def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
-    """All named lines with their (chip path, offset), and the paths of chips that may not be
+    """All named GPIO lines with their (chip path, offset), and the paths of chips that may not be
     opened."""
     places: dict[str, list[tuple[str, int]]] = {}
     denied = []
@@ -95,7 +95,7 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
                 info = chip.get_info()
                 if (
                     info.name in chips
-                ):  # a second device name of the same chip, as Raspberry Pi OS has one
+                ):  # a second device name of the same chip, as on Raspberry Pi OS
                     continue
                 chips.add(info.name)
                 for offset in range(info.num_lines):
@@ -117,7 +117,7 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
 
 
 def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
-    """A LineError that explains an errno and names the lines it concerns."""
+    """A LineError that explains an errno and names the GPIO lines."""
     advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
     return LineError(
         f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}"
@@ -126,7 +126,7 @@ def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
 
 @contextmanager
 def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
-    """Turn an OSError into a LineError that names the lines."""
+    """Turn an OSError into a LineError that names the GPIO lines."""
     try:
         yield
     except OSError as e:
@@ -136,8 +136,8 @@ def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
 def request_lines(
     gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, separate: bool = False
 ) -> list[tuple[LineRequest, dict[int, str]]]:
-    """One request per chip, or with `separate` one per line, each with its {offset: name}; `stack`
-    releases them."""
+    """One request for each chip, or with `separate` for each GPIO line, with its {offset: name}.
+    `stack` releases them."""
     groups: dict[tuple[str, str], dict[int, str]] = {}
     for name, (path, offset) in find_lines(gpio, names).items():
         groups.setdefault((path, name if separate else ""), {})[offset] = name
@@ -153,7 +153,8 @@ def request_lines(
 
 
 class Lines:
-    """The box's output lines; all are low at first. An empty name is a line that is not wired.
+    """The output GPIO lines of the box, all low at first. An empty name means that the line is not
+    wired.
 
     Raises LineError if lines cannot be found, requested or written.
     """
@@ -180,8 +181,8 @@ class Lines:
         return 1 << len(self._bits)
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when
-        BUSY rises."""
+        """Set READY, BUSY, FAULT and DECIDED, of which only changes are written. RESULT VALID falls
+        when BUSY rises."""
         if (ready, busy, fault, decided) == self._status:
             return
         if busy and not self._status[1]:
@@ -190,11 +191,11 @@ class Lines:
         self._write(dict(zip(self._status_lines, self._status, strict=True)))
 
     def result(self, code: int | None) -> None:
-        """Output a class code: RESULT VALID falls, the class bits change, and `settle_us` later
-        RESULT VALID rises.
+        """Output a class code: RESULT VALID falls, the class bits change, and RESULT VALID rises
+        `settle_us` later.
 
-        With None RESULT VALID only falls. A code outside 0..capacity-1 lets it fall, too, and
-        raises LineError.
+        With None, RESULT VALID only falls. With a code outside 0..capacity-1 it falls as well, and
+        LineError is raised.
         """
         self._write({self._valid: False})
         if code is None:
@@ -209,7 +210,7 @@ class Lines:
         self._write({self._valid: True})
 
     def close(self) -> None:
-        """Set all lines low, then release them; the level of a line that nobody holds is up to its
+        """Set all GPIO lines low, then release them. The level of a released line depends on its
         chip."""
         try:
             self._write(dict.fromkeys(self._levels, False))

@@ -1,9 +1,8 @@
-"""Triggers for the bench and for robots without a line to spare: by command, by the space bar, by
-the clock.
+"""Triggers for the bench and for robots without a spare GPIO line: commands on the serial line, the
+space bar of a terminal, or the clock.
 
-In: commands of the serial line, a terminal, a period. Out: START and STOP with the time at which
-the command or the key was read, or at which the clock was due. None of them is as exact as a line,
-whose edges the kernel stamps.
+The time of an edge is the time at which the command or key was read, or at which the clock was due.
+All are less exact than a GPIO line, whose edges the kernel stamps.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from appliance.io.trigger import EdgeCounters
 
 SECOND = 1_000_000_000
 COUNTDOWN = 3
-"""Seconds before a start of the clock from which on each is announced."""
+"""Seconds before a timed start from which on each second is announced."""
 SPACE = ord(" ")
 
 Say = Callable[[str], object]
-"""Shows a line to a person."""
+"""Shows a message to a person."""
 
 
 class LinelessTrigger:
-    """What these triggers have in common: edges wait for the next turn of the loop, and none is
-    ever lost.
+    """The common part of these triggers: edges are kept for the next turn of the loop, and none is
+    lost.
 
-    about: for the sidecar of a recorded sweep, as GpioTrigger has it.
+    about: for the sidecar of a recorded sweep, as in GpioTrigger.
     """
 
     blind = False
@@ -49,13 +48,12 @@ class LinelessTrigger:
         self._edges: list[Edge] = []
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """The edges since the last call."""
         taken, self._edges = self._edges, []
         return taken
 
 
 class CommandTrigger(LinelessTrigger):
-    """START and STOP as commands on the serial line; `commands` carries them out."""
+    """START and STOP as commands on the serial line; `commands` has their handlers."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__("serial", "arrival of the command")
@@ -70,13 +68,12 @@ class CommandTrigger(LinelessTrigger):
 
 
 class KeyTrigger(LinelessTrigger):
-    """The space bar of a terminal starts a sweep and stops it. Restores the terminal when it is
-    closed.
+    """The space bar of a terminal starts and stops a sweep. `close` restores the terminal.
 
-    While it is open, keys are not shown, and Ctrl-\\ and Ctrl-Z do nothing, since either would
-    leave the terminal so. A sweep that was answered without a stop, for example `long`, is over:
-    the next space starts another one. terminal: its file descriptor. Raises ConfigError if it is no
-    terminal, and in `edges` PortError once it is closed.
+    While it is open, keys are not echoed, and Ctrl-\\ and Ctrl-Z do nothing, since both would leave
+    the terminal without echo. A sweep that was answered without a stop, for example `long`, is
+    over, and the next space starts another. terminal: its file descriptor. Raises ConfigError if it
+    is not a terminal, and `edges` raises PortError once it is closed.
     """
 
     def __init__(self, terminal: int, clock: Clock, say: Say) -> None:
@@ -92,7 +89,7 @@ class KeyTrigger(LinelessTrigger):
             termios.tcsetattr(terminal, termios.TCSANOW, changed)
         except (termios.error, OSError, ValueError) as e:
             raise ConfigError(
-                'trigger.mode = "key" reads the space bar, but standard input is no terminal; '
+                'trigger.mode = "key" reads the space bar, but standard input is not a terminal; '
                 'run it in one, or use "serial" or "timed"'
             ) from e
         say("the space bar starts a sweep and stops it; Ctrl-C ends")
@@ -108,12 +105,12 @@ class KeyTrigger(LinelessTrigger):
         return super().edges(now_ns)
 
     def over(self, sweep: int) -> None:
-        """The sweep of this number was answered, so it is over."""
-        if sweep == self._started:  # an older one may be answered late, when the next has begun
+        """Note that the sweep of this number was answered."""
+        if sweep == self._started:  # a late answer to an older sweep changes nothing
             self._sweeping = False
 
     def close(self) -> None:
-        """Give the terminal back as it was, where it is still there."""
+        """Restore the terminal, unless it is gone."""
         try:
             termios.tcsetattr(self._terminal, termios.TCSANOW, self._before)
         except termios.error:
@@ -140,10 +137,10 @@ class KeyTrigger(LinelessTrigger):
 
 
 class TimedTrigger(LinelessTrigger):
-    """Starts a sweep of `sweep_s` every `every_s` by the clock, and announces it. Raises
-    ConfigError if one does not fit into the other.
+    """Starts a sweep of `sweep_s` every `every_s` and announces it. Raises ConfigError if `every_s`
+    is not longer.
 
-    held: no sweep is started, and the pause before one begins again when this ends.
+    held: no sweep is started; afterwards the pause before a sweep begins again.
     """
 
     def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
@@ -163,13 +160,13 @@ class TimedTrigger(LinelessTrigger):
         self.held = False
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """START and STOP that are due, with the time at which they were."""
+        """START and STOP that are due, with the time at which each was due."""
         if self.held and not self._sweeping:
             self._due_ns, self._announced = now_ns + self._every_ns - self._sweep_ns, COUNTDOWN + 1
             return super().edges(now_ns)
         if (
             not self._sweeping and now_ns - self._due_ns > self._every_ns
-        ):  # after a pause of the program none is made up
+        ):  # after a pause of the program, the starts that it missed are left out
             self._due_ns = now_ns
         while now_ns >= self._due_ns:
             kind = EdgeKind.STOP if self._sweeping else EdgeKind.START
@@ -187,35 +184,33 @@ class TimedTrigger(LinelessTrigger):
 
 
 class AnswerWatch(Observer):
-    """Tells a KeyTrigger which sweeps are over."""
+    """Notifies a KeyTrigger of answered sweeps."""
 
     def __init__(self, trigger: KeyTrigger) -> None:
         self._trigger = trigger
 
     def answered(self, verdict: Verdict) -> None:
-        """Tell it."""
         self._trigger.over(verdict.sweep)
 
 
 class StreamWatch(Observer):
-    """Holds a TimedTrigger while the skin sends nothing: nobody need slide a finger in vain."""
+    """Holds a TimedTrigger while the skin sends nothing, so that nobody slides a finger in vain."""
 
     def __init__(self, trigger: TimedTrigger) -> None:
         self._trigger = trigger
         trigger.held = True
 
     def turn(self, health: Health) -> None:
-        """Hold it, or no longer."""
         self._trigger.held = not health.streams
 
 
 def standard_input() -> int:
-    """The file descriptor of standard input, -1 where there is none."""
+    """The file descriptor of standard input, -1 if there is none."""
     try:
         return sys.stdin.fileno()
     except (
         AttributeError,
         OSError,
         ValueError,
-    ):  # closed, or replaced by something without a descriptor
+    ):  # closed, or replaced by an object without a descriptor
         return -1

@@ -1,8 +1,8 @@
-"""Packets of the readout board (firmware_config/PROTOCOL.md, part 1) in pure functions. In: bytes.
-Out: packets, and how many bytes and frames were lost.
+"""Reads and writes packets of the readout board in pure functions (firmware_config/PROTOCOL.md,
+part 1), and counts lost bytes and frames.
 
-No received bytes make `unpack` or `follow` raise, and only frames of packets with a correct CRC are
-returned.
+`unpack` and `follow` accept any bytes without raising, and return only frames of packets with a
+correct CRC.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ CRC = struct.Struct("<I")
 MAX_PAYLOAD = 4096
 MAX_FRAMES = 255
 RECENT = 1 << 16
-"""A packet at most this many frames behind the newest is a repetition; further behind, the board
-has restarted its count."""
+"""A packet at most this many frames behind the newest is a repetition. A packet further behind
+shows that the readout board has restarted its count."""
 
 _DTYPES = tuple(np.dtype(d).newbyteorder("<") for d in DATA_TYPES)
 _IDENTITY = struct.Struct("<BBBB16s16s")
@@ -49,8 +49,8 @@ class Flag(IntFlag):
 
 
 class Request(IntEnum):
-    """Requests: bRequest of a vendor device, or one byte on the bulk OUT endpoint of a CDC-ACM
-    board."""
+    """Requests: bRequest of a vendor device, or a byte on the bulk OUT endpoint of a CDC-ACM
+    device."""
 
     IDENTITY = 1
     FORMAT = 2
@@ -60,8 +60,8 @@ class Request(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """Consecutive frames. seq, t_us: sequence number and time of the first, 32 bits as sent. flags:
-    bits of Flag. taxels: raw counts [n, R, C] or [n, R, C, A]."""
+    """Consecutive frames. seq, t_us: sequence number and time of the first frame, 32 bits as sent.
+    flags: bits of Flag. taxels: raw counts [n, R, C] or [n, R, C, A]."""
 
     seq: int
     t_us: int
@@ -71,7 +71,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The answer to a request that was sent as a byte (CDC-ACM)."""
+    """The reply to a request that was sent as a byte (CDC-ACM)."""
 
     request: int
     payload: bytes
@@ -79,8 +79,8 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Unpacked:
-    """What bytes contained: packets and replies in order, the number of bytes outside them, and the
-    unfinished rest."""
+    """The content of received bytes: packets and replies in order, the number of bytes outside of
+    them, and the unfinished rest."""
 
     packets: list[Packet]
     replies: list[Reply]
@@ -90,8 +90,8 @@ class Unpacked:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A readout board's answer to IDENTITY: protocol version, firmware version, board name, serial
-    number."""
+    """The reply to IDENTITY: protocol version, firmware version, name and serial number of the
+    readout board."""
 
     protocol: int
     firmware: tuple[int, int, int]
@@ -101,8 +101,8 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """What a readout board sends: grid, data type, frames per second, frames in its FIFO and in a
-    packet, axes."""
+    """The reply to FORMAT: grid, data type, frames per second, frames in the FIFO and in a packet,
+    axes."""
 
     rows: int
     cols: int
@@ -120,8 +120,8 @@ class SkinFormat:
 
 @dataclass(frozen=True, slots=True)
 class StreamPosition:
-    """Position in the stream: number of the enumeration, and the unwrapped number of the next
-    frame; None before the first."""
+    """Position in the stream: number of the enumeration, and the unwrapped number of the next frame
+    (None before the first)."""
 
     epoch: int
     next: int | None = None
@@ -163,7 +163,7 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
-    """A reply packet: a CDC-ACM board's answer to a request byte."""
+    """A reply packet: the reply of a CDC-ACM device to a request byte."""
     return _seal(
         HEADER.pack(MAGIC, version, PacketKind.REPLY, len(payload), 0, request, 0, 0, 0, 0, 0, 0),
         payload,
@@ -171,7 +171,7 @@ def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> byte
 
 
 def unpack(data: bytes) -> Unpacked:
-    """Find all complete packets in `data`. Put the leftover in front of the next bytes."""
+    """Find all complete packets in `data`. The leftover belongs before the next bytes."""
     packets: list[Packet] = []
     replies: list[Reply] = []
     garbage = at = 0
@@ -230,11 +230,11 @@ def follow(
     packets: list[Packet], position: StreamPosition
 ) -> tuple[list[tuple[int, Packet]], StreamPosition, int, int]:
     """Unwrap sequence numbers: ([(unwrapped number of the first frame, packet)], new position, lost
-    and stale frames).
+    frames, stale frames).
 
-    A packet behind the position is stale (repeated or late) and is left out. One that is more than
-    RECENT frames behind begins a new epoch, since the board has restarted its count. Frames are
-    lost where the count jumps ahead.
+    A packet behind the position is stale (repeated or late) and is left out. A packet more than
+    RECENT frames behind begins a new epoch, since the readout board has restarted its count. Frames
+    are lost where the count jumps ahead.
     """
     fresh: list[tuple[int, Packet]] = []
     lost = stale = 0
@@ -268,8 +268,8 @@ def pack_identity(who: Identity) -> bytes:
 
 
 def unpack_identity(payload: bytes) -> Identity:
-    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer board may send a
-    longer one."""
+    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer readout board may send
+    a longer reply."""
     if len(payload) < _IDENTITY.size:
         raise FormatError(
             f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check "
@@ -317,7 +317,7 @@ def unpack_format(payload: bytes) -> SkinFormat:
 
 
 def _axes_byte(axes: int = 1) -> int:
-    """One axis is sent as 0: the byte was 0 before there were several."""
+    """One axis is sent as 0, as the byte was always 0 before skins with several axes."""
     return 0 if axes == 1 else axes
 
 

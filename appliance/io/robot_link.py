@@ -1,8 +1,7 @@
-"""The serial line to the robot. In: verdicts, and bytes of the robot controller. Out: sentences,
-and its commands.
+"""The serial line to the robot controller: sends verdicts and other sentences, and reads commands.
 
-What sentences are stands in `core.sentences`. Nothing here waits for the port: if the peer does not
-read, sentences are dropped and counted, and no frame is lost.
+`core.sentences` defines sentences. Nothing here waits for the port: if the peer does not read,
+sentences are dropped and counted, and no frame is lost.
 """
 
 from __future__ import annotations
@@ -40,15 +39,17 @@ COMMANDS = (
     "DISCARD",
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
-"""The commands that have a text after a comma."""
+"""The commands with a text after a comma."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 
 
 class Port(Protocol):
-    """A line to the robot controller: verdicts and other sentences out, commands in. name: of the
-    port, for a person. dropped: sentences that were not sent. trouble: why the line does not work,
-    "" where it does."""
+    """A serial line to the robot controller, for sentences and commands.
+
+    name: of the port, for messages. dropped: number of sentences that were not sent. trouble: the
+    reason why the line does not work, "" if it does.
+    """
 
     name: str
     dropped: int
@@ -63,18 +64,16 @@ class Port(Protocol):
         ...
 
     def commands(self) -> list[Command]:
-        """Commands that have come in since the last call."""
+        """The commands that have come since the last call."""
         ...
 
-    def close(self) -> None:
-        """Release the line."""
-        ...
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A line from the robot controller: one of COMMANDS with its text if it has one, or `error`:
-    why it is no command."""
+    """A command of the robot controller: one of COMMANDS, and a text if it has one; or `error`, the
+    reason why it was not understood."""
 
     name: str
     text: str = ""
@@ -82,14 +81,14 @@ class Command:
 
     @property
     def line(self) -> str:
-        """The command as it is written in a sentence or a capture."""
+        """The command as it stands in a sentence or a capture."""
         return f"{self.name},{self.text}" if self.name in TEXT_COMMANDS else self.name
 
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
-    """The RES sentence of a verdict. source: where the frames came from (usb, sim, replay).
-    loss_known: whether lost frames of the skin can be seen; if not, a last field says so, for which
-    the detail is cut if need be."""
+    """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
+    lost frames of the skin can be seen; if not, a last field says so, and the detail is shortened
+    to make room for it."""
     fields = (
         v.sweep,
         f"{v.time_ns / 1e9:.3f}",
@@ -111,8 +110,8 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
-    """The commands in `data`, which continues `rest`, and the new unfinished rest: see
-    `sentences.parse`."""
+    """The commands in `data`, which continues `rest`, and the new unfinished rest (see
+    `sentences.parse`)."""
     found, rest = sentences.parse(data, rest)
     return [
         Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found
@@ -120,7 +119,7 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
 
 
 def command(name: str, text: str | None = None) -> Command:
-    """The command `name` with its text, or a Command whose `error` says why there is none."""
+    """The command `name` with its text, or a Command with an `error`."""
     if name not in COMMANDS or UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in TEXT_COMMANDS) != (text is not None):
@@ -155,18 +154,16 @@ class StdoutPort:
         sys.stdout.buffer.flush()
 
     def commands(self) -> list[Command]:
-        """Commands of the other source."""
         return self._commands()
 
     def close(self) -> None:
-        """Standard output stays open."""
+        """Does nothing: standard output stays open."""
 
 
 class SerialSink:
     """Sentences to and commands from a serial port, which may be unplugged and come back.
 
-    opener: creates a `serial.Serial`; passed in so that a test can refuse. dropped: sentences that
-    the peer did not read.
+    opener: opens a `serial.Serial`. dropped: number of sentences that the peer did not read.
     """
 
     def __init__(
@@ -181,16 +178,16 @@ class SerialSink:
         self._port: Any = None
         self._retry_ns = clock.now_ns()
         self._queue: deque[bytes] = deque()
-        self._begun = 0  # bytes of the first sentence in the queue that were sent already
+        self._begun = 0  # sent bytes of the first sentence in the queue
         self._rest = b""
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Queue a verdict's sentence and send what the port accepts now."""
+        """Queue a verdict's sentence and send as many as the port accepts now."""
         self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
-        """Queue a sentence; if the queue is full the oldest one that was not begun is dropped and
-        counted."""
+        """Queue a sentence. If the queue is full, the oldest sentence is dropped and counted,
+        except one that was sent in part."""
         if len(self._queue) >= self._config.queue:
             del self._queue[1 if self._begun else 0]
             self.dropped += 1
@@ -198,7 +195,7 @@ class SerialSink:
         self._flush()
 
     def commands(self) -> list[Command]:
-        """Send what is queued; returns the commands that have come in since the last call."""
+        """Send queued sentences; return the commands that have come since the last call."""
         self._flush()
         if not self._port:
             return []
@@ -213,7 +210,7 @@ class SerialSink:
         return found
 
     def close(self) -> None:
-        """Close the port; sentences that were not sent are lost."""
+        """Close the port; unsent sentences are lost."""
         if self._port:
             port, self._port = self._port, None
             serial_port.close(port)
@@ -223,8 +220,8 @@ class SerialSink:
             return
         while self._queue:
             try:
-                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits as long as the peer
-                # does not read
+                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits while the peer does
+                # not read
                 self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
             except BlockingIOError:
                 return

@@ -109,7 +109,7 @@ class BoardLink(SerialLink):
 def open_board(
     config: SensorConfig, clock: Clock, ports: Callable[[], Iterable[PortInfo]] = serial_port.ports
 ) -> BoardLink:
-    """Open the configured port, or the one with the configured USB ids. Raises SensorError."""
+    """Open the configured port, or the port with the configured USB ids. Raises SensorError."""
     path = config.port or find(((config.vendor_id, config.product_id),), config.serial, ports())
     return BoardLink(path, config.baud or BAUD, clock)
 

@@ -1,8 +1,5 @@
-"""Serial ports, for the line to the robot and for skins: which ones there are, opening one alone,
-what went wrong.
-
-In: paths. Out: an open `serial.Serial` that no other program can read from.
-"""
+"""Serial ports, for the line to the robot and for skins: lists them and opens one for this program
+alone."""
 
 from __future__ import annotations
 
@@ -23,8 +20,8 @@ PSEUDO_TERMINALS = range(136, 144)
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """A serial port of this machine. vendor_id, product_id: USB ids, 0 where it is not on USB.
-    serial: its USB serial number. name: what its maker calls it."""
+    """A serial port of this machine. vendor_id, product_id: USB ids, 0 if it is not on USB. serial:
+    USB serial number. name: product name of its maker."""
 
     path: str
     vendor_id: int = 0
@@ -41,7 +38,7 @@ class PortInfo:
 
 
 def ports() -> list[PortInfo]:
-    """The serial ports of this machine, from /sys; none of them is opened."""
+    """The serial ports of this machine, from /sys; none is opened."""
     from serial.tools.list_ports import comports
 
     return [
@@ -57,10 +54,10 @@ def ports() -> list[PortInfo]:
 
 
 def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:
-    """The port at `path`, not waiting, empty, and kept from other programs. opener: makes a
-    `serial.Serial`.
+    """The open port at `path`, non-blocking, with an empty buffer, and closed to other programs.
+    opener: opens a `serial.Serial`.
 
-    Raises OSError or ValueError (a speed that the port cannot do); `is_held` says whether another
+    Raises OSError, or ValueError for an unsupported baud rate; `is_held` tells whether another
     program has it.
     """
     port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
@@ -73,10 +70,10 @@ def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial)
 
 
 def close(port: Any) -> None:
-    """Close a port that `open_alone` has opened, also one that is gone."""
+    """Close a port from `open_alone`, also if it is gone."""
     with contextlib.suppress(OSError):
-        # if another program opened the port before, the exclusive mode would outlast us and lock us
-        # out, too
+        # if another program opened the port earlier, the exclusive mode would remain and lock us
+        # out
         fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
     with contextlib.suppress(OSError):
         port.close()
@@ -88,11 +85,11 @@ def is_held(e: Exception) -> bool:
 
 
 def _keep_others_out(port: int) -> None:
-    """Make the kernel refuse any further open of `port`, except by root: another reader would take
-    bytes away, and a lock only binds programs that ask for it.
+    """Make the kernel refuse any further open of `port`, except by root. Another reader would take
+    bytes away, and a lock only binds programs that check it.
 
-    Pseudo-terminals are left out: one would stay locked, also for us, if we were killed while its
-    other end is open.
+    Pseudo-terminals are left out: if we were killed while the other end is open, it would stay
+    locked, also for us.
     """
     if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
         fcntl.ioctl(port, termios.TIOCEXCL)

@@ -1,8 +1,6 @@
-"""Skin profiles: what goes over a skin's wire, as a TOML file. In: a name and folders. Out: a
-checked `SkinProfile`.
+"""Skin profiles: TOML files that describe the bytes of a skin, read into a checked SkinProfile.
 
-The fields of `SkinProfile` are the schema; firmware_config/skins/matrix.toml explains each of them
-to a person.
+The fields of SkinProfile are the schema; firmware_config/skins/matrix.toml explains each for users.
 """
 
 from __future__ import annotations
@@ -22,19 +20,20 @@ from appliance.core.schema import number as limited
 from appliance.core.types import MOST_AXES, SweepFormat
 
 DEFAULT = "palpate"
-"""The profile of Palpate's own protocol, whose grid, type and rate the board itself announces."""
+"""The profile of PROTOCOL.md, whose readout board announces grid, type and rate."""
 WINDOW_S = 2.0
-"""Length of a sweep's window where nothing else is asked for (paper, sec. II.B)."""
+"""Length of a sweep's window if no other is set (paper, sec. II.B)."""
 FEW_FRAMES = 200
-"""A window with fewer frames gets a warning. At 100 Hz, vibrations up to 50 Hz can be seen: the ridges of a texture of
-0.4 mm at 20 mm/s, about the finest that a hand calls rough. Below that, materials differ by stiffness and shape alone."""
+"""A window with fewer frames gets a warning. At 100 Hz, vibrations up to 50 Hz are visible: at
+20 mm/s a texture with ridges 0.4 mm apart, about the finest that feels rough to a hand. Materials
+with finer textures then differ only by stiffness and shape."""
 SLIDE_MM_S = 20
 """Speed of sliding for which the warning gives the finest texture."""
 NUMBERS = Literal["uint8", "int16", "uint16", "float32"]
 MARKS = ("sequence", "time", "checksum")
-"""What a skin may lack."""
+"""Abilities that a skin may lack."""
 NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
-"""Names of profiles, and so of their files."""
+"""Valid names of profiles, and so of their files."""
 _GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
 _USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
 _TURNS = ("transpose", "flip-rows", "flip-columns")
@@ -88,18 +87,18 @@ def _is_rate(value: Any) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class SkinProfile:
-    """What goes over a skin's wire. Raises ConfigError for values that contradict each other.
+    """The bytes that a skin sends. Raises ConfigError for values that contradict each other.
 
-    about: what it is, in a line. source: where these facts are from. measured: who has compared
-    them with a device; "" nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
-    stop: commands when it is opened and closed. tare: command for the unloaded zero, which then
-    takes tare_s. codec: how frames are told apart. marker, trailer: bytes before and after a frame
-    ("fixed"). lines: what a line of text holds. number, byte_order: one number on the wire. values:
-    numbers of one taxel on the wire. take: which of them are used, in this order; the last is the
-    one along the skin's normal. rows, cols: grid as it is on the wire. orientation: turns that make
-    the rows lie along the direction of sliding. sequence: type of a count after the marker.
-    rate_hz: frames per second; rates_hz: those to which `start` can set it with {rate} or
-    {period_ms}.
+    about: a line of description. source: where the facts are from. measured: who has compared them
+    with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
+    stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
+    skin, which takes tare_s. codec: how frames are recognized. marker, trailer: bytes before and
+    after a frame ("fixed"). lines: content of a line of text. number, byte_order: a number on the
+    wire. values: numbers of one taxel on the wire. take: indices of those that are used, in this
+    order; the last is the axis along the skin's normal. rows, cols: grid on the wire. orientation:
+    turns after which the rows lie along the direction of sliding. sequence: type of a frame count
+    after the marker. rate_hz: frames per second; rates_hz: those that `start` can set with {rate}
+    or {period_ms}.
     """
 
     about: str = ""
@@ -141,7 +140,7 @@ class SkinProfile:
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """Which of MARKS its frames do not have. Without a sequence number, lost frames cannot be
+        """The MARKS that its frames do not have. Without a sequence number, lost frames cannot be
         seen."""
         has = {
             "palpate": MARKS,
@@ -152,7 +151,8 @@ class SkinProfile:
 
     @property
     def format(self) -> SweepFormat:
-        """The format of its sweeps, rows along the direction of sliding; window of WINDOW_S."""
+        """The format of its sweeps, with rows along the direction of sliding and a window of
+        WINDOW_S."""
         rows, cols = (
             (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
         )
@@ -181,41 +181,56 @@ class SkinProfile:
 
 _KEYS = keys(SkinProfile)
 _VALUES = {"papillarray": (6, "float32"), "xela-can": (3, "uint16"), "robotiq-tsf": (1, "uint16")}
-"""Numbers of a taxel and their type in the codecs that have a form of their own."""
+"""Numbers of a taxel and their type, in the codecs that define them."""
 
 
 def _contradiction(p: SkinProfile) -> str:
-    """Why these values cannot be, "" if they can."""
+    """The contradiction between these values, "" for none."""
     if p.codec == "fixed" and not (p.marker or p.trailer):
         return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
     if p.codec != "fixed" and (p.marker or p.trailer or p.sequence):
-        return f'marker, trailer and sequence belong to codec = "fixed", not to "{p.codec}"; remove them'
+        return (
+            f'marker, trailer and sequence belong to codec = "fixed", not to "{p.codec}"; remove '
+            "them"
+        )
     if (
         not p.take
         or len(p.take) > MOST_AXES
         or len({*p.take}) < len(p.take)
         or max(p.take) >= p.values
     ):
-        return f"take = {list(p.take)} is not 1 to {MOST_AXES} different ones of 0 to {p.values - 1} (see values)"
+        return (
+            f"take = {list(p.take)} is not 1 to {MOST_AXES} different ones of 0 to {p.values - 1} "
+            "(see values)"
+        )
     if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
         values, kind = _VALUES[p.codec]
-        return f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = {values}, number = "{kind}"'
+        return (
+            f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = '
+            f'{values}, number = "{kind}"'
+        )
     if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
-        return 'usb_ids, start, stop and tare are not for codec = "palpate"; sensor.link and sensor.vendor_id say where it is'
+        return (
+            'usb_ids, start, stop and tare are not for codec = "palpate"; sensor.link and '
+            "sensor.vendor_id say where it is"
+        )
     if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
-        return f"{p.rows} x {p.cols} taxels are neither one finger (7 x 4) nor two (14 x 4); correct rows and cols"
+        return (
+            f"{p.rows} x {p.cols} taxels are neither one finger (7 x 4) nor two (14 x 4); correct "
+            "rows and cols"
+        )
     return ""
 
 
 PALPATE = SkinProfile()
-"""The profile where no file says anything else."""
+"""The profile that is used if no file defines another."""
 
 
 def load(name: str, folders: Sequence[Path]) -> SkinProfile:
-    """The profile NAME.toml in the first of the folders that has one; that of DEFAULT needs no
-    file. A name that ends in .toml is a file.
+    """The profile NAME.toml in the first folder that has it. DEFAULT needs no file. A name that
+    ends in .toml is a path.
 
-    Raises ConfigError naming the file, the key, the value and what is allowed.
+    Raises ConfigError with the file, the key, the value and the allowed values.
     """
     there = {name: Path(name)} if name.endswith(".toml") else names(folders)
     if name == DEFAULT and name not in there:
@@ -242,11 +257,11 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
 
 
 def from_json(table: Any, where: str) -> SkinProfile:
-    """The profile that `json` wrote, checked like a file. where: for messages. Raises
+    """The profile that `json` wrote, checked like a file. where: its place, for messages. Raises
     ConfigError."""
     if not isinstance(table, dict):
         raise ConfigError(
-            f"{where}: {shown(table)} is no skin profile; take one that was not changed"
+            f"{where}: {shown(table)} is not a skin profile; take one that was not changed"
         )
     return _made(table, where)
 
@@ -272,7 +287,7 @@ def _made(table: dict[str, Any], where: str) -> SkinProfile:
 
 
 def names(folders: Sequence[Path]) -> dict[str, Path]:
-    """The profiles in these folders, by name; the first folder wins."""
+    """The profiles in these folders, by name; the first folder has priority."""
     found: dict[str, Path] = {}
     for folder in folders:
         for path in sorted(folder.glob("*.toml")):
@@ -282,13 +297,13 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
-    """The profile with what the settings change: sensor.grid, sensor.rate_hz, sensor.baud. Raises
+    """The profile with the changes of sensor.grid, sensor.rate_hz and sensor.baud. Raises
     ConfigError."""
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
         raise ConfigError(
-            f"sensor.{key} is for skins that do not say it; this one speaks PROTOCOL.md, so "
-            "remove it"
+            f"sensor.{key} is for skins that do not announce it; this skin speaks "
+            "PROTOCOL.md, so remove it"
         )
     grid = _GRID.fullmatch(config.grid)
     if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
@@ -317,7 +332,7 @@ def with_window(rows: int, cols: int, rate_hz: float, dtype: str, axes: int) -> 
 
 
 def warning(format: SweepFormat) -> str:
-    """What to expect of a skin that is too slow for textures; "" for one that is fast enough."""
+    """A warning for a skin that is too slow for textures, "" for a faster skin."""
     if format.window >= FEW_FRAMES:
         return ""
     finest = ceil(20 * SLIDE_MM_S / format.rate_hz) / 10

@@ -221,7 +221,8 @@ class CountedStream:
         return arrived_ns - self._fit.to_host_ns(device_ns)
 
     def _times(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Host times of frames [n]. A better fit may move them back, but they never run backwards."""
+        """Host times of frames [n]. A better fit may move them back, but they never run
+        backwards."""
         first, last = int(numbers[0]), int(numbers[-1])
         first_ns, last_ns = (
             self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last)

@@ -1,5 +1,5 @@
-"""The skin of a box, whatever it speaks. In: settings and devices. Out: its profile, its sensor,
-the form of its sweeps before there is a bundle."""
+"""The skin of a box by its settings: its profile, its sensor, and the format of its sweeps if there
+is no bundle yet."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from appliance.io.skin_profile import SkinProfile
 from appliance.io.usb_sensor import LinkSensor, TransferObserver, UsbSensor, ask, open_link
 
 OWN = SITE.parent / "skins"
-"""Profiles that the owner of the box has written; one of the name of a delivered profile replaces
-it."""
-_FORM = re.compile(r"(\d{1,9})x(\d{1,9})(?:x(\d{1,9}))?:(\w+):(\d{1,9}(?:\.\d+)?)", re.ASCII)
+"""Profiles written by the owner of the box. They replace delivered profiles of the same name."""
+_DESCRIPTION = re.compile(r"(\d{1,9})x(\d{1,9})(?:x(\d{1,9}))?:(\w+):(\d{1,9}(?:\.\d+)?)", re.ASCII)
 
 
 def folders(settings: Config) -> list[Path]:
-    """Where profiles are; the first that has one of a name wins."""
+    """Folders of profiles; the first that has a profile has priority."""
     return list(dict.fromkeys((OWN, settings.folder / "skins")))
 
 
 def profile(settings: Config) -> SkinProfile:
-    """The profile that the settings name, with what they change in it. Raises ConfigError."""
+    """The profile that the settings name, with their changes. Raises ConfigError."""
     return skin_profile.adapted(
         skin_profile.load(settings.sensor.skin, folders(settings)), settings.sensor
     )
@@ -43,7 +42,7 @@ def sensor(
     chosen = profile(settings)
     if chosen.codec == "palpate":
         return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
-    # boxes with a board of PROTOCOL.md do without these modules
+    # boxes whose skin speaks PROTOCOL.md do without these modules
     from appliance.io.serial_link import SerialLink
     from appliance.io.serial_sensor import SerialSensor
 
@@ -54,24 +53,24 @@ def sensor(
 
 
 def open_board(settings: Config, devices: Devices) -> SkinLink:
-    """The opened board of a skin that speaks PROTOCOL.md. Raises ConfigError for another skin,
-    SensorError if there is none."""
+    """The opened readout board of a skin that speaks PROTOCOL.md. Raises ConfigError for another
+    skin, SensorError if there is none."""
     chosen = profile(settings)
     if chosen.codec != "palpate":
         raise ConfigError(
-            f'sensor.skin = "{settings.sensor.skin}" sends what its maker defines (codec '
+            f'sensor.skin = "{settings.sensor.skin}" sends a protocol of its maker (codec '
             f'"{chosen.codec}"), not PROTOCOL.md; '
-            'take sensor.skin = "palpate" for a board that does'
+            'use sensor.skin = "palpate" for a skin that does'
         )
     return open_link(_config(settings, chosen), devices.backend, devices.clock)
 
 
 def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = None) -> SweepFormat:
-    """The form of the skin's sweeps where no bundle says it: what the board announces, or what its
-    profile says, with a window of skin_profile.WINDOW_S. wanted: its rate is taken where the skin
-    can be set to it.
+    """The format of the skin's sweeps without a bundle: as announced by the readout board or
+    written in the profile, with a window of skin_profile.WINDOW_S. wanted: its rate is used if the
+    skin can be set to it.
 
-    Raises ConfigError, and SensorError where a board cannot be asked.
+    Raises ConfigError, or SensorError if the readout board cannot be asked.
     """
     chosen = profile(settings)
     if chosen.codec != "palpate":
@@ -91,14 +90,14 @@ def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = N
         return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)
     except FormatError as e:
         raise SensorMismatch(
-            f"the skin announces a form that cannot be: {e}; check its firmware"
+            f"the skin announces an invalid format: {e}; check its firmware"
         ) from e
 
 
 def described(text: str) -> SweepFormat:
-    """The form that a person describes as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example
-    "5x3:float32:100". Raises ConfigError."""
-    found = _FORM.fullmatch(text.strip())
+    """The format described as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example "5x3:float32:100". Raises
+    ConfigError."""
+    found = _DESCRIPTION.fullmatch(text.strip())
     if not found:
         raise ConfigError(
             f"--format {text}: not understood; give rows x columns (x axes), data type and frames "

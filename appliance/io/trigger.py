@@ -1,8 +1,7 @@
-"""The robot's trigger lines. In: GPIO edges, time-stamped by the kernel. Out: START, STOP and NEW
+"""Turns edges of the robot's GPIO lines, time-stamped by the kernel, into START, STOP and NEW
 OBJECT, debounced and in order of time.
 
-Edges that the kernel dropped or that came in a storm are reported as LOST; nothing is invented in
-their place.
+Edges that the kernel dropped, or that came in a storm, are reported as LOST and not guessed.
 """
 
 from __future__ import annotations
@@ -41,14 +40,12 @@ class Trigger(Protocol):
         ...
 
     @property
-    def edge_counters(self) -> EdgeCounters:
-        """Counts since the start."""
-        ...
+    def edge_counters(self) -> EdgeCounters: ...
 
     @property
     def about(self) -> dict[str, str]:
-        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: what the time of an
-        edge is."""
+        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: the origin of an edge's
+        time."""
         ...
 
     @property
@@ -58,19 +55,18 @@ class Trigger(Protocol):
 
 
 _Meaning = tuple[EdgeKind | None, EdgeKind | None]
-"""Meaning of a line's falling and of its rising edge; None: no meaning."""
+"""The meaning of a falling and of a rising edge of a GPIO line; None: no meaning."""
 
 
 @dataclass(slots=True)
 class _Line:
-    """An input line: its request, its settled level, and the burst of edges that has not settled
-    yet."""
+    """An input: its request, its settled level, and the burst of edges that has not settled yet."""
 
     request: LineRequest
     offset: int
     name: str
     meaning: _Meaning
-    seqno: int = 0  # of the newest event that was read
+    seqno: int = 0  # of the newest event
     known_ns: int = 0  # all events up to this time were read
     level: bool = False
     count: int = 0  # edges in the burst
@@ -80,7 +76,7 @@ class _Line:
 
 
 class GpioTrigger:
-    """Debounces the robot's lines.
+    """Debounces the robot's GPIO lines.
 
     A burst is a series of edges on one line with less than `glitch_us` between neighbours. It is
     settled `glitch_us` after its last edge. If the level then differs from the level before, the
@@ -105,9 +101,9 @@ class GpioTrigger:
         )  # newest edge since the levels became unknown; None: they are known
         roles = _roles(config)
         with ExitStack() as stack:
-            # separate: with several lines in a request the interrupt handler counts an edge and its
-            # thread delivers it; of two edges before the thread has run one count is never
-            # delivered, and each bounce would look like a loss
+            # separate requests: with several lines in a request, the interrupt handler counts an
+            # edge and its thread delivers it. Of two edges before the thread has run, one count is
+            # never delivered, so each bounce would look like a loss
             names = [name for name, _ in roles]
             requests = request_lines(
                 gpio, names, _input_settings(config, gpio), stack, separate=True
@@ -131,7 +127,7 @@ class GpioTrigger:
         """Edges that are settled at `now_ns` (the time before the call), in order of time; never
         waits."""
         for line in self._lines:
-            try:  # not `naming`: its generator costs more than polling an empty queue
+            try:  # not `naming`: its generator costs more than reading an empty queue
                 self._read(line, now_ns)
             except OSError as e:
                 raise line_error("read", [line.name], e) from e
@@ -167,7 +163,7 @@ class GpioTrigger:
         self.close()
 
     def _read(self, line: _Line, now_ns: int) -> None:
-        """Read the line's share of the `storm_edges` events of a call."""
+        """Read one line's share of the `storm_edges` events of a call."""
         left = max(1, self._storm_edges // len(self._lines))
         while left > 0 and line.request.wait_edge_events(0):
             events = line.request.read_edge_events(left)
@@ -192,7 +188,7 @@ class GpioTrigger:
         if not line.count:
             line.first_ns = t_ns
         # a rise may follow a rise: the kernel reads the level only after the interrupt, so the
-        # newest event is right
+        # level of the newest event is right
         line.count, line.last_ns, line.after = (
             line.count + 1,
             t_ns,

@@ -116,7 +116,8 @@ class TransferObserver(Protocol):
 
 
 class FrameStream(Protocol):
-    """Converts the bytes of a skin to Frames with unwrapped numbers and host times. It does no I/O."""
+    """Converts the bytes of a skin to Frames with unwrapped numbers and host times. It does no
+    I/O."""
 
     @property
     def loss_known(self) -> bool:

@@ -1,8 +1,7 @@
-"""The verdict as a class code on GPIO lines. In: verdicts. Out: class bits and RESULT VALID on
-Lines.
+"""Outputs the verdict as a class code on GPIO lines: class bits and RESULT VALID.
 
-Separate from gpio_lines.py, which must not import numpy: `cli.lower_outputs` uses it to lower the
-lines quickly.
+Separate from gpio_lines.py, which must not import numpy, since `cli.lower_outputs` needs to start
+fast.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ class LineSink(Observer):
 
 
 def check_bits(codes: int, labels: Sequence[str]) -> None:
-    """Raises ConfigError if there are fewer `codes` than labels and the code 0 need."""
+    """Raises ConfigError if `codes` are too few for the labels and the code 0."""
     if codes <= len(labels):
         raise ConfigError(
             f"{len(labels)} labels and the code 0 do not fit output.class_bits, which have "
             f"{codes} codes; "
-            "wire more lines, or none"
+            "wire more GPIO lines, or none"
         )

@@ -1,8 +1,8 @@
-"""The bytes of skins that do not speak PROTOCOL.md, in pure functions. In: bytes, with what earlier
-ones left over. Out: frames, and how many bytes belonged to none.
+"""Reads frames from the bytes of skins that do not speak PROTOCOL.md, in pure functions, and counts
+the bytes outside of frames.
 
-No received bytes make a codec raise, and none invents a frame: what is not enclosed by what its
-profile says is garbage.
+A codec accepts any bytes without raising, and invents no frame: bytes that are not enclosed as the
+profile describes are garbage.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from appliance.io.skin_profile import SkinProfile
 __all__ = ["Codec", "Decoded", "Rest", "arranged", "codec"]
 
 Codec = Callable[[Rest, bytes], Decoded]
-"""What was left over and new bytes -> what they contained."""
+"""Converts the rest of earlier bytes and new bytes to their content."""
 _MODULES = {
     "fixed": "fixed",
     "text": "text",
@@ -29,5 +29,5 @@ _MODULES = {
 
 def codec(profile: SkinProfile) -> Codec:
     """The codec of a profile that does not speak PROTOCOL.md."""
-    # a box has one skin, so it reads one of these modules
+    # a box has one skin, so it needs one of these modules
     return partial(import_module(f"{__name__}.{_MODULES[profile.codec]}").decode, profile)

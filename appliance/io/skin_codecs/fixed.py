@@ -1,5 +1,5 @@
 """Frames of a fixed length with a marker before or a trailer after each: FlexiTac, AnySkin, most
-matrices made at home."""
+self-made matrices."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from appliance.io.skin_codecs.frames import NONE, Decoded, Rest, arranged, colle
 from appliance.io.skin_profile import SkinProfile
 
 AMBIGUOUS_FRAMES = 32
-"""So many frames are kept while two places in them could be their beginning; then the oldest are
-given up."""
+"""Most frames that are kept while their beginning is ambiguous; then the oldest are dropped."""
 
 MOST_RIVALS = 8
-"""Places in a frame where marks may repeat; real frames have none or one."""
+"""Most places in a frame where the mark may repeat; real frames have none or one."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedLayout:
-    """Frames of a fixed length. mark: what stands between two of them: the end of one and the
-    beginning of the next. period: bytes from one mark to the next. tail: bytes of the mark that
+    """Frames of a fixed length. mark: the bytes between two frames, the end of the first and the
+    beginning of the second. period: bytes from one mark to the next. tail: bytes of the mark that
     belong to the frame before it."""
 
     profile: SkinProfile
@@ -49,8 +48,8 @@ def _layout(p: SkinProfile) -> FixedLayout:
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """A frame is what stands between two marks exactly one period apart, once it is known where
-    frames begin."""
+    """Read frames: the bytes between two marks that are exactly one period apart, once the
+    beginning of frames is known."""
     layout = _layout(profile)
     data, synced = rest.data + new, rest.synced
     at = garbage = before = 0
@@ -74,8 +73,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
             at, before = at + n * layout.period, 0
         if not broken:
             break
-        # a mark without another one at its distance: frames begin elsewhere now, or bytes are
-        # missing
+        # no mark follows one period later: bytes are missing, or this is not the beginning of a
+        # frame
         at, garbage, before, synced = at + 1, garbage + 1, before + 1, False
     left = Rest(data[at:], synced)
     if not runs:
@@ -90,7 +89,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
 def _columns(
     layout: FixedLayout, table: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Frames as bytes [n, period] -> raw counts, and sequence numbers where there are any."""
+    """Frames as bytes [n, period] -> raw counts, and sequence numbers if there are any."""
     begin, counts = len(layout.mark), NONE
     if layout.count:
         end = begin + layout.count.itemsize
@@ -102,8 +101,8 @@ def _columns(
 
 
 def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:
-    """How many frames follow the mark at `at`, and whether the next one is broken (False: its end
-    has not come)."""
+    """How many frames follow the mark at `at`, and whether the next frame is broken (False: it is
+    not complete yet)."""
     mark, period = layout.mark, layout.period
     n = 0
     while (end := at + (n + 1) * period) + len(mark) <= len(data):
@@ -126,14 +125,14 @@ def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, int, boo
 
 
 def _begins(layout: FixedLayout, data: bytes, at: int) -> int | None:
-    """0 if frames begin with the mark at `at`, else the bytes to pass over; None as long as more
-    are needed to tell.
+    """0 if frames begin with the mark at `at`, else the bytes to pass over; None if more bytes are
+    needed.
 
-    A mark may occur among the numbers, in every frame at the same place as long as the skin is at
-    rest. So a beginning is certain once two periods have followed it, and no other place within the
-    first is followed for as long. The answer does not depend on how many bytes have come beyond
-    those that it needs. Frames whose beginning cannot be told are passed over as a whole, and so
-    are those full of marks, which would cost more time than their bytes take to come.
+    A mark may also occur among the numbers, in every frame at the same place as long as the skin is
+    at rest. So a beginning is certain once two periods have followed it, and no other mark within
+    the first period is followed by two. The result does not depend on further bytes. Frames with an
+    ambiguous beginning are passed over as a whole. So are frames full of marks, which would take
+    more time to judge than to arrive.
     """
     mark, period, rivals = layout.mark, layout.period, [at]
     for i in range(1, AMBIGUOUS_FRAMES + 1):

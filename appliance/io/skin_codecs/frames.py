@@ -1,5 +1,5 @@
-"""What all codecs give: frames, with what is known of each. In: numbers in the order of the wire.
-Out: raw counts with rows along the direction of sliding."""
+"""The result of all codecs: raw counts with rows along the direction of sliding, and counts and
+times as far as the skin sends them."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from numpy.typing import NDArray
 from appliance.io.skin_profile import SkinProfile
 
 MOST_PACKET = 8192
-"""Longest packet or line, in bytes; a longer one has no end."""
+"""Longest packet or line, in bytes; after that it counts as garbage."""
 NONE = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """What a codec left over. synced: it begins with a frame, as the bytes before it have shown.
-    form: of the frames before it, where a codec remembers that."""
+    """The leftover of a codec. synced: it begins with a frame, as the bytes before it have shown.
+    layout: of the last frame, if the codec keeps it."""
 
     data: bytes = b""
     synced: bool = False
-    form: Any = None
+    layout: Any = None
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """What bytes contained.
+    """The content of bytes.
 
     taxels: raw counts [n, R, C] or [n, R, C, A]. ends: int64 [n], bytes up to the end of each
-    frame, counted from the beginning of what was left over. skipped: int64 [n], garbage right
-    before each. size: bytes of a frame, 0 without one. counts: int64 [n] sequence numbers of 32
-    bits, times_us: int64 [n] device time, 32 bits, each empty where the skin has none. garbage:
-    bytes in no frame. rest: for the next bytes. wrong: why these frames cannot be of the profile,
-    "" if they can.
+    frame, counted from the beginning of the leftover. skipped: int64 [n], garbage right before each
+    frame. size: bytes of a frame, 0 if there is none. counts: int64 [n], sequence numbers of 32
+    bits. times_us: int64 [n], device time of 32 bits. Both are empty if the skin sends none.
+    garbage: bytes outside of frames. rest: for the next bytes. wrong: why these frames do not fit
+    the profile, "" if they do.
     """
 
     taxels: NDArray[Any]
@@ -53,8 +53,8 @@ class Decoded:
 
 
 def arranged(profile: SkinProfile, numbers: NDArray[Any]) -> NDArray[Any]:
-    """Numbers as they are on the wire [n, rows * cols * values] -> raw counts [n, R, C] or [n, R,
-    C, A]: the chosen values, the normal axis last, rows along the direction of sliding,
+    """Numbers in the order of the wire [n, rows * cols * values] -> raw counts [n, R, C] or [n, R,
+    C, A]: the chosen values with the normal axis last, rows along the direction of sliding,
     little-endian."""
     grid = numbers.reshape(len(numbers), profile.rows, profile.cols, profile.values)
     if profile.take != tuple(range(profile.values)):
@@ -80,7 +80,7 @@ def collected(
     size: float,
     **more: Any,
 ) -> Decoded:
-    """Frames that were found one by one. numbers: of each frame, as on the wire."""
+    """Frames that were found one by one. numbers: of each frame, in the order of the wire."""
     table = (
         np.stack(numbers)
         if numbers

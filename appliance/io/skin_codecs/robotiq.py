@@ -1,4 +1,4 @@
-"""Packets of Robotiq's TSF-85 fingertips, of which the grids of static pressure are taken."""
+"""Packets of Robotiq's TSF-85 fingertips. Only their grids of static pressure are used."""
 
 from __future__ import annotations
 
@@ -15,29 +15,27 @@ _TSF_HEADER = 4
 _TSF_TAXELS = 28
 _TSF_READ, _TSF_AUTOSEND = 0x61, 0x58
 _TSF_FIELDS = {0x10: 2 * _TSF_TAXELS, 0x20: 2, 0x30: 6, 0x40: 6, 0x50: 6, 0x60: 2, 0x70: 8}
-"""Type of a field (high nibble) -> bytes of its numbers. 0x10 is the grid; the others are dynamic
+"""Type of a field (high nibble) -> bytes of its numbers. 0x10 is the grid. The others are dynamic
 pressure, accelerometer, gyroscope, magnetometer, temperature, time stamp."""
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Packets of fields, each followed by the next: there is no checksum. A frame is complete when
-    the grid of each finger has come, in one packet or in several."""
+    """Packets of fields without a checksum; a packet ends where the next begins. A frame is
+    complete with the grids of all fingers, in one packet or in several."""
     data = rest.data + new
     fingers = profile.rows * profile.cols // _TSF_TAXELS
     numbers: list[NDArray[Any]] = []
     ends: list[int] = []
     skipped: list[int] = []
     grids: dict[int, bytes] = {}
-    at = begun = garbage = before = size = (
-        0  # begun: where the packets of the frame under way begin
-    )
+    at = begun = garbage = before = size = 0  # begun: beginning of the packets of the current frame
     while (end := _tsf_end(data, at)) != 0:
         fields = _tsf_fields(data[at + _TSF_HEADER : end]) if end > 0 else None
         whole = fields is not None and not grids.keys() & fields.keys()
         upto = at + 1 if fields is None else at if not whole else begun
         if (
             upto > begun
-        ):  # no packet, or the other finger's grid did not come: what was collected is not whole
+        ):  # no packet, or a finger's grid is missing: the current frame is incomplete
             garbage, before, begun, grids = garbage + upto - begun, before + upto - begun, upto, {}
         if fields is None:
             found = data.find(_TSF_START, begun)
@@ -55,7 +53,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
 
 
 def _tsf_end(data: bytes, at: int) -> int:
-    """Where the packet at `at` ends; 0 if more bytes are needed, -1 if there is no packet."""
+    """The end of the packet at `at`; 0 if more bytes are needed, -1 if there is no packet."""
     head = data[at : at + _TSF_HEADER]
     if not head.startswith(_TSF_START[: len(head)]):
         return -1

@@ -19,8 +19,8 @@ _MOST_FLOAT = float(np.finfo(np.float32).max)
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Numbers between spaces, commas, semicolons or tabs; a line is a frame, or a row of one that a
-    shorter line ends."""
+    """Numbers between spaces, commas, semicolons or tabs. A line is a frame, or a row of a frame
+    that a shorter line ends."""
     data = rest.data + new
     per_line = profile.cols * profile.values * (profile.rows if profile.lines == "frames" else 1)
     lines = 1 if profile.lines == "frames" else profile.rows
@@ -53,8 +53,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
 
 
 def _numbers(profile: SkinProfile, line: bytes, most: int) -> NDArray[Any] | None:
-    """The numbers of a line, None if it holds anything else or one that its type cannot hold. A
-    line with more than `most` is cut one number behind them."""
+    """The numbers of a line; None if it contains anything else, or a number outside the range of
+    its type. A line with more than `most` is cut after most + 1."""
     words = line.translate(_BETWEEN).split()[: most + 1]
     if profile.number == "float32":
         if not all(map(_DECIMAL.fullmatch, words)):

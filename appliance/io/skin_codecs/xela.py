@@ -18,18 +18,18 @@ _LINE_END = re.compile(rb"[\r\a\n]")
 _CAN_ANSWER = re.compile(rb"[zZ]?|V[0-9A-Fa-f]{4}|N[0-9A-Za-z]{4}")
 _NO_VALUE = 250
 _WRONG_TAXELS = 4
-"""So many numbers of taxels beyond the grid in one read are no noise."""
+"""This many taxel numbers beyond the grid in one read are not noise."""
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """One CAN frame a taxel, in the order of their numbers; a frame of the skin is complete with
-    its last taxel."""
+    """One CAN frame for each taxel, in the order of taxel numbers. A frame of the skin is complete
+    with its last taxel."""
     data = rest.data + new
     taxels = profile.rows * profile.cols
     numbers: list[NDArray[Any]] = []
     ends: list[int] = []
     skipped: list[int] = []
-    found: list[bytes] = []  # the bytes of taxels 0, 1, 2, ... of the frame that is under way
+    found: list[bytes] = []  # the bytes of taxels 0, 1, 2, ... of the current frame
     at = begun = garbage = before = size = beyond = 0
     while match := _LINE_END.search(data, at):
         line, at = data[at : match.start()], match.end()
@@ -41,8 +41,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         if taxel == len(found) < taxels and values[0] < _NO_VALUE:
             found.append(values)
         else:
-            # out of turn, no value, or no taxel at all: the frame under way is not whole; taxel 0
-            # begins another
+            # out of order, without a value, or not a taxel: the current frame is incomplete, and
+            # taxel 0 begins another
             fresh = taxel == 0 and values[0] < _NO_VALUE
             upto = match.end() - len(line) - 1 if fresh else at
             garbage, before = garbage + upto - begun, before + upto - begun

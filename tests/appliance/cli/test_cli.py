@@ -544,7 +544,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
             "2x2 uint8 at 10 Hz",
         ),
         (["run", "--trigger", "serial"], ConfigError, "serial.port names none"),
-        (["run", "--trigger", "key"], ConfigError, "standard input is no terminal"),
+        (["run", "--trigger", "key"], ConfigError, "standard input is not a terminal"),
         (
             ["run", "--trigger", "key", "--every", "3"],
             ConfigError,
@@ -688,7 +688,7 @@ def test_skin_check_fails_with_a_part(
         (
             ["--set", "sensor.skin=anyskin"],
             78,
-            'sensor.skin = "anyskin" sends what its maker defines (codec "fixed")',
+            'sensor.skin = "anyskin" sends a protocol of its maker (codec "fixed")',
         ),
     ],
 )

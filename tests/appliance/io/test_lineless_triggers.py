@@ -176,7 +176,7 @@ def test_what_is_no_terminal_is_refused(what: str):
     read, write = os.pipe()
     try:
         with pytest.raises(
-            ConfigError, match=r'standard input is no terminal; run it in one, or use "serial"'
+            ConfigError, match=r'standard input is not a terminal; run it in one, or use "serial"'
         ):
             KeyTrigger(read if what == "pipe" else -1, rig.VirtualClock(), lambda line: None)
     finally:
@@ -296,7 +296,7 @@ def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
             "a sweep of 1 s is shorter than the window of 2 s",
         ),
         (("trigger.mode=timed", "trigger.sweep_s=6"), "leaves no pause"),
-        (("trigger.mode=key",), "is no terminal"),
+        (("trigger.mode=key",), "is not a terminal"),
     ],
 )
 def test_a_box_that_could_not_sweep_does_not_start(
