@@ -59,7 +59,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
         f"what it names of the sweeps that fit --split left out: {shlex.join(commands[-1])}\n"
         in out
     )
-    assert "left out: README.md: its name does not fit the pattern" in out
+    assert "left out: README.md: its name does not match the pattern" in out
     found = re.search(r"named rightly: (\d+) of 18: ", out)
     assert found
     assert int(found[1]) >= 12
@@ -84,7 +84,7 @@ def test_a_broken_file_is_told_and_the_others_are_imported(
     args += ["--out", str(tmp_path / "s.h5"), "--report", str(tmp_path / "report.txt")]
     assert main(args) == 65
     told = capsys.readouterr()
-    assert "left out: foam_p0_1.csv: line 3, column 2 is 'x', which is no number" in told.out
+    assert "left out: foam_p0_1.csv: line 3, column 2 is 'x', which is not a number" in told.out
     assert told.err.splitlines()[-1].startswith(
         "palpate-train: 1 of 4 files could not be used, as said above"
     )
@@ -114,7 +114,7 @@ def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.Cap
     told = capsys.readouterr()
     assert told.out.count("left out: ") == 6
     assert (
-        "left out: 7 more for the same reason: it has 5 columns, a grid of 4x4 takes 16" in told.out
+        "left out: 7 more for the same reason: it has 5 columns, but a grid of 4x4 needs 16" in told.out
     )
     assert "none of 12 files could be taken" in told.err
     assert not (tmp_path / "s.npz").exists()
