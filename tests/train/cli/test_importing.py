@@ -114,9 +114,10 @@ def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.Cap
     told = capsys.readouterr()
     assert told.out.count("left out: ") == 6
     assert (
-        "left out: 7 more for the same reason: it has 5 columns, but a grid of 4x4 needs 16" in told.out
+        "left out: 7 more for the same reason: it has 5 columns, but a grid of 4x4 needs 16"
+        in told.out
     )
-    assert "none of 12 files could be taken" in told.err
+    assert "none of 12 files could be imported" in told.err
     assert not (tmp_path / "s.npz").exists()
     assert len((tmp_path / "report.txt").read_text().splitlines()) == 12
 
