@@ -128,8 +128,8 @@ def settings_tables() -> str:
 
 
 def described(group: Any) -> tuple[str, dict[str, str]]:
-    """What a section of the settings is about, and each key's meaning, from its docstring: text,
-    then `key: meaning.`, or `key, key: meaning.`"""
+    """The purpose of a section of the settings and the meaning of each key, from its docstring:
+    the purpose, then `key: meaning.`, or `key, key: meaning.`"""
     names = "|".join(group.__dataclass_fields__)
     parts = re.split(
         rf"(?:^|(?<=\s))((?:{names})(?:, (?:{names}))*): ", " ".join(group.__doc__.split())

@@ -180,7 +180,7 @@ def test_settings_of_the_text_exist():
 
 
 def test_exit_codes_are_those_of_the_code():
-    """The codes of `palpate --help`, of the errors, and what the unit does about them."""
+    """The codes of `palpate --help`, of the errors, and the reaction of the unit to each."""
     shown = {int(cells[0]): cells for cells in rows("reference/exit-codes.md", "exit code")}
     assert [*shown] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
     codes = {k.exit_code for k in vars(errors).values() if isinstance(k, type)}
@@ -370,7 +370,7 @@ def test_the_trial_is_described_as_it_is():
 
 
 def test_the_change_log_knows_this_version():
-    """Versions go down, the newest is this one, each with what was added, changed or fixed."""
+    """Versions go down, the newest is the present version. Each has its additions, changes or fixes."""
     heads = re.findall(r"(?m)^## (\d+\.\d+\.\d+)", CHANGES)
     assert heads[0] == __version__
     assert heads == sorted(heads, key=lambda v: [*map(int, v.split("."))], reverse=True)

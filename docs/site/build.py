@@ -145,7 +145,7 @@ def training_commands() -> str:
 
 
 def linked(page: Path, text: str, out: Path, lost: list[str]) -> str:
-    """The text with its links checked: what they lead to is copied as well, and README's page is
+    """The text with its links checked. Linked files are copied as well, and README's page is
     `index`. Links that lead nowhere are added to `lost`."""
 
     def follow(found: re.Match[str]) -> str:
