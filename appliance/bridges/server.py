@@ -37,7 +37,8 @@ class TcpPeer:
 
     async def read(self, timeout_s: float | None) -> bytes:
         """What has come, b"" at the end. Raises TimeoutError, ConnectionError."""
-        data = await asyncio.wait_for(self._reader.read(4096), timeout_s)
+        async with asyncio.timeout(timeout_s):
+            data = await self._reader.read(4096)
         self.heard_s = self._now_s()
         return data
 
@@ -50,7 +51,8 @@ class TcpPeer:
 
     async def flush(self, timeout_s: float) -> None:
         """Wait until the peer has taken what was sent. Raises TimeoutError, ConnectionError."""
-        await asyncio.wait_for(self._writer.drain(), timeout_s)
+        async with asyncio.timeout(timeout_s):
+            await self._writer.drain()
 
     def drop(self) -> None:
         """End the connection at once."""
@@ -61,7 +63,8 @@ class TcpPeer:
         program can end."""
         with suppress(OSError, TimeoutError):
             self._writer.close()
-            await asyncio.wait_for(self._writer.wait_closed(), CLOSE_S)
+            async with asyncio.timeout(CLOSE_S):
+                await self._writer.wait_closed()
         self.drop()
 
 
@@ -133,7 +136,8 @@ async def until(stop: asyncio.Event, every_s: float, work: Callable[[], Awaitabl
     while not stop.is_set():
         await work()
         with suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), every_s)
+            async with asyncio.timeout(every_s):
+                await stop.wait()
     log.info("stopped")
 
 

@@ -92,7 +92,8 @@ class TcpBridge:
                     await asyncio.to_thread(
                         self._line.write, sentence(command.kind, *command.fields)
                     )
-                    return await asyncio.wait_for(self._answer, ANSWER_S)
+                    async with asyncio.timeout(ANSWER_S):
+                        return await self._answer
                 except LinkLost as e:
                     why = str(e)
                 except TimeoutError:

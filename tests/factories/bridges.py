@@ -62,7 +62,11 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
             assert process.poll() is None, "the bridge has ended by itself"
         finally:
             process.terminate()
-            process.wait(LONG_S)
+            try:
+                process.wait(LONG_S)
+            except subprocess.TimeoutExpired:  # else closing its pipe would wait forever
+                process.kill()
+                raise
 
 
 class RawModbus:

@@ -39,3 +39,28 @@ async def _peers_after_the_end() -> int:
         served.cancel()
         await asyncio.wait([served])
         return len(server.peers)
+
+
+def test_a_task_that_is_cancelled_as_bytes_arrive_ends() -> None:
+    """A cancelled task ends, in whichever turn of the loop the bytes came. With asyncio.wait_for of
+    Python 3.11 it went on, and the bridge never ended after SIGTERM."""
+
+    async def ends(turns: int) -> bool:
+        reader = asyncio.StreamReader()
+        peer = TcpPeer(reader, None, asyncio.get_running_loop().time)  # type: ignore[arg-type]
+
+        async def serve() -> None:
+            while True:
+                await peer.read(LONG_S)
+
+        serving = asyncio.create_task(serve())
+        await asyncio.sleep(0.01)
+        reader.feed_data(b"x")
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        serving.cancel()
+        _, waiting = await asyncio.wait([serving], timeout=1)
+        serving.cancel()
+        return not waiting
+
+    assert [turns for turns in range(6) if not asyncio.run(ends(turns))] == []

@@ -207,6 +207,25 @@ def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
     assert right == sentence("ANS", "STOP", "ok")
 
 
+def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
+    """The task does not go on, as it did with asyncio.wait_for of Python 3.11: then the bridge never
+    ended after SIGTERM."""
+
+    async def run() -> bool:
+        bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
+        asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
+        while bridge._asked != "STOP":
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.05)
+        bridge._pass_on(Sentence("ANS", "STOP,ok", summed=True))
+        asking.cancel()
+        await asyncio.wait([asking])
+        bridge.close()
+        return asking.cancelled()
+
+    assert asyncio.run(run())
+
+
 def test_a_silent_peer_makes_room():
     """A full server gives up who has been silent longest, but nobody who has spoken lately."""
 
