@@ -1,1 +1,2 @@
-"""What is fitted after training, on what the trunk gives: temperatures, early exit, novelty."""
+"""Closed-form statistics of features: heads, early answers, unknown materials, displaced
+contacts."""

@@ -1,7 +1,7 @@
-"""Contacts of a training set: the load that counts as contact, and the positions where it was.
+"""Contacts of a training set: the load that counts as contact, and the positions of the contacts.
 
-The box uses both: a window without a load above the limit is `no-contact`, and a contact far from
-all trained positions is displaced. Where the recordings contain the unloaded skin, a load is the
+The box uses both. A window without a load above the limit is `no-contact`, and a contact far from
+all trained positions is displaced. If the recordings contain the unloaded skin, a load is the
 difference from it. Otherwise raw counts are taken as loads, if they can be.
 """
 
@@ -69,8 +69,7 @@ class ContactCentres:
 
 @dataclass(frozen=True, slots=True)
 class Contacts:
-    """The limit and the centres of a training set; centres: None if there is no limit, or nothing
-    touched the skin. pitch_mm: of a simulated skin, whose pitch is known; else None."""
+    """The limit and the centres of a training set; centres: None without a limit or a contact. pitch_mm: of a simulated skin, whose pitch is known; else None."""
 
     limit: ContactLimit
     centres: ContactCentres | None
@@ -164,11 +163,11 @@ def _limit_of_raw_counts(means: Array) -> ContactLimit:
 
 
 def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
-    """The centre of contact at each position of `sweeps`, else of each recording; None without a
-    limit or a contact. Loads are those of a box that was not tared.
+    """The centre of contact at each position of `sweeps`, or in each recording if positions are
+    unknown; None without a limit or a contact. Loads are those of a box that was not tared.
 
-    The limit keeps 97 % of positions whose own sweeps were left out, judged by their farthest
-    sweep, as novelty.limit computes it; it keeps all of 33 positions or fewer.
+    The limit of the distance keeps 97 % of positions whose own sweeps were left out, judged by
+    their farthest sweep, as novelty.limit computes it. It keeps all of 33 positions or fewer.
     """
     if limit.contact is None:
         return None

@@ -1,9 +1,9 @@
-"""Sweeps of a moved skin. In: features of augmented copies of sweeps. Out: their distances, and the
-rule for them.
+"""Sweeps with a displaced contact: their distances from known materials, and the rule for them.
 
-A skin that was put back elsewhere changes a known material more than another material would. Where
-the contact shows that it has moved, distances are therefore measured as augmented copies of the
-training sweeps scatter, and certainty as copies of held-out sweeps are named rightly.
+A skin that was put back elsewhere changes the features of a known material more than another
+material would. If the contact is displaced, distances are therefore measured relative to the
+scatter of augmented copies of the training sweeps, and certainty is limited by the accuracy on
+copies of held-out sweeps.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
 MOST_WRONG = 0.0125
-"""Share of held-out copies that may be named wrongly with status ok. Heads that have learnt from
-copies name these better than sweeps of a skin that really moved: with .0125 a fit for a skin that
-is put back names 4 % of sim:T-HARD:201-236:2 wrongly."""
+"""Share of held-out copies that may be named wrongly with status ok. Heads that were fitted to
+copies name copies better than sweeps of a skin that was really displaced: with .0125 a fit for a
+reattached skin names 4 % of sim:T-HARD:201-236:2 wrongly."""
 UNSURE = np.arange(50, 100) / 100
-"""Least probabilities that a moved sweep may need."""
+"""Candidates for the least probability with which a displaced sweep is ok."""
 NEVER = 1.01
 """A least probability that no sweep reaches."""
 
 
 @dataclass(frozen=True)
 class AugmentedCopies:
-    """The sweeps again, augmented: features [M, F], labels [M], groups [M].
+    """Augmented copies of sweeps: features [M, F], labels [M], groups [M].
 
-    They show the head that names the material how materials vary. The embedding does not see them:
-    with them an unknown material would lie among the known ones. held: bool [M], those of sweeps
-    that the trunk did not see; no head is fitted to them, they judge.
+    The head that names the material learns from them how materials vary. The embedding does not see
+    them, because an unknown material would then lie among the known ones. held: bool [M], copies of
+    sweeps that the trunk did not see; heads are judged by them and not fitted to them.
     """
 
     features: Array
@@ -45,7 +45,7 @@ class AugmentedCopies:
     held: Array
 
     def take(self, index: Array) -> AugmentedCopies:
-        """Those that `index` (bool [M]) names."""
+        """The copies that `index` (bool [M]) selects."""
         return AugmentedCopies(
             self.features[index], self.labels[index], self.groups[index], self.held[index]
         )
@@ -68,11 +68,11 @@ class DisplacementFit:
 def fit_displacement(
     whole: Array, labels: Array, judged: Array, fixed: int, copied: AugmentedCopies, logits: Array
 ) -> DisplacementFit | None:
-    """The rule for moved sweeps; None where there are no copies to fit it or to judge by.
+    """The rule for displaced sweeps; None if there are no copies to fit it to or to judge by.
 
-    whole, labels, judged: features [N, F], labels [N] and bool [N] as for calibrate.fit_calibration.
-    logits: [m, K] of the copies that are held out, calibrated for sweeps in place, by a head that
-    saw none of their groups.
+    whole, labels, judged: features [N, F], labels [N] and bool [N] as in CalibrationInputs. logits:
+    [m, K] of the held-out copies, calibrated for contacts that are in place, by a head that saw
+    none of their groups.
     """
     fitted, judging = copied.take(~copied.held), copied.take(copied.held)
     if (
@@ -82,8 +82,8 @@ def fit_displacement(
         return None
 
     def turn(fit: Array) -> tuple[Embedding, Embedding]:
-        """An embedding fitted to the sweeps `fit`, bool [N], and that of what it makes of the
-        copies."""
+        """An embedding of the sweeps `fit` (bool [N]), and an embedding of the copies after the
+        first."""
         z = embed(whole[fit], labels[fit], fixed)
         return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
 

@@ -1,9 +1,9 @@
-"""Early decisions. In: an embedding of each tenth of a sweep. Out: a head for each tenth, and the
-rule.
+"""Early answers: a head for each prefix of the window, and the rule for answering before its end.
 
-The box asks after each tenth of the window; it decides when the last few heads agree and the newest
-is certain enough. The probability required is found on sweeps that the heads did not see; where
-these do not support one there is no rule.
+The box computes the heads after each tenth of the window. It answers as soon as the last few heads
+agree and the newest is certain enough. The required probability is found on sweeps that the heads
+did not see; without a sufficient probability the
+box does not answer early.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ Array = NDArray[Any]
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
 """Probabilities that a rule may require, the strictest first."""
 AGREE = (1, 2, 3)
-"""How many successive steps a rule may require to agree."""
+"""Numbers of successive steps that a rule may require to agree."""
 ABSENT = -1e4
 """Logit of a label without a sweep, before it is divided by the temperature."""
 MAX_LOSS = 0.005
-"""Share of sweeps that deciding early may turn from right to wrong."""
+"""Share of sweeps whose right answer may become wrong by an early answer."""
 MIN_SWEEPS = 40
-"""Sweeps that a rule is found on at least."""
+"""Smallest number of sweeps to find a rule on."""
 MAX_SHARE = 0.95
-"""Mean share of the sweep above which a rule is not worth having."""
+"""Largest mean share of the window that a rule may need."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Heads:
     bias: Array
 
     def logits(self, z: Array) -> Array:
-        """Embeddings [n, D or more, r] of the window's first parts -> logits [n, D, K]."""
+        """Embeddings [n, D or more, r] of prefixes of the window -> logits [n, D, K]."""
         steps: Array = np.einsum("ndr,drk->ndk", z[:, : len(self.weight)], self.weight) + self.bias
         return steps
 
     def cooled(self, temperatures: Array) -> Heads:
-        """The same, divided by the temperature of each step [D]."""
+        """The same heads, divided by the temperature of each step [D]."""
         by = np.asarray(temperatures)[:, None]
         return Heads(
             (self.weight / by[..., None]).astype(np.float32), (self.bias / by).astype(np.float32)
@@ -57,10 +57,11 @@ class Heads:
 
 @dataclass(frozen=True)
 class EarlyRule:
-    """What was found. early: for the manifest; None where there is no rule, and then `why`.
+    """A rule, with its figures on the sweeps it was found on. early: for the manifest; None if
+    there is no rule, with the reason in `why`.
 
-    share: mean share of the sweep that it needs; lost: share of sweeps that it turns from right to
-    wrong, both on the sweeps it was found on; n: their number.
+    share: mean share of the window that it needs. lost: share of sweeps whose right answer it turns
+    into a wrong one. n: number of sweeps.
     """
 
     early: Early | None
@@ -71,10 +72,10 @@ class EarlyRule:
 
 
 def heads(z: Array, labels: Array, classes: int) -> Heads:
-    """Heads for all rows but the last of the embeddings z [N, D + 1, r]: shrinkage LDA with equal
-    priors, temperature 1.
+    """Heads for all prefixes but the last, from embeddings z [N, D + 1, r]: shrinkage LDA with
+    equal priors, at temperature 1.
 
-    A label without a sweep among `labels` gets logits far below all others.
+    A label without a sweep gets logits far below all others.
     """
     steps = [lda(z[:, d], labels, classes) for d in range(z.shape[1] - 1)]
     return Heads(np.stack([weight for weight, _ in steps]), np.stack([bias for _, bias in steps]))
@@ -102,12 +103,12 @@ def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
 def cross_fitted_logits(
     tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
 ) -> tuple[Array, Array]:
-    """Logits [n, D + 1, K], temperature 1, of each step and the whole sweep, and the numbers [n] of
-    their sweeps.
+    """Logits [n, D + 1, K] of each prefix and the whole window at temperature 1, and the numbers
+    [n] of their sweeps.
 
-    tenths: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding and
-    heads that did not see its group (int [N]); sweeps of a material that occurs in no other part
-    are left out. Raises FormatError as novelty.parts.
+    prefixes: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding
+    and heads that did not see its group (int [N]). Sweeps of a material that occurs in no other
+    part are left out. Raises FormatError as novelty.parts.
     """
     classes, logits, numbers = int(labels.max()) + 1, [], []
     for fit, judges in parts(groups, judged):
@@ -124,19 +125,19 @@ def cross_fitted_logits(
 
 
 def fit_temperatures(logits: Array, labels: Array, groups: Array) -> Array:
-    """One for each step and the whole: logits [n, D + 1, K] of sweeps that the heads did not see ->
-    [D + 1]."""
+    """A temperature [D + 1] for each prefix and the whole window, from logits [n, D + 1, K] of
+    sweeps that the heads did not see."""
     return np.array(
         [sufficient_temperature(step, labels, groups) for step in logits.swapaxes(0, 1)]
     )
 
 
 def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
-    """What the box answers, and when: probabilities [n, D + 1, K] -> labels [n], share of the sweep
-    [n].
+    """The answers of the box and their times: probabilities [n, D + 1, K] -> labels [n], share of
+    the window [n].
 
-    As the appliance's inference.early_exit decides, for many sweeps at once; the last row, the
-    whole window, always decides.
+    It decides as the appliance's inference.early_exit does, for many sweeps at once. The last
+    row, the whole window, always decides.
     """
     n, steps, _ = probabilities.shape
     label, certain = probabilities.argmax(2), probabilities.max(2) >= np.append(early.least, 0)
@@ -147,12 +148,12 @@ def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
 
 
 def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
-    """The rule that needs the least of the sweep, found on probabilities [n, D + 1, K] of sweeps
-    that the heads did not see.
+    """The rule that needs the smallest share of the window, found on probabilities [n, D + 1, K] of
+    sweeps that the heads did not see.
 
-    For each number of steps that must agree, levels are tried from the strictest on, and none after
-    the first that turns more than MAX_LOSS of the sweeps from right to wrong: a looser one that
-    seems to do better does so by chance (fixed sequence testing; Maurer et al. 1995).
+    For each number of steps that must agree, levels are tried from the strictest on, until one
+    turns more than MAX_LOSS of the sweeps from right to wrong. A looser level that seems to do
+    better after that does so by chance (fixed sequence testing; Maurer et al. 1995).
     """
     if (n := len(labels)) < MIN_SWEEPS:
         return EarlyRule(

@@ -25,11 +25,11 @@ Array = NDArray[Any]
 ABSENT = -1e4
 """Logit of a material without a sweep."""
 LEAST_SHRINKAGE = 1e-4
-"""Where the scatter is known so well that none is needed, equations with equal features must have a
+"""Least shrinkage: even if the scatter is known well, equations with equal features need a
 solution."""
 Given = tuple[Array, Array, Array, Array]
-"""What a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and labels
-[M] of augmented copies."""
+"""The data that a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and
+labels [M] of augmented copies."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class HeadPart:
 
 @dataclass(frozen=True)
 class HeadData:
-    """Sweeps that a head is fitted to. features: [N, F], labels [N]; copied: [M, F] of augmented
-    copies, and the number [M] of the sweep that each was made of."""
+    """Sweeps that a head is fitted to. features: [N, F], labels [N]. copied: [M, F] of augmented
+    copies; source: the number [M] of the sweep of each copy."""
 
     features: Array
     labels: Array
@@ -70,7 +70,7 @@ class HeadData:
         )
 
     def given(self) -> Given:
-        """What heads are fitted to."""
+        """The data as HeadPart.fit takes it."""
         return self.features, self.labels, self.copied, self.labels[self.source]
 
 
@@ -88,21 +88,21 @@ class HeadPlan:
         return weight, bias
 
     def cooled(self, temperature: float) -> HeadPlan:
-        """The same, its logits divided by `temperature`."""
+        """The same plan with logits divided by `temperature`."""
         return HeadPlan(tuple(replace(p, factor=p.factor / temperature) for p in self.parts))
 
     def uncooled(self) -> HeadPlan:
-        """The same with logits as sure as discriminants are by themselves, which is never too
-        modest."""
+        """The same plan with the logits of plain discriminants, whose probabilities are never too
+        low."""
         return self.cooled(max(part.factor for part in self.parts))
 
     def columns(self) -> Array:
-        """Numbers of the features that any of the discriminants sees, ascending."""
+        """Numbers of the features that a discriminant sees, ascending."""
         return np.unique(np.concatenate([np.array(part.columns) for part in self.parts]))
 
     def renumbered(self, kept: Array) -> HeadPlan:
-        """The same for a trunk with only the features `kept` (ascending numbers), which include
-        `columns`."""
+        """The same plan for a trunk with only the features `kept` (ascending numbers), which
+        include `columns`."""
         return HeadPlan(
             tuple(
                 replace(p, columns=tuple(np.searchsorted(kept, p.columns).tolist()))
@@ -111,12 +111,12 @@ class HeadPlan:
         )
 
     def json(self) -> list[dict[str, Any]]:
-        """For a fit's record."""
+        """The entry in the file of a fit."""
         return [asdict(part) for part in self.parts]
 
     @classmethod
     def read(cls, entries: Sequence[dict[str, Any]]) -> Self:
-        """What `json` gave."""
+        """The plan that gave these `entries`."""
         return cls(
             tuple(HeadPart(**entry | {"columns": tuple(entry["columns"])}) for entry in entries)
         )
@@ -126,8 +126,8 @@ def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Arra
     """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below
     `classes`.
 
-    The logits of a material without a sweep are ABSENT. Raises FormatError where there is only one
-    sweep of each material, which says nothing of how materials vary.
+    The logits of a material without a sweep are ABSENT. Raises FormatError if there is only one
+    sweep of each material, which does not show how materials vary.
     """
     present, member = np.unique(labels, return_inverse=True)
     x = np.asarray(features, np.float64)
@@ -170,7 +170,7 @@ def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
     """Ledoit and Wolf's share of the mean variance in the covariance of `z` [N, F], whose means are
     0, and that variance.
 
-    gram: z @ z.T or z.T @ z, whichever is smaller.
+    gram: the smaller of z @ z.T and z.T @ z.
     """
     n, size = z.shape
     trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2

@@ -1,10 +1,9 @@
-"""Detection of unknown materials. In: features of sweeps, labels, groups. Out: an Embedding, the
-limit of its distances.
+"""Detection of unknown materials: an embedding of features, and the limit of its distances.
 
 The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps
 of every material scatter around its mean with covariance 1. The nearest mean names the material, as
-LDA does, and a sweep far from all of them is of an unknown material. The box needs only this map
-and the means.
+in LDA, and a sweep far from all means is of an unknown material. The box needs only this map and
+the means.
 """
 
 from __future__ import annotations
@@ -25,13 +24,12 @@ from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 KEPT = 0.985
-"""Share of known sweeps that the limit keeps: the others are lost to the robot, whatever the
-network gave (docs/decisions/0006)."""
+"""Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
+network computes (docs/decisions/0006)."""
 PARTS = 10
-"""Into how many parts groups are divided at most; each part is judged by what was fitted to the
-others."""
+"""Largest number of parts of the groups; each part is judged by a fit to the others."""
 FLAT = 1e-9
-"""Least variance of a direction, relative to that of the widest one: a silent channel stays
+"""Least variance of a direction, relative to that of the widest direction: a silent channel stays
 finite."""
 
 
@@ -40,12 +38,12 @@ class Embedding:
     """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each
     label.
 
-    The projection [F, r] is in two parts, for most of it only selects: directions [F, d] and the
-    last F' features as they are, side by side, times turn [d + F', r]. F' is 0 where that would
-    save nothing.
+    The projection [F, r] is kept in two factors, because most of it only selects features:
+    directions [F, d] and the last F' features themselves, side by side, times turn [d + F', r]. F'
+    is 0 if two factors would not be smaller.
 
     The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et
-    al. 2018). shapes: float16 [K, b, b], how each material's own sweeps scatter in the last b
+    al. 2018). shapes: float16 [K, b, b], the scatter of each material's own sweeps in the last b
     directions; see the box's shaped_distances.
     """
 
@@ -57,7 +55,7 @@ class Embedding:
 
     @property
     def selected(self) -> int:
-        """How many features, the last ones, are turned as they are."""
+        """Number of features, the last ones, that `turn` takes as they are."""
         return int(self.turn.shape[0] - self.directions.shape[1])
 
     @cached_property
@@ -80,7 +78,7 @@ class Embedding:
         return squares
 
     def classes(self) -> Classes:
-        """The means as a bundle holds them, each counted as trained."""
+        """The means as a bundle holds them; each counts as trained."""
         bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
         return Classes(
             self.means,
@@ -91,8 +89,8 @@ class Embedding:
         )
 
     def novelty(self, features: Array) -> Array:
-        """Squared distance [...] of features [..., F] to the nearest mean, each material's scatter
-        being its own: what the limit is compared with."""
+        """Squared distance [...] of features [..., F] to the nearest mean, with the scatter of each
+        material. The limit is a limit of this."""
         away = self(features)[..., None, :] - self.means.astype(np.float64)
         nearest: Array = shaped_distances(away, self.shapes.astype(np.float64)).min(axis=-1)
         return nearest
@@ -110,10 +108,12 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     fixed, F) directions.
 
     The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1
-    directions hold everything that LDA uses; more are added until the last `fixed` features, which
-    were not trained (see spectrum.py), are in it completely: trained materials do not differ there,
-    but an unknown one may. There each material has its own shape. Raises FormatError where there is
-    one material, a label is missing, or each material has only one sweep.
+    directions hold everything that LDA uses. More are added until they contain the last `fixed`
+    features, which were not trained (see spectrum.py): trained materials do not differ there, but
+    an unknown one may. In these directions each material has its own shape.
+
+    Raises FormatError if there is one material, if a label is missing, or if each material has only
+    one sweep.
     """
     labels = np.asarray(labels)
     if len(missing := np.setdiff1d(np.arange(labels.max(initial=0) + 1), labels)):
@@ -155,8 +155,8 @@ def _shape(away: Array) -> Array:
     """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n,
     b] from a class mean.
 
-    The covariance is that of the class's own sweeps, pulled towards 1, that of all classes, as if b
-    more sweeps had it (regularized discriminant analysis; Friedman 1989).
+    The covariance is that of the material's own sweeps, pulled towards 1, the covariance of all
+    materials, as if b more sweeps had it (regularized discriminant analysis; Friedman 1989).
     """
     n, b = away.shape
     covariance = (away.T @ away + b * np.eye(b)) / (n + b) if b else np.eye(0)
@@ -165,20 +165,19 @@ def _shape(away: Array) -> Array:
 
 
 def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
-    """The Embedding of sweeps among which a label may be missing, and the labels [K] of its
-    means."""
+    """The Embedding of sweeps that may lack some labels, and the labels [K] of its means."""
     present, numbered = np.unique(labels, return_inverse=True)
     return embed(features, numbered, fixed), present
 
 
 @dataclass(frozen=True)
 class _Whitening:
-    """W [F, F] with W' C W = 1, C being the covariance within materials: a diagonal matrix and that
-    of a few directions.
+    """W [F, F] with W' C W = 1, where C is the covariance within materials: a diagonal matrix plus
+    a matrix of a few directions.
 
     C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of
-    R. directions: V [F, n], orthonormal; variances: the diagonal [n] of S. Nothing of the size [F,
-    F] is computed where there are fewer sweeps.
+    R. directions: V [F, n], orthonormal; variances: the diagonal [n] of S. No matrix of the size
+    [F, F] is computed if there are fewer sweeps.
     """
 
     root: Array
@@ -205,9 +204,9 @@ class _Whitening:
 
 
 def _whitening(x: Array, labels: Array) -> _Whitening:
-    """Of the covariance that LinearDiscriminantAnalysis(shrinkage="auto") has: Ledoit and Wolf's of
-    each material's features [n, F], scaled to the same spread, and their mean, each as often as it
-    occurs."""
+    """The whitening for the covariance of LinearDiscriminantAnalysis(shrinkage="auto"): Ledoit and
+    Wolf's covariance of each material's features [n, F] at the same spread, averaged by the number
+    of sweeps."""
     diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
@@ -229,10 +228,10 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:
-    """Pairs (bool [N] to fit on, numbers of the sweeps that then judge).
+    """Pairs (bool [N] to fit to, numbers of the sweeps to judge the fit by).
 
-    Each sweep of `judged` (bool [N]) judges once, what was fitted without its group. groups: int
-    [N], divided into `most` parts at most. Raises FormatError where there is only one group.
+    Each sweep of `judged` (bool [N]) judges once, a fit that did not see its group. groups: int
+    [N], divided into `most` parts at most. Raises FormatError if there is only one group.
     """
     values = np.unique(groups[judged])
     if len(np.unique(groups)) < 2:
@@ -250,7 +249,7 @@ def cross_fitted_distances(
     features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
 ) -> Array:
     """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups
-    (int [N]); NaN of the others.
+    (int [N]); NaN for the others.
 
     Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts`
     and `embed`.
@@ -265,11 +264,11 @@ def cross_fitted_distances(
 
 def limit(novelty: Array, kept: float = KEPT) -> float:
     """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not
-    trained on; NaN is left out.
+    trained on. NaN is left out.
 
-    The ceil((n + 1) * kept)-th smallest, as split conformal prediction takes it, so that a new
-    sweep is kept with at least that probability (Vovk et al. 2005); the largest where n is too
-    small for it. Raises FormatError where there is none.
+    It is the ceil((n + 1) * kept)-th smallest, as in split conformal prediction, so that a new
+    sweep is kept with at least that probability (Vovk et al. 2005); the largest if n is too small.
+    Raises FormatError if there is no novelty.
     """
     novelty = novelty[~np.isnan(novelty)]
     if not (n := len(novelty)):
@@ -281,11 +280,8 @@ def limit(novelty: Array, kept: float = KEPT) -> float:
 
 
 def auroc(known: Array, unknown: Array) -> float:
-    """The probability that a novelty of `unknown` [m] is above one of `known` [n], ties half (Mann
-    and Whitney).
-
-    Raises FormatError where there is none of either.
-    """
+    """The probability that a novelty of `unknown` [m] is above one of `known` [n], with ties
+    counted half (Mann and Whitney). Raises FormatError if either is empty."""
     if not len(known) or not len(unknown):
         raise FormatError(
             "no AUROC without sweeps of both kinds; test on known and on unknown ones"

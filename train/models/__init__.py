@@ -1,1 +1,1 @@
-"""Every way to name a material, behind one interface."""
+"""Every method that names a material, behind one interface."""

@@ -1,8 +1,7 @@
-"""An unfinished training in a file. In: all that it changes. Out: after an interruption the same
-training, bit for bit.
+"""A file of an unfinished training, from which it goes on with the same bits after an interruption.
 
-The file holds the state after some step. It is written whole or not at all; one that cannot be read
-counts as none.
+The file holds the state after some step. It is written whole or not at all, and a file that cannot
+be read is ignored.
 """
 
 from __future__ import annotations
@@ -20,28 +19,25 @@ from torch import Generator
 from appliance.core.storage import put
 
 EVERY_S, WRITING = 10.0, 0.003
-"""How often an unfinished training is written, and the share of the time that writing may take: the
-paper's CNN takes 250 MB and half a second each time."""
+"""Seconds between two files of an unfinished training, and the largest share of the time for
+writing them: the paper's CNN has files of 250 MB, which take half a second."""
 
 
 class Stateful(Protocol):
-    """A network, an optimizer, a schedule."""
+    """The state of a network, an optimizer or a schedule."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that changes in training."""
+        """Everything that training changes."""
         ...
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> Any:
-        """Take back what `state_dict` gave."""
+        """Restore the state that `state_dict` gave."""
         ...
 
 
 class Checkpoint:
-    """The state of a training: its parts, its random generators and (iteration, cost) of the steps
-    done.
-
-    path None: kept nowhere.
-    """
+    """The state of a training: its parts, its random generators and (iteration, cost) of the
+    finished steps. path: None to keep nothing."""
 
     def __init__(
         self, path: Path | None, parts: Mapping[str, Stateful], generators: Sequence[Generator]
@@ -50,8 +46,8 @@ class Checkpoint:
         self._next = time.monotonic() + wait(0.0)
 
     def load(self) -> list[tuple[int, float]]:
-        """Bring all parts and generators to the state in the file, and give the cost so far; []
-        where there is none."""
+        """Restore all parts and generators from the file and return the cost so far; [] without a
+        file."""
         kept = self._read()
         if kept is None:
             return []
@@ -62,7 +58,7 @@ class Checkpoint:
         return [(int(step), float(loss)) for step, loss in kept["cost"]]
 
     def _read(self) -> dict[str, Any] | None:
-        """What `save` wrote; None where the file is missing or cannot be read."""
+        """The content of the file; None if it is missing or cannot be read."""
         if self._path is None:
             return None
         try:
@@ -72,8 +68,8 @@ class Checkpoint:
         return kept
 
     def save(self, cost: list[tuple[int, float]]) -> None:
-        """Write the state, where the last time was long enough ago. cost: of every step done.
-        Raises OSError."""
+        """Write the state if the last file is old enough. cost: of every finished step. Raises
+        OSError."""
         if self._path is None or (start := time.monotonic()) < self._next:
             return
         packed = io.BytesIO()
@@ -86,12 +82,12 @@ class Checkpoint:
 
 
 def wait(took: float) -> float:
-    """Seconds until it is written again, where writing `took` so long."""
+    """Seconds until the next file, if the last took `took` seconds to write."""
     return max(EVERY_S, took / WRITING)
 
 
 def default_generators(device: str) -> tuple[Generator, ...]:
-    """PyTorch's own generators, from which dropout is drawn on `device`."""
+    """The generators of PyTorch from which dropout is drawn on `device`."""
     on_gpu = (
         (torch.cuda.default_generators[torch.cuda.current_device()],) if device == "cuda" else ()
     )

@@ -1,9 +1,8 @@
-"""Linear heads. In: features of training sweeps, or a graph that computes them. Out: a head, a
-temperature, a Model.
+"""Linear heads on features that a graph computes, and the sweeps that are held out to judge them.
 
-A head is found in closed form or by scikit-learn. One temperature, found on groups that were held
-out, makes its probabilities honest. minirocket.py and sthmp.py build the graphs; heads are fitted
-to what the graph gives on the box.
+A head is fitted in closed form or by scikit-learn, to the features that the graph gives on the box.
+One temperature, found on held-out groups, calibrates its probabilities. minirocket.py and sthmp.py
+build the graphs.
 """
 
 from __future__ import annotations
@@ -25,14 +24,13 @@ from train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
 HELD_OUT = 0.2
-"""Share of the groups that training does not see: they give the temperature and the validation
-accuracy."""
+"""Share of the groups that is held out from training, for temperature and validation."""
 ABSENT = -30.0
-"""Logit of a material that training never saw, where the best of the others is never below 0: its
-probability is below 1e-12."""
+"""Logit of a material that training never saw. The best of the other logits is never below 0, so
+the probability of such a material is below 1e-12."""
 SHARPENING = 30.0
-"""Factor on margins before `platt_temperature`: margins are about 1 and need sharpening, while it
-only softens."""
+"""Factor on margins before `platt_temperature`, which only softens: margins are about 1 and have to
+be sharpened."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +55,10 @@ class LinearHeadModel:
 
 
 def hold_out(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
-    """(to train on, held out, by which group): whole positions where there are several and these
-    allow it, else recordings.
+    """(training sweeps, held-out sweeps, name of the group): whole positions if there are several
+    and these allow it, else recordings.
 
-    Raises FormatError where the set has too few groups, or only one sweep of a material would be
+    Raises FormatError if the set has too few groups, or if only one sweep of a material would be
     left to train on.
     """
     if len(np.unique(sweeps.groups.get("position", 0))) > 1:
@@ -70,10 +68,8 @@ def hold_out(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
 
 
 def hold_out_or_all(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
-    """As linear_head.hold_out; too small a set is used whole on both sides, by "nothing".
-
-    Then only Platt's correction bounds the temperature.
-    """
+    """As `hold_out`; if the set is too small, all of it on both sides, by "nothing". Then only
+    Platt's correction bounds the temperature."""
     try:
         return hold_out(sweeps, seed)
     except FormatError:
@@ -97,7 +93,7 @@ def closed_form_head(
     """Weight [K, F] and bias [K], float32, of shrinkage LDA on `features` [N, F], with the
     temperature of `held_out` [n, F].
 
-    Raises FormatError where there is only one sweep of each material, which says nothing of how
+    Raises FormatError if there is only one sweep of each material, which does not show how
     materials vary.
     """
     if len(labels) <= len(np.unique(labels)):
@@ -123,9 +119,8 @@ def train_linear_head(
     `sweeps`.
 
     fit: (features [n, F], labels [n]) -> scikit-learn's coefficients [k, F] and intercepts [k] for
-    the k labels that occur, one row where k is 2. The temperature is found on the groups that
-    `hold_out` names, with a head that did not see them; it is 1 where `sweeps` are too few for
-    that.
+    the k labels that occur, in one row if k is 2. The temperature is found on the groups that
+    `hold_out` returns, with a head that did not see them; it is 1 if `sweeps` are too few.
     """
     present, labels = np.unique(sweeps.labels, return_inverse=True)
     computed = run(features, inputs)
@@ -144,7 +139,7 @@ def train_linear_head(
 
 
 def _centred(coefficients: Array, intercepts: Array) -> tuple[Array, Array]:
-    """One row for each label, less their mean: the largest margin is then never below 0."""
+    """One row for each label, minus their mean, so that the largest margin is never below 0."""
     coefficients, intercepts = np.atleast_2d(coefficients), np.atleast_1d(intercepts)
     if len(coefficients) == 1:  # of two labels scikit-learn gives the second one's margin
         coefficients, intercepts = (
@@ -155,7 +150,7 @@ def _centred(coefficients: Array, intercepts: Array) -> tuple[Array, Array]:
 
 
 def expanded_head(weight: Array, bias: Array, present: Array, classes: int) -> tuple[Array, Array]:
-    """A head for all `classes`, of which `present` were trained; as Network.expand_head."""
+    """A head for all `classes`, trained for those in `present`; see Network.expand_head."""
     all_weight, all_bias = (
         np.zeros((classes, weight.shape[1]), np.float32),
         np.full(classes, ABSENT, np.float32),

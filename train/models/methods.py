@@ -1,8 +1,7 @@
-"""All methods that name a material, behind one interface. In: a name. Out: a Method, which trains
-Models.
+"""All methods that name a material, behind one interface, by name.
 
-A model classifies many sweeps at once on the desktop, and gives the ONNX graph with which the box
-gives the same answers.
+A model classifies many sweeps at once on the desktop. Its ONNX graph gives the same answers on the
+box.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Array = NDArray[Any]
 Log = Callable[[str], None]
 """Shows a line of progress."""
 Cost = list[tuple[int, float]]
-"""(iteration, cross entropy of its batch), eq. 11: what the paper's Fig. 9 shows."""
+"""(iteration, cross entropy of its batch), eq. 11 of the paper and its Fig. 9."""
 SHIPPED = "default"
 """The method of `fit`."""
 PACKAGED = "default-reattached"
@@ -48,16 +47,16 @@ MODULES = (
     "train.models.peers.recurrent",
     "train.models.recipe.methods",
 )
-"""Each defines METHODS, and methods(effort) where it trains networks."""
+"""Each defines METHODS, and methods(effort) if it trains networks."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long networks are trained, for all of them.
+    """The length of trainings.
 
     share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
-    paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in it, where
-    the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
+    paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in bfloat16
+    if the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
     time, so that it goes on after an interruption.
     """
 
@@ -71,27 +70,25 @@ FULL_EFFORT = Effort()
 
 
 class Model(Protocol):
-    """A trained method. K: number of the training set's materials, whether or not each occurred in
-    training.
+    """A trained method. K: number of materials of the training set, including those that did not
+    occur in training.
 
-    It may have further attributes, which train.evaluation.fold reads: `ran` (what was computed),
-    `cost` (of the training) and `forms`, the same model in other precisions as Models by name.
+    It may have further attributes, which train.evaluation.fold reads: `ran` (a description of the
+    computation), `cost` (of the training) and `forms` (the same model in other precisions, as
+    Models by name).
     """
 
     def logits(self, inputs: Array) -> Array:
-        """Inputs of n sweeps -> float32 [n, K]; their softmax are calibrated probabilities.
+        """Inputs of n sweeps -> float32 [n, K]; their softmax is a calibrated probability.
 
-        inputs: raw counts [n, T, R, C] where the method's `input` is "raw", else features float32
-        [n, F].
+        inputs: raw counts [n, T, R, C] if the method's `input` is "raw", else features float32 [n,
+        F].
         """
         ...
 
     def graph(self) -> onnx.ModelProto:
-        """What the box runs: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits` float32
-        [1, K].
-
-        Raises FormatError where the method runs in its `library` alone.
-        """
+        """The graph for the box: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits`
+        float32 [1, K]. Raises FormatError if the method runs in its `library` alone."""
         ...
 
 
@@ -101,9 +98,9 @@ class Method:
 
     about: one line with its source. input: "raw" or a key of train.features.kinds.KINDS. train:
     (training sweeps, their model_inputs, seed) -> Model; the same arguments give the same model.
-    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: what an
-    Effort changes in it. library: what runs its models where they have no graph; they are timed
-    there and cannot be packed.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: the part
+    of an Effort that changes it. library: the library that runs its models if they have no graph;
+    they are timed there and cannot be packed.
     """
 
     name: str
@@ -116,8 +113,8 @@ class Method:
 
     @property
     def why_not_on_the_box(self) -> str:
-        """Why the box cannot run it: no graph, or features that the box does not compute; "" where
-        it can."""
+        """The reason why the box cannot run it: no graph, or features that the box does not
+        compute; "" if it can."""
         if self.library:
             return f"runs in {self.library} alone and has no graph"
         if self.input != "raw" and self.input not in features.KINDS:
@@ -135,8 +132,8 @@ def no_log(line: str) -> None:
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:
-    """What a method with the input `kind` takes of `sweeps`: raw counts [N, T, R, C], or features
-    float32 [N, F]."""
+    """The inputs of a method with the input `kind` for `sweeps`: raw counts [N, T, R, C], or
+    features float32 [N, F]."""
     if kind == "raw":
         return sweeps.samples
     return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
@@ -157,7 +154,7 @@ def module_of(name: str) -> str:
 
 
 def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
-    """The methods of these names. Raises FormatError naming one that is unknown."""
+    """The methods of these names. Raises FormatError with a name that is unknown."""
     known = every(effort)
     for name in names:
         if name not in known:

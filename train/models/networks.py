@@ -1,8 +1,8 @@
-"""What all networks share. In: the form of a sweep. Out: the base class Network, which writes its
-own ONNX graph.
+"""The base class of all networks.
 
 A network has a linear head on features of a sweep; `prepare` scales raw counts for the
-convolutions. Graphs are built with train.onnx_tools.graph_builder and take the sensor's raw counts.
+convolutions. It writes its own ONNX graph with train.onnx_tools.graph_builder, which takes the raw
+counts of the sensor.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ Array = NDArray[Any]
 class Network(nn.Module, ABC):
     """Base class of all networks.
 
-    scale: brings raw counts to about 1 after `offset` (None: each taxel's own mean) is subtracted.
-    dropout: share of the features that the head does not see in a training step.
+    scale: factor that brings raw counts to about 1 after `offset` is subtracted; offset None: the
+    mean of each taxel. dropout: share of the features that the head does not see in a training
+    step.
     """
 
     head: nn.Linear
@@ -43,10 +44,10 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def features(self, prepared: Tensor) -> Tensor:
-        """[B, R * C, T] as `prepare` gives -> what the head sees of it [B, F]."""
+        """Prepared sweeps [B, R * C, T] -> the features that the head sees [B, F]."""
 
     def training_logits(self, prepared: Tensor) -> Tensor:
-        """[B, R * C, T] as `prepare` gives -> logits [B, K]; with dropout before the head while
+        """Prepared sweeps [B, R * C, T] -> logits [B, K]; with dropout before the head while
         training."""
         logits: Tensor = self.head(
             functional.dropout(self.features(prepared), self.dropout, self.training)
@@ -54,7 +55,7 @@ class Network(nn.Module, ABC):
         return logits
 
     def head_input(self, counts: Tensor) -> Tensor:
-        """Raw counts [B, T, R, C] -> what the head sees of them [B, F]."""
+        """Raw counts [B, T, R, C] -> the features that the head sees [B, F]."""
         return self.features(self.prepare(counts))
 
     def forward(self, counts: Tensor) -> Tensor:
@@ -68,7 +69,7 @@ class Network(nn.Module, ABC):
 
     @torch.no_grad()
     def expand_head(self, present: Array, classes: int, temperature: float) -> None:
-        """Replace the head by one for all `classes`, of which `present` were trained; logits are
+        """Replace the head, trained for `present`, by a head for all `classes`; logits are
         divided by `temperature`.
 
         The trained logits are shifted to sum to 0, which changes no softmax; ABSENT lies far below

@@ -1,5 +1,5 @@
-"""Training of networks. In: a Network, a Dataset, a TrainingRecipe. Out: the trained network, its
-cost curve, a Method.
+"""Training of networks: from a Network, a Dataset and a TrainingRecipe to a trained network and its
+cost curve.
 
 Sweeps are drawn and augmented with a generator of their own. `learn` draws dropout from PyTorch's
 global generator, which the caller seeds and forks; no other random state is read or changed.
@@ -39,23 +39,23 @@ Net = TypeVar("Net", bound=Network)
 Recipe = TypeVar("Recipe", bound="TrainingRecipe")
 Augment = Callable[[Tensor, Generator], Tensor]
 Watch = Callable[[int, Network], None]
-"""Called after each step with its number and the network, which it leaves as it was; so it draws no
-random numbers."""
+"""Called after each step with its number and the network. It must neither change the network nor
+draw random numbers."""
 Build = Callable[[SweepFormat, int, Array], Network]
 """(format, number of materials, training samples [N, T, R, C]) -> an untrained network."""
 MIN_STEPS = 2
-"""However small the effort is."""
+"""Least number of iterations, for any effort."""
 
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """How a network is trained: AdamW (Adam where `weight_decay` is 0) on batches drawn from
-    shuffled rounds.
+    """The training of a network: AdamW (Adam if `weight_decay` is 0) on batches drawn from shuffled
+    rounds.
 
     cycle: the learning rate rises to `peak_rate` and falls again; else it is constant. ema: share
-    that the moving average of the weights keeps of itself each step. dropout: of the features
-    before the head. noise and gain: standard deviations, of a scaled taxel and of its factor.
-    adversarial: how far each scaled count is also moved in the direction in which the cost grows
+    of its old value that the moving average of the weights keeps in each step. dropout: of the
+    features before the head. noise and gain: standard deviations, of a scaled taxel and of its
+    factor. adversarial: how far each scaled count is also moved in the direction of a rising cost
     (fast gradient sign; Goodfellow 2015); 0 for none.
     """
 
@@ -74,10 +74,8 @@ class TrainingRecipe:
 
 @dataclass(frozen=True)
 class NetworkModel:
-    """A trained network as a Model. ran: what was computed, and how. cost: of the training.
-
-    forms: the same model in other precisions, by name.
-    """
+    """A trained network as a Model. ran: a description of the computation. cost: of the training.
+    forms: the same model in other precisions, by name."""
 
     network: Network
     ran: str
@@ -98,17 +96,15 @@ class NetworkModel:
 
 
 def unchanged(x: Tensor, rng: Generator) -> Tensor:
-    """The augmentation that changes nothing."""
+    """An augmentation without any change."""
     return x
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let PyTorch compute in one thread: the same bits whatever the number of cores, and hardly
-    slower.
+    """Let PyTorch compute in one thread: the same bits for any number of cores, and hardly slower.
 
-    On a busy machine two threads wait for one another; a fit was once seen to take twenty times as
-    long there.
+    On a busy machine two threads wait for each other; a fit there once took twenty times as long.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -120,9 +116,9 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def deterministic_device(seed: int) -> Iterator[str]:
-    """The name of the device: a GPU where there is one, else one thread of the processor.
+    """The name of the device: a GPU if there is one, else one thread of the processor.
 
-    It gives the same bits each time, and no random state outside is changed.
+    It computes the same bits each time, and no random state outside is changed.
     """
     exact = torch.backends.cudnn.flags(
         enabled=True, deterministic=True, allow_tf32=False
@@ -151,7 +147,7 @@ def learn(
     unfinished: Path | None = None,
     watch: Watch = lambda step, network: None,
 ) -> tuple[Net, Cost]:
-    """Train by gradient descent; gives the moving average of the weights, ready for inference on
+    """Train by gradient descent. Returns the moving average of the weights, ready for inference on
     the processor, and the cost of each step.
 
     augment: changes sweeps [B, R * C, T], drawn anew in each step, before gain and noise. bfloat16:
@@ -211,8 +207,8 @@ def _schedule(optimizer: torch.optim.Optimizer, recipe: TrainingRecipe) -> lr_sc
 
 
 def backward(model: Network, x: Tensor, labels: Tensor, recipe: TrainingRecipe) -> float:
-    """Leave the gradients of the cost in the weights; the cost itself, of the sweeps as they
-    are."""
+    """Leave the gradients of the cost in the weights, and return the cost of the unchanged
+    sweeps."""
     x.requires_grad_(recipe.adversarial > 0)
     loss = functional.cross_entropy(
         model.training_logits(x).float(), labels, label_smoothing=recipe.smoothing
@@ -234,7 +230,7 @@ def batches(n: int, batch: int = 128) -> tuple[Tensor, ...]:
 
 
 def float_batches(samples: Array, picks: tuple[Tensor, ...]) -> Iterator[Tensor]:
-    """The picked sweeps of `samples` as float32, a batch at a time; PyTorch supports too little of
+    """The picked sweeps of `samples` as float32, a batch at a time, because PyTorch hardly supports
     uint16."""
     for pick in picks:
         yield torch.from_numpy(samples[pick.numpy()].astype(np.float32))
@@ -253,13 +249,13 @@ def train_network(
     int8: Sequence[str] = (),
     unfinished: Path | None = None,
 ) -> NetworkModel:
-    """Train what `build` gives on the materials that occur in `inputs`, the raw counts [N, T, R, C]
-    of `sweeps`.
+    """A network of `build`, trained on the materials that occur in `inputs`, the raw counts [N, T,
+    R, C] of `sweeps`.
 
     A material that does not occur gets a logit that no sweep can raise. calibrated: hold some
-    groups out for the temperature; else all are trained on, with temperature 1. int8: kinds of
-    nodes that the form "int8" has in int8; without any there is no such form. unfinished: as in
-    `learn`. Raises FormatError where only one material occurs.
+    groups out for the temperature; else train on all, with temperature 1. int8: kinds of nodes that
+    are in int8 in the precision "int8"; without any there is no such precision. unfinished: as in
+    `learn`. Raises FormatError if only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
     train, held_out = hold_out_or_all(known, seed)[:2] if calibrated else (known, known)
@@ -294,7 +290,7 @@ def network_method(
     int8: Sequence[str] = (),
     unfinished: Path | None = None,
 ) -> Method:
-    """The Method of this name that trains what `build` gives; see train_network."""
+    """The Method of this name that trains the networks of `build`; see train_network."""
     train = partial(
         train_network,
         build=build,
@@ -311,11 +307,11 @@ def network_method(
 
 
 def describe_run(recipe: TrainingRecipe, device: str, half: bool, wanted: bool) -> str:
-    """What was computed, and how. half: in bfloat16; wanted: whether that was asked for."""
+    """A description of the computation. half: in bfloat16; wanted: whether that was asked for."""
     precision = "bfloat16" if half else "float32 (no bfloat16 here)" if wanted else "float32"
     return f"{recipe.steps} iterations of {recipe.batch} in {precision} on {device}"
 
 
 def scale_steps(recipe: Recipe, effort: Effort) -> Recipe:
-    """`recipe` with as many iterations as `effort` asks for."""
+    """`recipe` with the iterations of `effort`."""
     return replace(recipe, steps=max(round(recipe.steps * effort.share), MIN_STEPS))

@@ -1,1 +1,1 @@
-"""The compact networks, the box's default: architectures, training, graphs in float and int8."""
+"""The default recipe of the box: features, candidates, choice, trained stages, and their fit."""
