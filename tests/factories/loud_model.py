@@ -54,7 +54,7 @@ class Loud:
     """A model in two precisions."""
 
     model: onnx.ModelProto
-    forms: dict[str, GraphModel] = field(default_factory=dict)
+    precisions: dict[str, GraphModel] = field(default_factory=dict)
 
     def logits(self, given: np.ndarray) -> np.ndarray:
         """As the graph says."""

@@ -2,8 +2,7 @@
 
 The box computes the heads after each tenth of the window. It answers as soon as the last few heads
 agree and the newest is certain enough. The required probability is found on sweeps that the heads
-did not see; without a sufficient probability the
-box does not answer early.
+did not see; without a sufficient probability the box does not answer early.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: 
     start = time.perf_counter()
     model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
     fit_s = time.perf_counter() - start
-    models = {"": model} | dict(getattr(model, "forms", {}))
+    models = {"": model} | dict(getattr(model, "precisions", {}))
     answers = {
         name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()
     }

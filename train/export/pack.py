@@ -176,8 +176,8 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
     train, held_out, held_out_by = hold_out(sweeps, seed)
     model = method.train(train, model_inputs(method.input, train), seed)
     about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
-    forms = getattr(model, "forms", {})
-    reference = forms["float"].graph() if "float" in forms else None
+    precisions = getattr(model, "precisions", {})
+    reference = precisions["float"].graph() if "float" in precisions else None
     return model, Content(
         model.graph(), method.input, train, held_out, held_out_by, about, reference=reference
     )

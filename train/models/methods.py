@@ -74,7 +74,7 @@ class Model(Protocol):
     occur in training.
 
     It may have further attributes, which train.evaluation.fold reads: `ran` (a description of the
-    computation), `cost` (of the training) and `forms` (the same model in other precisions, as
+    computation), `cost` (of the training) and `precisions` (the same model in other precisions, as
     Models by name).
     """
 

@@ -75,12 +75,12 @@ class TrainingRecipe:
 @dataclass(frozen=True)
 class NetworkModel:
     """A trained network as a Model. ran: a description of the computation. cost: of the training.
-    forms: the same model in other precisions, by name."""
+    precisions: the same model in others, by name."""
 
     network: Network
     ran: str
     cost: Cost = field(default_factory=list)
-    forms: Mapping[str, Model] = field(default_factory=dict)
+    precisions: Mapping[str, Model] = field(default_factory=dict)
 
     @torch.no_grad()
     def logits(self, inputs: Array) -> Array:
@@ -274,7 +274,9 @@ def train_network(
     network.expand_head(np.unique(sweeps.labels), len(sweeps.materials), temperature)
     return replace(
         trained,
-        forms={"int8": GraphModel(quantize(network.graph(), train.samples, int8))} if int8 else {},
+        precisions={"int8": GraphModel(quantize(network.graph(), train.samples, int8))}
+        if int8
+        else {},
     )
 
 

@@ -24,8 +24,8 @@ from train.evaluation import evaluate, parallel, robustness
 from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Plan, Where
 from train.evaluation.fold import fingerprint
-from train.export import measure, model_forms
-from train.export.model_forms import Packed
+from train.export import measure, precisions
+from train.export.precisions import Packed
 from train.metrics import score
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method
@@ -146,7 +146,7 @@ class Charting:
             )
             self.log(f"{len(made)} models take turns")
             train = sets.load(self.chart.train).select(self.chart.only)
-            costs = model_forms.measured(made, train.samples, self.chart.rounds)
+            costs = precisions.measured(made, train.samples, self.chart.rounds)
         known = {"seeds": list(self.seeds), "set": train.source} | score.provenance()
         return [
             self._dot(one, cost, accuracy.get((one.method, one.form), {})) | known
@@ -227,7 +227,7 @@ class Charting:
                 self.left_out[method.name] = "not packed yet"
                 continue
             try:
-                yield from model_forms.packed(method, train, self.seeds[0], folder)
+                yield from precisions.packed(method, train, self.seeds[0], folder)
             except (FormatError, BundleError) as e:
                 self.left_out[method.name] = str(e)
             progress(f"{method.name} packed")
@@ -236,7 +236,7 @@ class Charting:
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
     """Where the bundles of a method that was trained on these sweeps are kept."""
     about = [sets.digest(train), method.name, method.effort, seed]
-    modules = methods.module_of(method.name), "train.export.model_forms", "train.export.pack"
+    modules = methods.module_of(method.name), "train.export.precisions", "train.export.pack"
     return cache / "dots" / fingerprint(about, *modules)
 
 

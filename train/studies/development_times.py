@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError, FormatError
 from train.data.progress import Progress
 from train.data.sets import Dataset
-from train.export import measure, model_forms
+from train.export import measure, precisions
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 from train.studies.chart_report import kept_folder
@@ -96,7 +96,7 @@ def _callable(
         model = method.train(some, model_inputs(method.input, some), seed)
         entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
         return [(entry | {"runs_on_box": False}, partial(_alone, model))]
-    made = model_forms.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
+    made = precisions.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
     return [
         (
             {

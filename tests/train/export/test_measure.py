@@ -15,7 +15,7 @@ from appliance.core.clock import SystemClock
 from appliance.inference.classifier import Classifier
 from tests.factories.loud_model import loud, sweeps
 from train.cli.main import main
-from train.export import measure, model_forms
+from train.export import measure, precisions
 from train.export.measure import Measurement
 from train.models.peers import minirocket
 from train.studies import chart_report
@@ -41,7 +41,7 @@ def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
     is trained."""
     calls: list[int] = []
     for _ in range(2):
-        made = model_forms.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
+        made = precisions.packed(loud(calls), sweeps(), 3, tmp_path / "kept")
     assert calls == [3]
     assert [(one.form, one.precision, one.runtime) for one in made] == [
         ("", "float", "onnx"),
@@ -74,14 +74,14 @@ def test_all_take_turns():
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
     """Costs of a real bundle: the keys of chart.json, resident memory of Python with numpy and
     onnxruntime."""
-    made = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
-    (costs, _) = model_forms.measured(made, sweeps().samples, 2)
+    made = precisions.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    (costs, _) = precisions.measured(made, sweeps().samples, 2)
     assert set(KEYS) <= costs.keys()
     assert costs["runs_on_box"]
     assert 15 < costs["rss_mb"] < 150
     assert 0 < costs["ms_p50"] <= costs["ms_p99"]
     assert costs["file_kb"] < costs["bundle_kb"]
-    assert not model_forms._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))[
+    assert not precisions._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))[
         "runs_on_box"
     ]
 
@@ -89,7 +89,7 @@ def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_p
 @pytest.mark.slow
 def test_what_does_not_run_by_itself_is_named(tmp_path: Path):
     """A bundle that was altered on disk is refused with its name and reason."""
-    one, _ = model_forms.packed(loud([]), sweeps(), 1, tmp_path / "kept")
+    one, _ = precisions.packed(loud([]), sweeps(), 1, tmp_path / "kept")
     (one.folder / "model.onnx").write_bytes(b"no model")
     with pytest.raises(
         measure.BundleError,
@@ -110,7 +110,7 @@ def test_torch_runs_what_was_trained(tmp_path: Path):
     class TwoCountsModel:
         network: torch.nn.Module
 
-    model_forms._save_torch(TwoCountsModel(TwoCounts()), sweeps(), 1, tmp_path)
+    precisions._save_torch(TwoCountsModel(TwoCounts()), sweeps(), 1, tmp_path)
     counts = sweeps().samples[3]
     assert measure.load(tmp_path)(counts).tolist() == counts.ravel()[:2].tolist()
 
@@ -123,7 +123,7 @@ def test_aeon_runs_what_was_trained(tmp_path: Path):
     known = sweeps()
     state = np.random.get_state()[1].copy()
     model = minirocket.train(known, known.samples, 1)
-    model_forms._save_aeon(model, known, 1, tmp_path)
+    precisions._save_aeon(model, known, 1, tmp_path)
     answer = measure.load(tmp_path)
     assert answer(known.samples[1]) == pytest.approx(model.logits(known.samples[1:2])[0], abs=0.05)
     assert (np.random.get_state()[1] == state).all()

@@ -541,7 +541,7 @@ def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch
     model = method.train(train, train.samples, 1)
     content, reference = (
         pack.Content(model.graph(), "raw", train, held, by, {}),
-        model.forms["float"].graph(),
+        model.precisions["float"].graph(),
     )
     assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(
         content.held_out

@@ -303,7 +303,7 @@ def test_compact_is_what_palpate_train_fits():
         same, model = stages.fit_network(given, 1, FitRecipe(steps=6)), train("compact", given)
         with torch.no_grad():
             want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
-        have = model.forms["float"].logits(given.samples)
+        have = model.precisions["float"].logits(given.samples)
         np.testing.assert_allclose(have, want - want.mean(1, keepdims=True), rtol=1e-4, atol=1e-3)
         int8 = graph_builder.run(
             graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples
@@ -366,7 +366,7 @@ def test_the_paper_s_cnn_has_an_int8_form(name: str):
     changes nothing."""
     s = easy(8)
     model = train(name, s)
-    int8 = model.forms["int8"]
+    int8 = model.precisions["int8"]
     assert len(int8.graph().SerializeToString()) < 0.3 * len(model.graph().SerializeToString())
     sure, rough = softmax(model.logits(s.samples)), softmax(int8.logits(s.samples))
     np.testing.assert_allclose(rough, sure, atol=0.1)

@@ -143,7 +143,7 @@ def test_the_family_counts_its_costs_as_the_chart_does():
     shown, bands = model.fit.architecture.cost(known.format, 2), model.fit.bands
     alone = graph.trunk_graph(known.format, model.fit.scale, {}, ARCHITECTURES["bands"])
     more = [count(alone) + 2 * bands if bands else 0 for count in (cost.weights, cost.macs)]
-    for one in (model, model.forms["float"]):
+    for one in (model, model.precisions["float"]):
         assert cost.weights(one.graph()) == shown.weights + more[0]
         assert cost.macs(one.graph()) == pytest.approx(
             shown.macs + more[1], rel=0.15

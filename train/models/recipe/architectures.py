@@ -1,5 +1,4 @@
-"""The architectures of the compact network. In: a size. Out: an Architecture, with its stages and
-its cost.
+"""The architectures of the compact network, by size.
 
 All sizes are alike: dense strided convolutions over time with the taxels as input channels; the
 head sees the logarithm of every stage's mean responses.
@@ -18,20 +17,20 @@ the first two tenths, and so on to the whole window."""
 FLOOR = 0.02
 """Added to a mean response before its logarithm, so that a silent channel stays finite."""
 MIN_LAST_STEPS = 24
-"""Time steps that the last stage should have: a mean over fewer is mostly noise."""
+"""Least number of time steps of the last stage: a mean over fewer is mostly noise."""
 LATER = (5, 2)
 """Kernel and stride of the stages after the first."""
 SHORT_KERNEL = 4
 """The first kernel for a window that does not allow any stride."""
 MAINS_HZ = 50.0
-"""Frequency that is filtered out unless a fit is asked for another. Of 50 Hz nothing passes then,
-but of 60 Hz three quarters pass a kernel of 32 frames at 750 Hz."""
+"""Frequency that is filtered out by default. A kernel of 32 frames at 750 Hz then removes 50 Hz
+completely, but passes three quarters of 60 Hz."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One convolution. steps: how many responses it gives; reach: frames of the window that one of
-    them sees.
+    """One convolution. steps: number of its responses. reach: number of frames that a response
+    sees.
 
     Response j sees the frames from j * hop to j * hop + reach.
     """
@@ -57,7 +56,7 @@ def each_frame(window: int) -> Stage:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a network costs: trained numbers, and multiply-accumulates of one sweep (convolutions
+    """The cost of a network: trained numbers, and multiply-accumulates of one sweep (convolutions
     and head)."""
 
     weights: int
@@ -69,12 +68,12 @@ class Architecture:
     """The layers of one size. channels: of each stage; kernel and stride: of the first stage for
     long windows.
 
-    planned: how many stages there were before some were cut off, 0 if none were; with none left the
-    head sees only the spectrum. spectrum: whether the head sees the bands of spectrum.py after the
-    stages' responses. fewest: number of stages that are never cut off. pools: how the filter bank
-    of bank.py is pooled: 0 where there is none, 1 by magnitudes, 2 by shares as well. distribution:
-    whether the head sees the shares of distribution.py. mains_hz: of the mains whose hum stages and
-    spectrum do not respond to.
+    planned: number of stages before some were cut off, 0 if none were; without any stage the head
+    sees only the spectrum. spectrum: whether the head sees the bands of spectrum.py after the
+    stages' responses. fewest: number of stages that are never cut off. pools: pooling of the filter
+    bank of bank.py: 0 without a bank, 1 by magnitudes, 2 by shares as well. distribution: whether
+    the head sees the shares of distribution.py. mains_hz: frequency of the mains, to whose hum
+    stages and spectrum do not respond.
     """
 
     channels: tuple[int, ...]
@@ -88,16 +87,16 @@ class Architecture:
     mains_hz: float = MAINS_HZ
 
     def cut(self, depth: int, spectrum: bool = False) -> Architecture:
-        """The first `depth` stages, each as it was, with the spectrum or without."""
+        """The first `depth` stages, unchanged, with the spectrum or without."""
         planned = max(self.planned, len(self.channels))
         return replace(self, channels=self.channels[:depth], planned=planned, spectrum=spectrum)
 
     def stages(self, window: int) -> tuple[Stage, ...]:
-        """The stages for a window of so many frames.
+        """The stages for a window of this many frames.
 
-        Kernel and stride of the first are halved as long as the last stage has fewer steps than
-        MIN_LAST_STEPS; where that leaves no stride, the kernel is SHORT_KERNEL. Raises FormatError
-        where the window is too short for any.
+        Kernel and stride of the first stage are halved as long as the last stage has fewer steps
+        than MIN_LAST_STEPS; if that leaves no stride, the kernel is SHORT_KERNEL. Raises
+        FormatError if the window is too short for any.
         """
         return self._planned_stages(window)[: len(self.channels)]
 
@@ -125,13 +124,13 @@ class Architecture:
         """Whether the first stage's kernels sum to zero over time for every taxel, so that no
         offset or slow drift matters.
 
-        They do where the window is long enough for a stride. A slow sensor's texture lies in just
-        these low frequencies: there each taxel's mean over the window is subtracted instead.
+        They do if the window is long enough for a stride. The texture of a slow sensor lies in just
+        these low frequencies; then the mean of each taxel over the window is subtracted instead.
         """
         return self._planned_stages(window)[0].stride > 1
 
     def cost(self, format: SweepFormat, classes: int) -> Cost:
-        """Of convolutions and head, as they are in the graph."""
+        """The cost of convolutions and head, as they are in the graph."""
         head = sum(self.channels) * classes
         weights, macs, inputs = head + classes, head, format.channels
         for stage, outputs in zip(self.stages(format.window), self.channels, strict=True):
@@ -152,29 +151,31 @@ ARCHITECTURES = {
 """By the approximate maximum of their weights, for 1500 x 4 x 4 raw counts and six materials. The
 last is as large as its bundle may be; the first has only the spectrum and a head."""
 DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
-"""Of the method `compact`: all stages may be cut off where the spectrum alone does as well."""
+"""The architecture of the method `compact`: all stages may be cut off if the spectrum alone does as
+well."""
 
 
 @dataclass(frozen=True)
 class NoiseLimit:
-    """A taxel that is much noisier than others is attenuated: a broken one must not drown the rest.
+    """Attenuation of a taxel that is much noisier than others: a broken taxel must not drown the
+    rest.
 
-    A taxel's noise is its mean difference between neighbouring frames, over `pairs` pairs at most.
-    The reference is the taxel at rank a quarter of all, the noisiest first (the fifth of 16, the
-    noisiest of three): more than `times` its noise is scaled down to that. A quarter and not half:
-    where a finger touches only a few taxels, most are silent. Nothing is attenuated where the
-    reference is silent.
+    The noise of a taxel is its mean difference between neighbouring frames, over `pairs` pairs at
+    most. The reference is the taxel at rank a quarter of all, the noisiest first (the fifth of 16,
+    the noisiest of three). A taxel with more than `times` the noise of the reference is scaled down
+    to that. The rank is a quarter rather than a half because most taxels are silent if a finger
+    touches only a few. Nothing is attenuated if the reference is silent.
     """
 
     times: float = 3.0
     pairs: int = 150
 
     def step(self, window: int) -> int:
-        """Frames from one pair to the next."""
+        """Number of frames from one pair to the next."""
         return max(window // self.pairs, 1)
 
     def rank(self, taxels: int) -> int:
-        """The rank of the reference taxel, the noisiest being 0."""
+        """The rank of the reference taxel; the noisiest has 0."""
         return taxels // 4
 
 

@@ -24,14 +24,14 @@ from train.data.sets import Dataset
 
 Array = NDArray[np.float32]
 OCTAVES = 5.0
-"""How far below half the sampling rate the cut-off of a damped sweep may lie: at 750 Hz it is 12 to
-375 Hz."""
+"""Lowest cut-off of a damped sweep, in octaves below half the sampling rate: at 750 Hz it lies
+between 12 and 375 Hz."""
 NOISY = 4.0
 """Maximum noise of a noisy taxel."""
 HUMMING = 0.25
-"""Share of the sweeps with hum, where there is any."""
+"""Share of the sweeps with hum, if `hum` is not 0."""
 PIECES = 1 << 16
-"""Positions in the batch's one draw of noise at which a taxel's noise may start."""
+"""Number of positions in a batch's draw of noise at which the noise of a taxel may start."""
 
 COPIES = 2
 """Number of copies of each training sweep for a head in closed form."""
@@ -41,20 +41,20 @@ BATCH = 128
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What varies; 0 is off. Spreads are standard deviations; amplitudes are in deviations of all
-    taxels together, which `Network.prepare` makes 1.
+    """The changes of a sweep; 0 is off. Spreads are standard deviations. Amplitudes are in
+    deviations of all taxels together, which `Network.prepare` brings to 1.
 
-    What is not 0 by default was better in single runs on simulated sweeps at 750 Hz (T-REAL and
-    T-HARD, seeds 301 to 399). The rest was not, there: the network's first layers deal with hum,
-    drift and noisy taxels at less cost.
+    The defaults that are not 0 improved single runs on simulated sweeps at 750 Hz (T-REAL and
+    T-HARD, seeds 301 to 399). The others did not, because the first layers of the network deal with
+    hum, drift and noisy taxels at less cost.
     """
 
     shift: float = 1.0
-    """Largest displacement of the skin along the rows, in rows, either way; uniform, and
+    """Largest displacement of the skin along the rows, in rows, in both directions; uniform, and
     interpolated between rows. A row that enters over the edge carries between nothing and all of
-    what the row at the edge feels. A line of taxels is not moved."""
+    the load at the edge. A single line of taxels is not displaced."""
     moved: float = 0.5
-    """Share of the sweeps that are displaced so."""
+    """Share of the sweeps that are displaced."""
     gain: float = 0.2
     """Spread of the logarithm of the gain of all taxels together: force, skin, amplifier."""
     gains: float = 0.2
@@ -62,7 +62,7 @@ class Augmentation:
     silent: float = 0.05
     """Share of the taxels without a signal: dead, stuck or saturated."""
     stretch: float = 0.0
-    """Largest change of speed, as a share of it, below 1."""
+    """Largest change of speed, as a share of the speed, below 1."""
     damped: float = 0.5
     """Share of the sweeps in which skin and tape absorb high frequencies: a first-order low-pass
     with its cut-off anywhere in the OCTAVES below half the sampling rate."""
@@ -70,8 +70,7 @@ class Augmentation:
     """Spread of the logarithm of the gain of each octave: tape and glove pass some frequencies
     better than others."""
     noise: float = 0.5
-    """Maximum white noise, on all taxels; drawn squared, so that little of it is more common than
-    much."""
+    """Maximum white noise on all taxels, drawn squared: small noise is more common."""
     noisy: float = 0.0
     """Share of the taxels with white noise of their own, up to NOISY."""
     drift: float = 0.0
@@ -93,22 +92,22 @@ class Augmentation:
 
 
 SLOW = Augmentation(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
-"""For sensors that are too slow for vibrations: fingers and tape do not damp what these measure,
-and what they measure depends more on force and friction."""
+"""The augmentation for sensors that are too slow for vibrations. Fingers and tape do not damp their
+signal, which depends more on force and friction."""
 
 
 def default_augmentation(zero_sum: bool) -> Augmentation:
-    """The augmentation where none is given. zero_sum: whether the sensor is fast enough for kernels
-    that sum to zero."""
+    """The default for a recipe. zero_sum: whether the sensor is fast enough for kernels that sum to
+    zero."""
     return Augmentation() if zero_sum else SLOW
 
 
 def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
-    """Sweeps float32 [B, R * C * A, T], varied as `augmentation` says, R being `rows`; the same for
-    the same state of `rng`.
+    """Changed sweeps float32 [B, R * C * A, T], where R is `rows`; the same for the same state of
+    `rng`.
 
-    rows: 1 where the taxels stand in a line, which is not moved. x: what `Network.prepare` gives,
-    about 1 and, where something is drawn that shows it, around 0. It is not changed.
+    rows: 1 if the taxels stand in a line, which is not displaced. x: prepared sweeps (see
+    `Network.prepare`); it is not changed.
     """
     x = _attached(x, rows, augmentation, rng)  # new memory: what follows may write to it
     for change in (_stretched, _filtered, _disturbed, _clipped):
@@ -117,7 +116,7 @@ def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> 
 
 
 def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
-    """The skin attached anew: it sits elsewhere, its gains are others, a taxel fails."""
+    """Attach the skin anew: another position, other gains, failed taxels."""
     n, taxels, _ = x.shape
     gain = np.ones((n, taxels, 1), np.float32)
     x = _moved(x, rows, augmentation, rng) if augmentation.shift and 1 < rows < taxels else x.copy()
@@ -132,7 +131,7 @@ def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -
 
 
 def _moved(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
-    """Along the rows, in a share of the sweeps."""
+    """Displace a share of the sweeps along the rows."""
     n, row = len(x), np.arange(rows, dtype=np.float32)
     source = row + augmentation.shift * _symmetric(rng, n, 1) * _chosen(
         augmentation.moved, rng, n, 1
@@ -146,7 +145,7 @@ def _moved(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> A
 
 
 def _stretched(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """At another speed; a sweep that ends too soon is continued backwards."""
+    """Change the speed; a sweep that ends too soon is continued backwards."""
     n, _, frames = x.shape
     if not augmentation.stretch or frames < 2:
         return x
@@ -160,7 +159,7 @@ def _stretched(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 
 
 def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """Through skin, tape and glove, which pass some frequencies better than others."""
+    """Filter as skin, tape and glove do, which pass some frequencies better than others."""
     n, _, frames = x.shape
     if not (augmentation.damped or augmentation.colour) or frames < 2:
         return x
@@ -184,7 +183,7 @@ def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 
 
 def _disturbed(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """With what the sensor itself adds: noise, an offset that moves, hum."""
+    """Add the faults of the sensor: noise, an offset that drifts, hum."""
     n, taxels, frames = x.shape
     if augmentation.noise or augmentation.noisy:
         level = augmentation.noise * _uniform(rng, n, 1, 1) ** 2
@@ -208,7 +207,7 @@ def _disturbed(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 
 
 def _clipped(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """By a converter or a skin that has reached the end of its range."""
+    """Clip as a converter or a skin does at the end of its range."""
     if not augmentation.clipped:
         return x
     n, taxels, _ = x.shape
@@ -217,8 +216,8 @@ def _clipped(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 
 
 def _white_noise(rng: Generator, n: int, taxels: int, frames: int) -> Array:
-    """White noise [n, taxels, frames]: pieces of one draw, since a draw for each would take longer
-    than all else."""
+    """White noise [n, taxels, frames] from pieces of one draw, because separate draws would take
+    longer than everything else."""
     distance, angle = _uniform(
         rng, 2, (PIECES + frames + 1) // 2
     )  # Box and Muller 1958: NumPy's own takes three times as long

@@ -1,12 +1,11 @@
-"""A bank of random filters, which nothing trains. In: a format, raw counts. Out: a Bank, and its
-nodes in a trunk.
+"""A bank of random filters, which are not trained: their draw, and their nodes in a trunk.
 
-Each filter is a dilated kernel over time, the same for a random subset of the taxels but for a
-factor of each; both are small integers, so that float and int8 have the same taps and a bundle
-holds 25 bytes for 144. What it gives is pooled twice: the logarithm of its mean magnitude, and the
-share of responses above a threshold (Dempster et al. 2021 count the share alone). A filter either
-sums to zero over time on each taxel, so that no offset reaches it, or is free, which needs taxels
-about their means.
+Each filter is a dilated kernel over time, the same for a random subset of the taxels up to a factor
+for each taxel. Kernel and factors are small integers, so float and int8 have the same taps, and a
+bundle holds 25 bytes for 144 taps. The responses are pooled twice: the logarithm of their mean
+magnitude, and the share of responses above a threshold (Dempster et al. 2021 use the share alone).
+A filter either sums to zero over time on each taxel, so that offsets do not matter, or is free,
+which needs taxels without their means.
 """
 
 from __future__ import annotations
@@ -30,15 +29,17 @@ Array = NDArray[Any]
 TAPS, DILATIONS = 9, (1, 2, 4, 8, 16)
 MOST_FILTERS, LEAST_FILTERS = 512, 64
 MOST_TAPS = 36_864
-"""Of all filters of a kind together: 256 filters of sixteen taxels, 512 of eight and fewer."""
+"""Largest number of taps of all filters of a kind: 256 filters of sixteen taxels, 512 of eight or
+fewer."""
 LARGEST, SPREAD = 8, 3.0
-"""Largest factor of a taxel and of a frame, whose product is a tap of seven bits; deviation of what
-is rounded to them."""
+"""Largest factor of a taxel and of a frame, whose product is a tap of seven bits; deviation of the
+normal numbers that are rounded to such factors."""
 MOST_MACS, MOST_STEPS = 6_000_000, 256
-"""Multiply-accumulates of one kind, and responses of a filter, a window: the stride follows from
-them."""
+"""Largest number of multiply-accumulates of one kind, and of responses of a filter, for a window;
+the stride follows from them."""
 SHARES = (0.1, 0.9)
-"""The share of training responses above a filter's threshold is drawn uniformly from this range."""
+"""Range of the share of training responses above the threshold of a filter, which is drawn
+uniformly."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class Bank:
     """Filters for one format, in the order of `free`, then `dilations`.
 
     across: int8 [F, R * C], factors of the taxels; along: int8 [F, TAPS], of the frames. unit: [F],
-    what their products are multiplied by, on scaled counts; a training response is within -1 and 1
-    but for one of a thousand. dilations: int [F]. free: bool [F], not zero-sum. reach: [F], what a
-    response of 1 is in deviations of the counts. limits: [F], thresholds of responses.
+    factor of their products, on scaled counts; 999 of 1000 training responses lie between -1 and 1.
+    dilations: int [F]. free: bool [F], not zero-sum. reach: [F], a response of 1 in deviations of
+    the counts. limits: [F], thresholds of responses.
     """
 
     across: Array
@@ -74,25 +75,25 @@ class Bank:
         return Bank(**{name: values[kept] for name, values in vars(self).items()})
 
     def weights(self) -> dict[str, Array]:
-        """As a Fit keeps them."""
+        """The weights that a Fit keeps."""
         return {f"bank.{name}": values for name, values in vars(self).items()}
 
     @classmethod
     def of(cls, weights: Mapping[str, Array]) -> Bank:
-        """What `weights` gave. Raises KeyError where it is not there."""
+        """The bank that gave these `weights`. Raises KeyError if there was none."""
         return cls(**{name: weights[f"bank.{name}"] for name in cls.__dataclass_fields__})
 
 
 def count(format: SweepFormat) -> int:
-    """Filters of one kind for `form`."""
+    """Number of filters of one kind for `format`."""
     return int(np.clip(MOST_TAPS // (format.channels * TAPS), LEAST_FILTERS, MOST_FILTERS))
 
 
 def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> Bank:
-    """`count` filters of each kind (free or not), the dilations that fit into the window in turn;
-    their taps have unit norm.
+    """`count` filters of each kind (free or not), with all dilations that fit into the window in
+    turn; their taps have unit norm.
 
-    Raises FormatError where the window is shorter than a filter.
+    Raises FormatError if the window is shorter than a filter.
     """
     fitting = [d for d in DILATIONS if (TAPS - 1) * d < format.window]
     if not fitting:
@@ -125,8 +126,8 @@ def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -
 
 
 def _within(along: Array) -> Array:
-    """Kernels [F, TAPS] of whole numbers, halved until none is above LARGEST; a kernel of zeros
-    becomes a difference."""
+    """Kernels [F, TAPS] of whole numbers, halved until no number is above LARGEST; a kernel of
+    zeros becomes a difference."""
     kernels = []
     for kernel in along:
         zero_sum = kernel.sum() == 0
@@ -141,7 +142,7 @@ def _within(along: Array) -> Array:
 
 
 def fitted(drawn: Bank, seen: Sequence[Array], rng: np.random.Generator) -> Bank:
-    """Drawn filters, scaled to what they give. seen: for each filter, in order, its responses [n]
+    """Drawn filters, scaled to their responses. seen: for each filter, in order, its responses [n]
     to training sweeps."""
     reach = np.array(
         [max(float(np.percentile(np.abs(x), PERCENTILE)), 1e-6) for x in seen], np.float32
@@ -170,8 +171,8 @@ def groups(bank: Bank) -> list[tuple[Array, int]]:
 
 @dataclass(frozen=True)
 class Pooling:
-    """How responses are pooled: in integers, with shares beside magnitudes, for each tenth, with a
-    row for each tenth."""
+    """The pooling of responses. int8: in integers. shares: beside magnitudes. prefixes: for each
+    prefix. rowwise: each prefix has a row of its own."""
 
     int8: bool
     shares: bool
@@ -185,8 +186,9 @@ def responses(
     """Taxels [n, R * C, T] in units of `step` -> responses [n, steps, filters], with the Stage of
     each of `groups`.
 
-    Long filters give fewer responses than short ones; zeros behind the window give them as many,
-    which mean nothing. In int8 a response is a byte, 0 being MIDDLE and 1 the largest.
+    Long filters give fewer responses than short ones. Zeros after the window make their number
+    equal; these responses are ignored. In int8 a response is a byte, where MIDDLE is 0 and 255
+    about 1.
     """
     found, stages = [], [stage(format, dilation) for _, dilation in groups(bank)]
     shortest = min(shape.reach for shape in stages)
@@ -218,14 +220,14 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
 def pooled(
     g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
 ) -> list[str]:
-    """Taxels as for `responses` -> log mean magnitudes [1, 1 or PREFIXES, F], and where shares are
-    wanted, those above the thresholds in the same shape."""
+    """Taxels as for `responses` -> log mean magnitudes [1, 1 or PREFIXES, F], and with `shares` the
+    shares above the thresholds in the same shape."""
     y, stages = responses(g, format, bank, x, step, how.int8)
     counts = np.array([shape.known_steps(format.window, how.prefixes) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
 
     def mean(z: str) -> str:
-        """[n, steps, F] -> means over those that each filter has."""
+        """[n, steps, F] -> means over the responses of each filter."""
         total = graph_builder.sums(g, z, steps, counts, integers=how.int8, rowwise=how.rowwise)
         total = g(
             "Reshape",
@@ -242,8 +244,8 @@ def pooled(
 
 
 def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
-    """What makes means of sums over counts [m, groups] for all filters: [m, groups, F], 0 for other
-    groups'."""
+    """Factors [m, groups, F] that turn sums over counts [m, groups] into means, 0 for other groups
+    than the filter's."""
     ends = np.cumsum([len(numbers) for numbers, _ in groups(bank)])[:, None]
     at = g("Range", *(g.constant(n, "int32") for n in (0, len(bank), 1)))
     own = g("Not", g("Less", at, g.constant(np.append(0, ends[:-1])[:, None], "int32")))
@@ -255,8 +257,8 @@ def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
 
 
 def _sides(g: GraphBuilder, y: str) -> Iterator[str]:
-    """Bytes clipped to above MIDDLE, and to below: the difference of their means is that of
-    magnitudes, for the multiples of MIDDLE cancel."""
+    """Bytes clipped to above MIDDLE, and to below. The difference of their means is the mean
+    magnitude, because the multiples of MIDDLE cancel."""
     for side in ((MIDDLE, 255), (0, MIDDLE)):
         yield g("Clip", y, *(g.constant(end, "uint8") for end in side))
 

@@ -1,9 +1,9 @@
-"""The calibration of a fit: all that is fitted to the features of a finished trunk.
+"""The calibration of a fit: everything that is fitted to the features of a finished trunk.
 
-That is the head that names the material and its temperature, a head for each early answer and the
-rule for them, the embedding and the limit of known materials, and the rule for displaced contacts.
-Everything that limits an answer is fitted to held-out sweeps, by heads that did not see their
-group.
+It consists of the head that names the material and its temperature, a head for each early answer
+and the rule for these, the embedding and the limit of known materials, and the rule for displaced
+contacts. Temperatures, limits and rules are fitted to held-out sweeps, by heads that did not see
+their group.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def train(
         )
         for name in ("head", "int8")
     }
-    forms = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
-    return CompactModel(fit, *heads["int8"], fit.about["chosen"], forms=forms)
+    precisions = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
+    return CompactModel(fit, *heads["int8"], fit.about["chosen"], precisions=precisions)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:

@@ -287,7 +287,7 @@ class CompactModel:
     bias: Array
     ran: str
     cost: Cost = field(default_factory=list)
-    forms: Mapping[str, Model] = field(default_factory=dict)
+    precisions: Mapping[str, Model] = field(default_factory=dict)
 
     def features(self, inputs: Array, prefixes: bool = False) -> Array:
         """Raw counts [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F],

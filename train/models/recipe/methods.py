@@ -1,8 +1,7 @@
-"""The methods of the compact network. In: an Effort. Out: the METHODS compact-bands to
-compact-100k, and compact.
+"""The methods of the compact network: compact-bands to compact-100k, and compact.
 
-Each is trained as `palpate-train fit` does. The method is what the box runs, the int8 graph; its
-form "float" is the network that the graph was made from.
+Each is trained as `palpate-train fit --size` does. The method is the int8 graph that the box runs;
+its precision "float" is the network from which the graph was made.
 """
 
 from __future__ import annotations
@@ -35,10 +34,11 @@ def train_compact(
     recipe: FitRecipe,
     log: Log,
 ) -> CompactModel:
-    """Train a network of this architecture and its closed-form heads, as `palpate-train fit` does.
+    """A network of this architecture and its closed-form heads, trained as `palpate-train fit
+    --size` does.
 
-    inputs: the raw counts [N, T, R, C] of `sweeps`. Raises FormatError where only one material
-    occurs, where each occurs only once, or where a window is too short.
+    inputs: the raw counts [N, T, R, C] of `sweeps`. Raises FormatError if only one material occurs,
+    if each occurs only once, or if a window is too short.
     """
     known = replace(sweeps, samples=inputs).select(())
     fit = fit_network_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)

@@ -1,7 +1,5 @@
-"""The compact network in PyTorch. In: an Architecture and the form of a sweep. Out: the network.
-
-The sizes are in architectures.py; graph.py writes its graphs, in float and in int8.
-"""
+"""The compact network in PyTorch. Its sizes are in architectures.py; graph.py writes its graphs, in
+float and in int8."""
 
 from __future__ import annotations
 
@@ -27,11 +25,11 @@ Array = NDArray[Any]
 
 
 class ZeroSum(nn.Conv1d):
-    """A convolution whose taps sum to zero for every filter and taxel: no offset changes its
-    output.
+    """A convolution whose taps sum to zero for every filter and taxel, so that no offset changes
+    its output.
 
-    Gradient descent may hold any taps; their unwanted part is subtracted. mains: periods of the
-    mains per frame; where it is not 0 the hum is removed as well.
+    Gradient descent changes the taps freely; their unwanted part is subtracted. mains: periods of
+    the mains per frame; if it is not 0 the hum is removed as well.
     """
 
     def __init__(
@@ -56,7 +54,7 @@ class ZeroSum(nn.Conv1d):
 
 
 def limit_noise(x: Tensor) -> Tensor:
-    """Taxels [B, R * C, T], those that are much noisier than others attenuated; see
+    """Taxels [B, R * C, T] with attenuation of those that are much noisier than others; see
     architectures.NoiseLimit."""
     step, rank = NOISE_LIMIT.step(x.shape[2]), NOISE_LIMIT.rank(x.shape[1])
     noise = (x[:, :, 1::step] - x[:, :, :-1:step]).abs().mean(2, keepdim=True)
@@ -65,8 +63,8 @@ def limit_noise(x: Tensor) -> Tensor:
 
 
 def band_powers(x: Tensor, format: SweepFormat, mains_hz: float) -> Tensor:
-    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(form)], those of the first axis
-    first."""
+    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(format)], those of the first
+    axis first."""
     length = format.window // spectrum.SEGMENTS
     waves, averaging = (
         torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(format, mains_hz))
@@ -80,11 +78,11 @@ class Compact(Network):
     """Strided convolutions over time with the taxels as channels; the head sees the logarithm of
     every mean response.
 
-    Where the window is long the first kernels sum to zero and do not respond to the mains: what is
-    left is texture, and int8 may take the raw counts as they are. `scale` brings the texture to
-    about 1. The batch norms only serve training; `fused` folds them in. keep_means: show the head
-    each taxel's mean as well, for comparison: where materials were recorded one after another the
-    means reveal the session rather than the material.
+    If the window is long, the first kernels sum to zero and do not respond to the mains. Only
+    texture remains, and int8 can take the raw counts as they are. `scale` brings the texture to
+    about 1. The batch norms only serve training; `fused` folds them in. keep_means: show the mean
+    of each taxel to the head as well, for comparison; if materials were recorded one after another,
+    the means reveal the session rather than the material.
     """
 
     def __init__(
@@ -122,7 +120,8 @@ class Compact(Network):
         self.head = nn.Linear(sum(architecture.channels) + keep_means * inputs[0] + bands, classes)
 
     def responses(self, prepared: Tensor) -> list[Tensor]:
-        """[B, R * C, T] -> of each stage its responses [B, channels, steps], none below 0."""
+        """[B, R * C, T] -> for each stage its responses [B, channels, steps], which are not
+        negative."""
         x, of_stages = limit_noise(prepared), []
         for conv, norm in zip(self.convs, self.norms, strict=True):
             of_stages.append(x := torch.relu(norm(conv(x))))
@@ -138,7 +137,7 @@ class Compact(Network):
         )
 
     def head_input(self, counts: Tensor) -> Tensor:
-        """Raw counts [B, T, R, C] -> what the head sees of them [B, F]."""
+        """Raw counts [B, T, R, C] -> the features that the head sees [B, F]."""
         prepared = self.prepare(counts)
         parts = [self.features(prepared)]
         if self.keep_means:
@@ -150,7 +149,7 @@ class Compact(Network):
         return torch.cat(parts, 1)
 
     def fused(self) -> Compact:
-        """The same network for inference, its batch norms folded into the convolutions."""
+        """The same network for inference, with its batch norms folded into the convolutions."""
         plain = Compact(
             self.format,
             self.head.out_features,

@@ -1,12 +1,10 @@
-"""The spectrum that all taxels share. In: the form of a sweep. Out: log band powers, in PyTorch and
-as ONNX nodes.
+"""The spectrum that all taxels share: log band powers, in PyTorch and as ONNX nodes.
 
-Fixed features beside the learned ones. What is trained to separate materials discards what does not
-help it: it hardly sees that a material is none of them, and it fits its training sweeps too
-closely. Here the taxels' mean over the grid, on each axis by itself, is cut into tenths of the
-window, and the power in bands of each tenth's spectrum is taken (Welch 1967), as logarithms. Each
-tenth is processed by itself, so that no offset and no later frame matters; the hum of the mains is
-removed.
+These are fixed features beside the learned ones. Training discards what does not separate the
+training materials; it overfits, and its features hardly show that a material is unknown. Here the
+mean of the taxels over the grid, for each axis, is cut into tenths of the window. The power in
+bands of each tenth's spectrum (Welch 1967) is a feature, as a logarithm. Each tenth is processed by
+itself, so that offsets and later frames do not matter; the hum of the mains is removed.
 """
 
 from __future__ import annotations
@@ -24,19 +22,19 @@ from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 SEGMENTS = PREFIXES
-"""Into which a window is cut: the tenths after which a box may decide early."""
+"""Number of segments of a window: a box can answer early after each of them."""
 BANDS = 24
-"""Of a spectrum, at most: their edges lie evenly on a logarithmic axis, at whole half bins."""
+"""Largest number of bands of a spectrum: their edges are evenly spaced on a logarithmic axis, at
+whole half bins."""
 QUIET = 1e-4
-"""Added to a band's power before its logarithm, where the texture's is about 1: a silent skin stays
-finite."""
+"""Added to the power of a band before its logarithm, so that a silent skin stays finite; the power
+of a texture is about 1."""
 MIN_SEGMENT = 4
-"""Frames of the shortest tenth that has a spectrum."""
+"""Number of frames of the shortest segment that has a spectrum."""
 
 
 def count(format: SweepFormat) -> int:
-    """How many bands of all axes there are; 0 where a tenth of the window has fewer frames than
-    MIN_SEGMENT."""
+    """Number of bands of all axes; 0 if a segment has fewer frames than MIN_SEGMENT."""
     length = format.window // SEGMENTS
     return format.axes * (len(_edges(length)) - 1) if length >= MIN_SEGMENT else 0
 
@@ -53,8 +51,7 @@ def nodes(
     """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1,
     rows, bands], those of the first axis first.
 
-    One row for the whole window; with `tenths` one for each of the first tenth, the first two
-    tenths, and so on.
+    There is one row for the whole window; with `prefixes` one row for each prefix.
     """
     length, axes, taxels = format.window // SEGMENTS, format.axes, format.rows * format.cols
     mean = scale / taxels * (np.tile(np.eye(axes), (taxels, 1)) if axes > 1 else 1)  # [M, A]
@@ -91,21 +88,20 @@ def _edges(length: int) -> Array:
     """Edges [n + 1] of the n bands of a segment of `length` frames, in half bins of its spectrum:
     from 2 to `length`.
 
-    With whole bins, which are as far apart as Hann's window is wide, the AUROC of unknown materials
-    falls by .007.
+    Whole bins, which are as wide as Hann's window, lower the AUROC of unknown materials by .007.
     """
     return np.unique(np.rint(np.geomspace(2, length + 1, BANDS + 1)).astype(int))
 
 
 def mains(format: SweepFormat, mains_hz: float) -> float:
-    """Periods of mains of this frequency per frame; 0 where a segment holds less than two, or the
-    hum is too fast to be told apart."""
+    """Periods of mains of this frequency per frame; 0 if a segment holds less than two periods, or
+    if the hum is too fast to be resolved."""
     periods = mains_hz / format.rate_hz
     return periods if periods * (format.window // SEGMENTS) >= 2 and periods <= 0.25 else 0.0
 
 
 def _unwanted(length: int, mains: float) -> Array:
-    """Orthonormal [length, 1 or 3]: what no wave may respond to, an offset and the mains."""
+    """Orthonormal [length, 1 or 3]: an offset and the mains, to which no wave may respond."""
     phase = 2 * np.pi * mains * np.arange(length)
     basis = np.stack([np.ones(length), np.sin(phase), np.cos(phase)][: 3 if mains else 1], axis=1)
     orthonormal: Array = np.linalg.qr(basis)[0]
@@ -158,8 +154,8 @@ def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:
 
 
 def _averaging_nodes(g: GraphBuilder, edges: Array) -> str:
-    """Nodes that compute the matrix that averages squares over each band; folded as those of
-    `_wave_nodes` are."""
+    """Nodes that compute the matrix that averages squares over each band; folded like those of
+    `_wave_nodes`."""
     k = g("Range", *(g.constant(n, "int64") for n in (2, int(edges[-1]), 1)))
     k = g("Unsqueeze", g("Concat", k, k, axis=0), g.constant([1], "int64"))
     below, beyond = (g("Less", k, g.constant(side, "int64")) for side in (edges[:-1], edges[1:]))

@@ -46,7 +46,7 @@ def test_ds_cnn_has_an_int8_form():
     s = easy(12)
     (method,) = methods.find(["ds-cnn"], methods.Effort(0.1))
     model = method.train(s, s.samples, 1)
-    int8 = model.forms["int8"]
+    int8 = model.precisions["int8"]
     assert cost.precision(int8.graph()) == "int8"
     assert len(int8.graph().SerializeToString()) < 0.6 * len(model.graph().SerializeToString())
     np.testing.assert_allclose(

@@ -68,7 +68,7 @@ def test_lite_has_an_int8_form_that_the_box_reads():
     (method,) = methods.find(["lite"], methods.Effort(0.05))
     model = method.train(s, s.samples, 1)
     assert (model.logits(s.samples).argmax(1) == s.labels).mean() > 0.8
-    int8 = model.forms["int8"]
+    int8 = model.precisions["int8"]
     assert cost.precision(int8.graph()) == "int8"
     reader.read(int8.graph().SerializeToString())
     np.testing.assert_allclose(

@@ -296,7 +296,7 @@ def test_the_method_is_its_int8_graph():
         model.logits(s.samples), graph_builder.run(model.graph(), s.samples)
     )
     assert any(n.op_type == "MatMulInteger" for n in model.graph().graph.node)
-    plain = model.forms["float"]
+    plain = model.precisions["float"]
     np.testing.assert_allclose(
         plain.logits(s.samples), graph_builder.run(plain.graph(), s.samples), atol=1e-3
     )
@@ -407,9 +407,9 @@ def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactMode
     other = easy(seed=9).samples
     logits = bare.logits(other)
     np.testing.assert_array_equal(logits, graph_builder.run(bare.graph(), other))
-    np.testing.assert_allclose(bare.forms["float"].logits(other), logits, atol=2e-3)
+    np.testing.assert_allclose(bare.precisions["float"].logits(other), logits, atol=2e-3)
     np.testing.assert_allclose(
-        graph_builder.run(bare.forms["float"].graph(), other), logits, atol=2e-3
+        graph_builder.run(bare.precisions["float"].graph(), other), logits, atol=2e-3
     )
     assert np.mean(logits.argmax(1) == easy(seed=9).labels) > 0.9
     assert bare.features(other[:2], prefixes=True).shape == (2, 10, bare.fit.bands)

@@ -305,7 +305,7 @@ def test_the_method_names_materials_that_it_never_saw_last():
     named = logits.argmax(axis=1)[sweeps.labels != 1]
     assert np.mean(named == part.labels) > 0.9
     assert (
-        np.mean(model.forms["float"].logits(part.samples).argmax(axis=1) == named[: len(part)])
+        np.mean(model.precisions["float"].logits(part.samples).argmax(axis=1) == named[: len(part)])
         > 0.95
     )
 

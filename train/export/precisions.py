@@ -81,7 +81,7 @@ def _packed_forms(
     has one."""
     model, content = pack.train_content(method, sweeps, seed)
     counted: dict[str, dict[str, Any]] = {}
-    for form, graphed in {"": model, **getattr(model, "forms", {})}.items():
+    for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
         graph = graphed.graph()
         precision = cost.precision(graph)
         if any(precision == entry["precision"] for entry in counted.values()):
