@@ -69,7 +69,8 @@ class ContactCentres:
 
 @dataclass(frozen=True, slots=True)
 class Contacts:
-    """The limit and the centres of a training set; centres: None without a limit or a contact. pitch_mm: of a simulated skin, whose pitch is known; else None."""
+    """The limit and the centres of a training set; centres: None without a limit or a contact.
+    pitch_mm: of a simulated skin, whose pitch is known; else None."""
 
     limit: ContactLimit
     centres: ContactCentres | None

@@ -68,7 +68,7 @@ class DisplacementFit:
 def fit_displacement(
     whole: Array, labels: Array, judged: Array, fixed: int, copied: AugmentedCopies, logits: Array
 ) -> DisplacementFit | None:
-    """The rule for displaced sweeps; None if there are no copies to fit it to or to judge by.
+    """The rule for displaced sweeps; None without copies to fit it to and to judge it by.
 
     whole, labels, judged: features [N, F], labels [N] and bool [N] as in CalibrationInputs. logits:
     [m, K] of the held-out copies, calibrated for contacts that are in place, by a head that saw

@@ -163,7 +163,8 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
     right = probabilities[:, -1].argmax(1) == labels
     best = EarlyRule(
         None,
-        f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {MAX_LOSS:.1%} of {n} "
+        f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {MAX_LOSS:.1%} of "
+        f"{n} "
         "held-out sweeps wrong",
         n=n,
     )

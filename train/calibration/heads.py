@@ -133,7 +133,8 @@ def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Arra
     x = np.asarray(features, np.float64)
     if len(x) <= len(present):
         raise FormatError(
-            f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record more"
+            f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record "
+            "more"
         )
     means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
     scatter = x - means[member]

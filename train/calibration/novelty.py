@@ -236,7 +236,8 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
     values = np.unique(groups[judged])
     if len(np.unique(groups)) < 2:
         raise FormatError(
-            "all sweeps are of one group; what judges must not be trained on; record a second position"
+            "all sweeps are of one group; what judges must not be trained on; record a second "
+            "position"
         )
     part_of = np.full(len(groups), -1)
     judging = np.isin(groups, values)
@@ -268,12 +269,13 @@ def limit(novelty: Array, kept: float = KEPT) -> float:
 
     It is the ceil((n + 1) * kept)-th smallest, as in split conformal prediction, so that a new
     sweep is kept with at least that probability (Vovk et al. 2005); the largest if n is too small.
-    Raises FormatError if there is no novelty.
+    Raises FormatError if only NaN is left.
     """
     novelty = novelty[~np.isnan(novelty)]
     if not (n := len(novelty)):
         raise FormatError(
-            "no known sweep is left to find the limit with; record each material in several positions"
+            "no known sweep is left to find the limit with; record each material in several "
+            "positions"
         )
     rank = min(int(np.ceil((n + 1) * kept)), n) - 1
     return float(max(np.sort(novelty)[rank], np.finfo(np.float32).tiny))

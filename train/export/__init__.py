@@ -1,1 +1,1 @@
-"""From a fit to a bundle, and what it costs."""
+"""The way from a fit to a bundle, and the cost of the bundle."""

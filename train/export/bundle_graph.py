@@ -1,7 +1,7 @@
 """The graph of a bundle: a trunk, the heads of a calibration, and the embedding.
 
-Large matrices are kept in 16 bits. The nodes that only early answers need depend on nothing else,
-so that a box without early answers can leave them out.
+Large matrices are kept in 16 bits. No other output depends on the nodes of early answers, so that a
+box without early answers can leave them out.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""What a bundle answers to a sweep set, through the classifier of the box. In: a classifier, a
-Dataset. Out: a BundleScore.
+"""Answers of a bundle to a sweep set, through the classifier of the box.
 
-A sweep counts as named rightly where the box names its material and is sure of it (status ok).
+A sweep counts as named rightly if the box names its material with status ok.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ the interval."""
 def verdicts(
     classifier: Classifier, sweeps: Dataset, *, fused: bool = False
 ) -> Iterator[tuple[int, Verdict]]:
-    """The box's verdict on each sweep with its number, recording by recording. fused: the sweeps of
-    a recording count as sweeps of one object."""
+    """The box's verdict on each sweep with the sweep's number, recording by recording. fused: the
+    sweeps of a recording count as sweeps of one object."""
     format = sweeps.format
     t_ns, seq = (
         (np.arange(format.window) * format.period_ns).astype(np.int64),
@@ -76,15 +75,16 @@ def labels_of(
 
 @dataclass(frozen=True)
 class BundleScore:
-    """What a bundle answered to the sweeps of a set.
+    """The answers of a bundle to the sweeps of a set.
 
     about: name, version and id of the bundle. right: bool [n], of the sweeps whose material it has.
-    clusters, by: the groups [n] that the interval resamples, and their name; None, "" where sweeps
-    are independent. answered: of each material the answers and their counts: a label, or a status
-    in parentheses. statuses: counts. unsure_right: answers that were unsure but named the material.
-    recordings: right ones of those with several sweeps, fused; None where there are none. foreign:
-    as `answered`, of materials that the bundle does not have. moved: what the box says of the
-    sweeps whose contact lies outside the trained positions, each with its count.
+    clusters, by: the groups [n] that the interval resamples, and their name; None and "" if sweeps
+    are independent. answered: for each material the answers and their counts: a label, or a status
+    in parentheses. statuses: counts. unsure_right: number of unsure answers with the right label.
+    recordings: whether the fused answer to each recording is right; None if no recording has
+    several sweeps. foreign: as `answered`, of materials that the bundle does not have. moved:
+    descriptions of displacements, of the sweeps whose contact lies outside the trained positions,
+    with their counts.
     """
 
     about: dict[str, str]
@@ -100,7 +100,7 @@ class BundleScore:
     moved: Counter[str]
 
     def json(self) -> dict[str, Any]:
-        """The figures for scripts, with where they come from."""
+        """The figures for scripts, with their provenance."""
         result: dict[str, Any] = {
             "bundle": self.about,
             "set": self.sweeps.source,
@@ -125,7 +125,8 @@ class BundleScore:
         """The figures for a person, as lines."""
         by = "" if self.clusters is None else f", by {self.by} ({len(np.unique(self.clusters))})"
         lines = [
-            f"{self.about['name']} {self.about['version']}, {self.about['id']}, on {self.sweeps.source}: "
+            f"{self.about['name']} {self.about['version']}, {self.about['id']}, on "
+            f"{self.sweeps.source}: "
             f"{len(self.sweeps)} sweeps of {len(self.answered) + len(self.foreign)} materials",
             f"named rightly: {_share(self.right, self.clusters)}, 95 % interval{by}",
         ]
@@ -153,7 +154,8 @@ class BundleScore:
                 f"{answer} {n}" for answer, n in given.most_common() if answer != material
             )
             lines.append(
-                f"  {material:<{wide}}  {given[material]:>4} of {given.total():<4}  {others}".rstrip()
+                f"  {material:<{wide}}  {given[material]:>4} of {given.total():<4}  "
+                f"{others}".rstrip()
             )
         for material, given in self.foreign.items():
             named = ", ".join(f"{answer} {n}" for answer, n in given.most_common())
@@ -162,17 +164,19 @@ class BundleScore:
 
 
 def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
-    """Run `sweeps` through the box's classifier. Raises FormatError where their format is not the
-    bundle's, or it has none of their materials."""
+    """Run `sweeps` through the box's classifier. Raises FormatError if their format is not the
+    bundle's, or if it has none of their materials."""
     manifest = classifier.bundle.manifest
     present = [sweeps.materials[k] for k in np.unique(sweeps.labels)]
     if sweeps.format != manifest.format:
         raise FormatError(
-            f"{sweeps.source} is of {sweeps.format}, the bundle of {manifest.format}; name a set of its form"
+            f"{sweeps.source} is of {sweeps.format}, the bundle of {manifest.format}; name a set "
+            "of its format"
         )
     if not set(present) & set(manifest.labels):
         raise FormatError(
-            f"{sweeps.source} has {', '.join(present)}, the bundle {', '.join(manifest.labels)}; none is the same: "
+            f"{sweeps.source} has {', '.join(present)}, the bundle {', '.join(manifest.labels)}; "
+            "none is the same: "
             "name another set, or --rename OLD=NEW"
         )
     material = np.array(sweeps.materials)[sweeps.labels]
@@ -202,7 +206,7 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
 
 
 def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
-    """Which sweeps [N] succeed or fail together, and the name of that group."""
+    """The groups [N] of sweeps that succeed or fail together, and the name of the group."""
     for name in CLUSTERS:
         if name in sweeps.groups and len(np.unique(sweeps.groups[name])) > 1:
             return sweeps.groups[name], name
@@ -211,8 +215,8 @@ def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
 
 
 def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
-    """Whether the last fused answer to each recording is right, bool [G]; None where each holds one
-    sweep."""
+    """Whether the last fused answer to each recording is right, bool [G]; None if every recording
+    has one sweep."""
     values, member = np.unique(sweeps.group("recording"), return_inverse=True)
     if len(values) == len(sweeps):
         return None

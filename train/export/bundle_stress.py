@@ -1,5 +1,5 @@
-"""What a bundle answers to corrupted sweeps, through the classifier of the box. In: a classifier,
-EvaluationSweeps. Out: curves, as robustness has them of methods."""
+"""Answers of a bundle to corrupted sweeps, through the classifier of the box, as curves like those
+of robustness."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from train.export import bundle_score
 Array = NDArray[Any]
 Json = dict[str, Any]
 ANSWERS = ("rightly", "wrongly", "unsure", "unknown", "refused", "network")
-"""What becomes of a sweep: named with status ok, or one of three ways not to name it; and whether
-the network alone, whose most probable label counts whatever the box makes of it, is right."""
+"""The outcomes of a sweep: named with status ok, or one of three ways not to be named; and whether
+the network alone is right, whose most probable label counts without the checks of the box."""
 
 
 def under_corruptions(
@@ -35,14 +35,15 @@ def under_corruptions(
     """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the
     sweeps named rightly.
 
-    seeds: of the corruptions. Raises FormatError where the sweeps are not of the bundle's format,
-    or of materials that it does not have.
+    seeds: of the corruptions. Raises FormatError if the sweeps are not of the bundle's format, or
+    have a material that it lacks.
     """
     manifest, sweeps = box.bundle.manifest, test.sweeps
     lacking = sorted({sweeps.materials[k] for k in np.unique(sweeps.labels)} - set(manifest.labels))
     if sweeps.format != manifest.format or lacking:
         raise FormatError(
-            f"bundle {box.bundle.id} ({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
+            f"bundle {box.bundle.id} "
+            f"({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
             f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
         )
     clean, tasks = _answers(box, sweeps), []
@@ -63,7 +64,8 @@ def under_corruptions(
 
 
 def _answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
-    """Which sweeps get each of ANSWERS: bool [N] each; the first five are of every sweep one."""
+    """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
+    five."""
     given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
     labels = box.bundle.manifest.labels
     for i, verdict in bundle_score.verdicts(box, sweeps):

@@ -27,17 +27,17 @@ from train.metrics.score import interval, provenance
 Array = NDArray[Any]
 Json = dict[str, Any]
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
-"""How far the skin is moved, in mm."""
+"""Displacements of the skin in mm."""
 DIRECTIONS = {"rows": "dx_mm", "columns": "dy_mm"}
 LOSS = 0.05
-"""Accuracy counts as lost where it is so far below that of a skin that has not moved."""
+"""Accuracy counts as lost if it is this far below that of a skin that was not moved."""
 
 
 def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:
-    """The box's answers to simulated sweeps with the skin elsewhere: at positions that were not
-    trained (`unseen`, which are then moved), at those that were (`seen`), and at T-HARD's (`hard`).
+    """The box's answers to simulated sweeps: at positions that were not trained (`unseen`, whose
+    skin is then moved), at trained positions (`seen`), and at those of T-HARD (`hard`).
 
-    Raises FormatError where the bundle has no positions.
+    Raises FormatError if the bundle has no positions.
     """
     place = box.bundle.manifest.contact
     if place is None:
@@ -77,12 +77,11 @@ def _point(
     test: EvaluationSweeps,
     where: Callable[[skin.Placement], skin.Placement] = lambda p: p,
 ) -> Json:
-    """The box's answers to the test sweeps, with the skin moved. Sweeps of one attachment form a
-    cluster.
+    """The box's answers to the test sweeps, with the skin moved. The sweeps of an attachment are
+    one cluster.
 
-    accuracy, wrong: named with status ok, rightly and wrongly; unsure, unknown: the other answers;
-    network: named rightly by the network alone, whose most probable label counts whatever the box
-    makes of it.
+    accuracy, wrong: named with status ok, rightly and wrongly. unsure, unknown: the other answers.
+    network: most probable label of the network alone is right.
     """
     assert test.scene
     sweeps, place, limits = test.sweeps, box.bundle.manifest.contact, box.bundle.manifest.thresholds
@@ -149,9 +148,11 @@ def _loss(points: Sequence[Json]) -> Json:
 
 
 def lines(result: Json) -> Iterator[str]:
-    """For the terminal: accuracy as the box answers and of the network alone, and share of flagged
-    sweeps, with intervals, at each displacement."""
-    yield f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
+    """The report for the terminal: accuracy of the box and of the network alone, and share of
+    flagged sweeps, with intervals, at each displacement."""
+    yield (
+        f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
+    )
     named = {k: v for k, v in result.items() if isinstance(v, dict) and "attachments" in v}
     rows = [(name, point) for name, point in named.items()]
     rows += [
@@ -165,6 +166,8 @@ def lines(result: Json) -> Iterator[str]:
             for key in ("accuracy", "wrong_share", "network", "moved")
         )
         yield (
-            f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure {point['unsure']:>3}  unknown "
-            f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance {point['told_mm']} mm"
+            f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure "
+            f"{point['unsure']:>3}  unknown "
+            f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance "
+            f"{point['told_mm']} mm"
         )

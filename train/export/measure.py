@@ -1,8 +1,7 @@
-"""What a packed model costs on this machine. In: folders of models, sweeps. Out: a Measurement of
-each: time, size, memory.
+"""The cost of a packed model on this machine: time, size and memory.
 
-Run by its path, this file is also the process of its own in which a model's memory is read. It
-therefore imports at its top only what the box has.
+Run by its path, this file is also the separate process in which the memory of a model is read. It
+therefore imports at its top only packages that the box has.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from appliance.core.errors import BundleError
 Array = NDArray[Any]
 Call = Callable[[Array], Any]
 ROUNDS, BLOCK = 60, 6
-"""Rounds; sweeps of a model in one round, after one that is not counted: the model before it has
-emptied the caches."""
+"""Number of rounds, and of sweeps of a model in a round. One more sweep before them is not counted,
+because the model before it has emptied the caches."""
 TIMED_SWEEPS = 60
-"""About so many different sweeps are used, spread evenly over those given."""
+"""Approximate number of different sweeps, spread evenly over the given sweeps."""
 SWEEPS_BEFORE_MEMORY = 20
-"""How many sweeps a process answers before its memory is read."""
+"""Number of sweeps that a process answers before its memory is read."""
 MODEL, TORCH, AEON = "model.onnx", "model.pt", "model.npz"
 """The model's file in a bundle, as TorchScript, and as aeon's parameters."""
 DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
@@ -43,13 +42,13 @@ DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one packed model costs on this machine.
+    """The cost of a packed model on this machine.
 
     ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks
-    and features, in one thread; of a model in its own library, of its logits. model_bytes: the
-    model's file. bundle_bytes: all files, golden sweeps too. rss_mib: resident memory (VmRSS) in
-    MiB of a process of its own that has loaded the model and answered SWEEPS_BEFORE_MEMORY sweeps.
-    foreign: packages in that process that the box does not have.
+    and features, in one thread; for a model in its own library, of its logits. model_bytes: of the
+    model's file. bundle_bytes: of all files, golden sweeps included. rss_mib: resident memory
+    (VmRSS) in MiB of a separate process that has loaded the model and answered SWEEPS_BEFORE_MEMORY
+    sweeps. foreign: packages in that process that the box does not have.
     """
 
     ms_p50: float
@@ -73,8 +72,8 @@ class Measurement:
 def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
     """The Measurement of the model in each of `folders`, in their order; all are timed in turns.
 
-    sweeps: raw counts [n, T, R, C], of the format of all the models. Raises BundleError where a
-    model does not run.
+    sweeps: raw counts [n, T, R, C], in the format of all models. Raises BundleError if a model does
+    not run.
     """
     some = sweeps[:: max(len(sweeps) // TIMED_SWEEPS, 1)]
     took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
@@ -98,9 +97,9 @@ def timed(
 ) -> dict[str, Array]:
     """Times in ms [rounds * block] of each call with `sweeps` [n, T, R, C] one by one, by name.
 
-    All take turns, a block each, and every round begins with another one: what slows the machine
-    down slows all alike. It is the time that the processor gave to one thread: by the clock, slow
-    models would be interrupted by other programs and quick ones would not.
+    All calls take turns, a block each, and every round begins with another call, so a slow machine
+    slows all of them alike. The time is processor time of one thread: in real time, slow models
+    would be interrupted by other programs and quick ones would not.
     """
     from train.models.training import (
         one_thread,
@@ -124,7 +123,7 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
     """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of
     `sweeps`, and the `foreign` packages there.
 
-    Raises BundleError where it does not run in a process of its own.
+    Raises BundleError if the model does not run in a process of its own.
     """
     with tempfile.TemporaryDirectory() as aside:
         path = Path(aside) / "sweeps.npy"
@@ -138,18 +137,19 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     if done.returncode:
         raise BundleError(
-            f"the model in {folder} does not run in a process of its own: {done.stderr.strip()[-300:]}; pack it again"
+            f"the model in {folder} does not run in a process of its own: "
+            f"{done.stderr.strip()[-300:]}; pack it again"
         )
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
 def load(folder: Path) -> Call:
-    """What answers raw counts [T, R, C]: the box's classifier for a bundle, else the model in its
-    own library.
+    """A function that answers raw counts [T, R, C]: the box's classifier for a bundle, else the
+    model in its own library.
 
-    Raises BundleError for a bundle that is not whole, and ImportError where a model's own library
-    is missing.
+    Raises BundleError for an incomplete bundle, and ImportError if the model's own library is
+    missing.
     """
     if (folder / TORCH).is_file():
         return _torch(folder / TORCH)
@@ -159,7 +159,7 @@ def load(folder: Path) -> Call:
 
 
 def _classifier(folder: Path) -> Call:
-    """The box's classifier, given one sound sweep after another, each of an object of its own."""
+    """The box's classifier, which gets one sound sweep after another, each of another object."""
     from appliance.bundle import (
         bundle,
     )  # here, not at the top: a model in its own library runs without the box's code
@@ -219,8 +219,8 @@ def _aeon(path: Path) -> Call:
 
 
 def main(folder: str, sweeps: str) -> None:
-    """Answer some sweeps, and print the resident memory in MiB and what of the desktop was loaded,
-    as JSON."""
+    """Answer some sweeps, and print the resident memory in MiB and the loaded packages of the
+    desktop as JSON."""
     answer = load(Path(folder))
     counts = np.load(sweeps)
     for i in range(SWEEPS_BEFORE_MEMORY):

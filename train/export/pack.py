@@ -1,7 +1,7 @@
-"""Packing a trained model as a bundle. In: a graph, its sweeps, a folder. Out: the folder, or
-ExportRefused.
+"""Packing of a trained model as a bundle.
 
-A model is refused unless the box's classifier, on this machine, answers as the trained model does.
+A model is refused unless the box's classifier, on this machine, gives the answers of the trained
+model.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ from train.onnx_tools.graph_builder import run, slim
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
-"""Shares of held-out sweeps that the box may refuse (because of stuck taxels, for instance), and
-call unknown, which it does for about 5 % by its limit; more means that thresholds or limit do not
-fit."""
+"""Largest shares of held-out sweeps that the box may refuse (because of stuck taxels, for
+instance), and call unknown. Its limit makes it call about 5 % unknown; more means that thresholds
+or limit do not fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 FEWEST = 5
-"""Training sweeps of a material, below which that is why none is recognised."""
+"""Number of training sweeps of a material below which that is the reason why none is recognised."""
 COARSEST = 8
-"""Steps to which golden sweeps are rounded at most, of what a number usually changes by in a frame.
-Coarser ones save little more."""
+"""Largest step to which golden sweeps are rounded, in usual changes of a number from frame to
+frame. Larger steps save little more."""
 NEAR = 0.1
-"""By how much rounding may move a probability of a golden sweep; so the label stays as certain as
-it was, about."""
+"""Largest change of a golden sweep's probability by rounding, so that its label stays about as
+certain."""
 
 
 class ExportRefused(BundleError):
-    """A model that answers differently in its bundle than it was trained, or that the box could not
-    use."""
+    """The model answers differently in its bundle than on the desktop, or the box could not use
+    it."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,10 @@ class Content:
     """The content of a bundle.
 
     model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need. input:
-    as in the manifest. train, held_out: the sweeps it was trained on and the others, split by the
-    group `held_out_by`. about: how it was made; figures: its results; both for the manifest. early,
-    known, moved: for the manifest. means: the file means.npz if there is `known`. reference: the
-    float model of an int8 model. contacts: of the training sweeps; None to find them.
+    as in the manifest. train, held_out: the training sweeps and the others, split by the group
+    `held_out_by`. about: description of the training; figures: its results; both for the manifest.
+    early, known, moved: for the manifest. means: the file means.npz if there is `known`. reference:
+    the float model of an int8 model. contacts: of the training sweeps; None to find them.
     """
 
     model: onnx.ModelProto
@@ -159,8 +159,8 @@ def _made(content: Content, commit: str, contact_unknown_because: str) -> dict[s
 
 
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
-    """`method` trained on all but a fifth of the positions (else recordings) of `sweeps`, on which
-    it is tested.
+    """`method`, trained on four fifths of the positions (else recordings) of `sweeps`; the others
+    test it.
 
     Raises FormatError for a method that the box cannot run.
     """
@@ -168,7 +168,7 @@ def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
 
 
 def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Content]:
-    """The model that `trained` trains, and its content."""
+    """The model of `trained`, and its content."""
     if why := method.why_not_on_the_box:
         raise FormatError(
             f"method {method.name!r} {why}; compare it with evaluate, and pack another"
@@ -186,13 +186,13 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
 def pack_to_measure(
     content: Content, target: Path, full_scale: float | None = None
 ) -> bundle.Manifest:
-    """Pack `content` under its method's name, so that every command that measures a method measures
-    the same bundle."""
+    """Pack `content` under the name of its method, so that every command that measures a method
+    measures the same bundle."""
     return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
 
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
-    """Logits [N, K] as the box computes them from class means where a label is enrolled, before
+    """Logits [N, K] that the box computes from class means once a label is enrolled, before
     temperature scaling."""
     with np.load(io.BytesIO(content.means)) as means:
         logits: Array = _embedded(content, sweeps) @ means["means"].T + means["bias"]
@@ -200,7 +200,8 @@ def logits_of_means(content: Content, sweeps: Dataset) -> Array:
 
 
 def _unknown(content: Content, sweeps: Dataset) -> Array:
-    """bool [N], which of them the box calls unknown: none where the bundle has no novelty check."""
+    """bool [N], the sweeps that the box calls unknown; none if the bundle has no limit of known
+    materials."""
     if not content.known:
         return np.zeros(len(sweeps), bool)
     with np.load(io.BytesIO(content.means)) as means:
@@ -224,9 +225,9 @@ def _embedded(content: Content, sweeps: Dataset) -> Array:
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:
     """One training sweep of the first and the last material.
 
-    Of the sweeps that both kinds of logits recognise it is the one with the median probability: not
-    so certain that a small fault does not show, and not so uncertain that rounding changes the
-    label. Raises ExportRefused where none is recognised.
+    It is the sweep with the median probability among those that both kinds of logits recognise:
+    certain enough that rounding does not change its label, and not so certain that a small fault is
+    hidden. Raises ExportRefused if none is recognised.
     """
     index = []
     for label in (0, len(sweeps.materials) - 1):
@@ -237,7 +238,8 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dat
         )
         if not len(known):
             raise ExportRefused(
-                f"no training sweep of {sweeps.materials[label]!r} is recognised: {_why(sweeps, label)}"
+                f"no training sweep of {sweeps.materials[label]!r} is recognised: "
+                f"{_why(sweeps, label)}"
             )
         order = np.argsort(softmax(logits[known])[:, label], kind="stable")
         index.append(known[order[len(order) // 2]])
@@ -245,10 +247,10 @@ def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dat
 
 
 def golden_file(content: Content, golden: Dataset) -> bytes:
-    """golden.npz: sweeps, and the logits of the model for exactly these.
+    """The file golden.npz: sweeps, and the logits of the model for exactly these.
 
-    Sweeps are rounded, since noise does not pack: as coarsely as leaves labels as they are,
-    probabilities NEAR, and known sweeps known.
+    Sweeps are rounded because noise cannot be compressed: as coarsely as possible without a change
+    of a label, a change of a probability by more than NEAR, or a known sweep that becomes unknown.
     """
 
     def answers(samples: Array) -> tuple[Array, ...]:
@@ -269,8 +271,8 @@ def golden_file(content: Content, golden: Dataset) -> bytes:
 
 
 def _rounded(samples: Array) -> Iterator[Array]:
-    """Sweeps as multiples of powers of two, from COARSEST times what a number usually changes by in
-    a frame down to half of that change. Sweeps of whole numbers stay such."""
+    """Sweeps as multiples of powers of two, from COARSEST usual changes of a number from frame to
+    frame down to half of that change. Sweeps of whole numbers stay whole."""
     whole = samples.dtype.kind != "f"
     usual = float(np.median(np.abs(np.diff(samples.astype(np.float64), axis=1))))
     if not usual:
@@ -285,7 +287,7 @@ def _rounded(samples: Array) -> Iterator[Array]:
 
 
 def _why(sweeps: Dataset, label: int) -> str:
-    """What keeps a material from being recognised, and what to do."""
+    """The reason why a material is not recognised, and the remedy."""
     of_it = sweeps.samples[sweeps.labels == label]
     if not np.ptp(of_it, axis=1).any():
         return "every taxel of its sweeps is constant; check the skin, and record it again"
@@ -297,8 +299,8 @@ def _why(sweeps: Dataset, label: int) -> str:
 def thresholds(
     sweeps: Dataset, contact: float | None, full_scale: float | None
 ) -> bundle.Thresholds:
-    """The thresholds for a window; without `full_scale` the highest count of the type is taken for
-    it."""
+    """The thresholds for a window; without `full_scale` the highest count of the type is the full
+    scale."""
     kind = sweeps.samples.dtype
     top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
     return bundle.Thresholds(
@@ -307,10 +309,10 @@ def thresholds(
 
 
 def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
-    """Figures of the bundle in `folder` on `held_out`, run as the box runs it; logits [N, K]: of
-    the graph, on the same.
+    """Figures of the bundle in `folder` on `held_out`, run as the box runs it. logits: [N, K] of
+    the graph, for the same sweeps.
 
-    Raises ExportRefused where the box gives another label than export, or refuses too many sweeps.
+    Raises ExportRefused if the box gives another label than the graph, or refuses too many sweeps.
     """
     box = Classifier(bundle.load(folder), SystemClock())
     box.self_test()
@@ -325,20 +327,24 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
             str(v.status) for _, v in bundle_score.verdicts(box, held_out) if not v.label
         )
         raise ExportRefused(
-            f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit {MOST_REFUSED:.0%}), by status: "
-            f"{counted(reasons)}. Drop such sweeps from the set; where they are saturated, name the skin's --full-scale"
+            f"the box would refuse {refused.sum()} of {len(held_out)} held-out sweeps (limit "
+            f"{MOST_REFUSED:.0%}), by status: "
+            f"{counted(reasons)}. Drop such sweeps from the set; where they are saturated, name "
+            "the skin's --full-scale"
         )
     if (known := box.bundle.manifest.known) and unknown.mean() > MOST_UNKNOWN:
         raise ExportRefused(
-            f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit {MOST_UNKNOWN:.0%}, "
-            f"squared distance {known.limit:.4g}); record more positions, so that it learns how sweeps vary"
+            f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit "
+            f"{MOST_UNKNOWN:.0%}, "
+            f"squared distance {known.limit:.4g}); record more positions, so that it learns how "
+            "sweeps vary"
         )
     return answers.figures(held_out, protocol)
 
 
 def check_target(target: Path) -> None:
-    """Make the folders above `target`. Raises ExportRefused where no bundle can be put there,
-    before anything is computed."""
+    """Make the folders above `target`. Raises ExportRefused if no bundle can be put there, before
+    anything is computed."""
     if target.exists() and not (target / bundle.MANIFEST).is_file():
         raise ExportRefused(
             f"{target} is not a bundle and will not be replaced; name another folder with --out"
@@ -349,13 +355,14 @@ def check_target(target: Path) -> None:
             pass
     except OSError as e:
         raise ExportRefused(
-            f"the bundle cannot be written to {target}: {e.strerror}; name another folder with --out"
+            f"the bundle cannot be written to {target}: {e.strerror}; name another folder with "
+            "--out"
         ) from e
 
 
 @contextlib.contextmanager
 def _replacing(target: Path) -> Iterator[Path]:
-    """A new folder beside `target` that replaces it when the block succeeds, and is removed when it
+    """A new folder beside `target`, which replaces it if the block succeeds and is removed if it
     fails."""
     check_target(target)
     try:

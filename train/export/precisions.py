@@ -1,8 +1,6 @@
-"""Every form of a method as a packed model. In: a method, sweeps. Out: its bundles, and it as its
-own library runs it.
+"""Every precision of a method as a packed model, and the method in its own library.
 
-The forms are the method itself, its other precisions, and for some a peer: the same model in a
-library that the box has not.
+For some methods there is a peer: the same model in a library that the box does not have.
 """
 
 from __future__ import annotations
@@ -31,11 +29,11 @@ INDEX = "dots.json"
 
 @dataclass(frozen=True)
 class Packed:
-    """A model in `folder`, which measure.load reads. runtime: "onnx" is a bundle, else a peer in
-    its own library.
+    """A model in `folder`, which measure.load reads. runtime: "onnx" for a bundle, else the library
+    of a peer.
 
-    form: "" is the method itself, else the name of a form of it. precision, weights, macs: as
-    onnx_tools.cost counts them. window_s: length of a sweep in s.
+    form: "" for the method itself, else the name of another of its precisions. precision, weights,
+    macs: as onnx_tools.cost counts them. window_s: length of a sweep in s.
     """
 
     method: str
@@ -49,18 +47,18 @@ class Packed:
 
     @property
     def name(self) -> str:
-        """No two models of a chart share one."""
+        """A name that no other model of a chart has."""
         return f"{self.method} {self.precision}" + (
             "" if self.runtime == "onnx" else f" in {self.runtime}"
         )
 
 
 def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
-    """Train `method` on four fifths of `sweeps` and pack all its forms; what lies in `folder` is
+    """Train `method` on four fifths of `sweeps` and pack all its precisions; models in `folder` are
     not made again.
 
-    Raises FormatError where the method cannot work with the set, ExportRefused where it would be no
-    model on the box.
+    Raises FormatError if the method cannot work with the set, and ExportRefused if the box could
+    not use the model.
     """
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -77,8 +75,8 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
 def _packed_forms(
     method: Method, sweeps: Dataset, seed: int, work: Path
 ) -> Iterator[dict[str, Any]]:
-    """Each form packed in a folder of its own; then the method as its own library runs it, where it
-    has one."""
+    """Each precision packed in a folder of its own; then the method in its own library, if it has
+    one."""
     model, content = pack.train_content(method, sweeps, seed)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
@@ -108,7 +106,7 @@ def _packed_forms(
 
 
 def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
-    """The network as TorchScript, which needs none of our code to be read."""
+    """The network as TorchScript, which can be read without our code."""
     import torch  # here: other forms need no PyTorch
 
     with warnings.catch_warnings(), torch.no_grad():
@@ -131,16 +129,16 @@ PEERS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
     "paper-cnn-centred": ("torch", _save_torch),
     "minirocket": ("aeon", _save_aeon),
 }
-"""Methods that are measured in their own library as well, which the box has not."""
+"""Methods that are also measured in their own library, which the box does not have."""
 
 
 def measured(
     models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS
 ) -> list[dict[str, Any]]:
-    """What each of the `models` costs, as chart.json names it; see docs/reference/file-formats.md. sweeps: raw
-    counts [n, T, R, C].
+    """The cost of each of the `models` with the names of chart.json; see
+    docs/reference/file-formats.md. sweeps: raw counts [n, T, R, C].
 
-    Raises BundleError where a model does not run.
+    Raises BundleError if a model does not run.
     """
     found = measure.measure_all([one.folder for one in models], sweeps, rounds)
     return [_costs(one, measurement) for one, measurement in zip(models, found, strict=True)]

@@ -1,7 +1,5 @@
-"""Quantization of a trained network for the box. In: a Fit. Out: its bundle.
-
-Where the int8 form does not answer as the fitted one does, the bundle holds the float form.
-"""
+"""A fit as a bundle in int8, or in float if its int8 model does not answer as the float model
+does."""
 
 from __future__ import annotations
 
@@ -33,23 +31,24 @@ from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
-"""Of a logit, between PyTorch and the float graph: they add the same numbers in another order."""
+"""Largest difference of a logit between PyTorch and the float graph, which add the same numbers in
+another order."""
 MOST_LOST = 0.005
-"""Loss of accuracy on held-out sweeps, float less int8: as expected from float's probabilities
-(AnswerDifference.expected_loss), whatever the number of sweeps; and as counted, where that is
-significant. Counting alone is not enough: two uncertain sweeps of a hundred that change their label
-are two points lost or won."""
+"""Largest loss of accuracy on held-out sweeps by int8: as expected from float's probabilities
+(AnswerDifference.expected_loss), for any number of sweeps; and as counted, if that is significant.
+Counting alone is not enough: two uncertain sweeps of a hundred that change their label are two
+points lost or won."""
 CHANCE = 0.05
-"""Level of significance: of the one-sided sign test on the sweeps on which both forms differ, that
-int8 is not worse. The counted loss is used only where the probability is below it."""
+"""Level of significance of the one-sided sign test on the sweeps on which both precisions differ,
+that int8 is not worse. The counted loss is used only if the probability is below it."""
 LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 0.025
-"""Share of held-out sweeps with equal labels, of which one may always differ; largest change of a
-probability, and its mean. Of 14 fits of four sizes to five sets the worst had 0.974, 0.199 and
-0.015."""
+"""Least share of held-out sweeps with equal labels, of which one may always differ; largest change
+of a probability, and largest mean change. The worst of 14 fits of four sizes to five sets had
+0.974, 0.199 and 0.015."""
 
 SATURATED = 0.01
-"""Where a larger share of a tensor's values is beyond the range of int8, this tensor is named as
-the cause, although the noise grows with every later layer."""
+"""A tensor with a larger share of values beyond the range of int8 is named as the cause, although
+the noise grows with every later layer."""
 
 
 def export(
@@ -111,8 +110,8 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
-    """The largest of a logit between PyTorch and the float graph. Raises ExportRefused above
-    MOST_TORCH_DIFFERENCE."""
+    """The largest difference of a logit between PyTorch and the float graph. Raises ExportRefused
+    above MOST_TORCH_DIFFERENCE."""
     import torch  # here: a fit without trained stages is exported without PyTorch
 
     with torch.no_grad():
@@ -120,14 +119,15 @@ def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
     difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
     if not difference <= MOST_TORCH_DIFFERENCE:
         raise ExportRefused(
-            f"the float graph differs from pytorch by {difference:.3g} in a logit (limit {MOST_TORCH_DIFFERENCE}); "
+            f"the float graph differs from pytorch by {difference:.3g} in a logit (limit "
+            f"{MOST_TORCH_DIFFERENCE}); "
             "fit again; if it stays, compare train/models/recipe/graph.py with network.py"
         )
     return difference
 
 
 def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
-    """(float, int8): `sweep` -> `logits`, each with a head fitted on the features of its own
+    """(float, int8): `sweep` -> `logits`, each with a head fitted to the features of its own
     trunk."""
     reference = with_head(
         fit.trunk(int8=False), fit.weights["head.weight"], fit.weights["head.bias"]
@@ -136,11 +136,8 @@ def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
 
 
 def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
-    """`content`, whose model is int8, with a comparison with its float form `reference`; unchanged
-    where that is None.
-
-    Raises ExportRefused where `check` does.
-    """
+    """`content`, whose model is int8, with a comparison with the float model `reference`; unchanged
+    if that is None. Raises ExportRefused as `check`."""
     if reference is None:
         return content
     held_out = content.held_out
@@ -156,8 +153,8 @@ def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
 
 
 def check(found: Parity) -> None:
-    """Raises ExportRefused, with the number, its limit and what to try, where int8 differs too much
-    from float."""
+    """Raises ExportRefused, with the number, its limit and a remedy, if int8 differs too much from
+    float."""
     apart, lost = found.answers, found.accuracy
     if apart is None or lost is None:
         raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
@@ -165,12 +162,14 @@ def check(found: Parity) -> None:
     if found.layers:
         worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
         hint = (
-            f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond what int8 reaches; "
+            f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond "
+            "what int8 reaches; "
             f"see palpate-train parity): {hint}"
         )
     if lost.lost > MOST_LOST and lost.chance < CHANCE:
         raise ExportRefused(
-            f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on {lost.float_right}: "
+            f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on "
+            f"{lost.float_right}: "
             f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
         )
     expected, moved, moved_mean = (
@@ -180,25 +179,28 @@ def check(found: Parity) -> None:
     )
     if not expected <= MOST_LOST:
         raise ExportRefused(
-            f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own probabilities "
+            f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own "
+            "probabilities "
             f"(limit {100 * MOST_LOST}); {hint}"
         )
     if not (moved <= MOST_PROBABILITY_DIFFERENCE and moved_mean <= MOST_MEAN_DIFFERENCE):
         raise ExportRefused(
-            f"int8 moves a probability of held-out sweeps by up to {moved:.3f} (limit {MOST_PROBABILITY_DIFFERENCE}), "
+            f"int8 moves a probability of held-out sweeps by up to {moved:.3f} (limit "
+            f"{MOST_PROBABILITY_DIFFERENCE}), "
             f"by {moved_mean:.3f} on average (limit {MOST_MEAN_DIFFERENCE}); {hint}"
         )
     if round(lost.total * (1 - apart.agreement)) > max(1, (1 - LEAST_AGREEMENT) * lost.total):
         raise ExportRefused(
-            f"int8 agrees with float on {apart.agreement:.3f} of {lost.total} held-out sweeps (limit {LEAST_AGREEMENT}); {hint}"
+            f"int8 agrees with float on {apart.agreement:.3f} of {lost.total} held-out sweeps "
+            f"(limit {LEAST_AGREEMENT}); {hint}"
         )
 
 
 def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
-    """The table of float against int8 on `sweeps`; source: a fit, or a bundle, which has no float
-    form. file: JSON.
+    """The table of float against int8 on `sweeps`. source: a fit, or a bundle, which has no float
+    model. file: for JSON.
 
-    Raises FormatError where formats or materials differ, or nothing is in int8.
+    Raises FormatError if formats or materials differ, or if nothing is in int8.
     """
     if source.is_dir():
         loaded = bundle.load(source)
@@ -210,7 +212,8 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
         reference, model = graphs(made)
     if (format, materials) != (sweeps.format, sweeps.materials):
         raise FormatError(
-            f"{source.name} is of {format} and {', '.join(materials)}; {sweeps.source} of {sweeps.format} and "
+            f"{source.name} is of {format} and {', '.join(materials)}; {sweeps.source} of "
+            f"{sweeps.format} and "
             f"{', '.join(sweeps.materials)}: name a set of the same kind"
         )
     found = parity.measure(
@@ -223,11 +226,11 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
 
 
 def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write what `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx, both with
-    random weights.
+    """Write the models that `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx,
+    both with random weights.
 
-    The first is a trunk like the packaged bundle's in float32, with stages and the fewest filters,
-    the second the paper's CNN in int8; both take its sweeps.
+    The first is a trunk like that of the packaged bundle in float32, with stages and the fewest
+    filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.
     """
     from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
     from train.models.recipe.network import Compact  # here, as what follows: it imports PyTorch

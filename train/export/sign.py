@@ -1,7 +1,7 @@
-"""Signing a bundle. In: a bundle's folder, a key, a counter. Out: the bundle with its signature.
+"""Signing of a bundle with a key and a counter.
 
 The box refuses a bundle whose counter is not above that of every bundle it has committed, so that
-nobody can install an old one again, even with a valid signature. The signer chooses the counter:
+an old bundle cannot be installed again, even with a valid signature. The signer chooses the counter:
 number your deliveries, from 1.
 """
 
@@ -19,17 +19,18 @@ from appliance.deployment import signature
 
 
 def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
-    """Sign the bundle in `folder`; its manifest. counter: is written into the manifest first, so
-    the bundle's id changes.
+    """Sign the bundle in `folder` and return its manifest. counter: is written into the manifest
+    first, so the bundle's id changes.
 
-    Labels that a box has enrolled become part of the bundle, so that other boxes take them, too.
-    Raises BundleError where the bundle is incomplete or has no counter yet, and ConfigError where
-    `key` does not sign.
+    Labels that a box has enrolled become part of the bundle, so that other boxes know them. Raises
+    BundleError if the bundle is incomplete or has no counter yet, and ConfigError if `key` does not
+    sign.
     """
     loaded = bundle.load(folder)
     if counter is not None and counter < (had := loaded.manifest.counter):
         raise BundleError(
-            f"{folder} has counter {had} already, and a box that has committed that takes no {counter}; "
+            f"{folder} has counter {had} already, and a box that has committed that takes no "
+            f"{counter}; "
             f"use --counter {had + 1}, or export the bundle again"
         )
     held = _with_labels(loaded) if loaded.added else {}
@@ -39,7 +40,8 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
         manifest = replace(manifest, counter=counter, schema=SCHEMA)
     if manifest.counter < 1:
         raise BundleError(
-            f"{folder} has counter {manifest.counter}, which no box takes; give it one above those that were delivered "
+            f"{folder} has counter {manifest.counter}, which no box takes; give it one above those "
+            "that were delivered "
             "before: --counter N, from 1 on"
         )
     text = manifest.json()

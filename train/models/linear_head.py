@@ -98,7 +98,8 @@ def closed_form_head(
     """
     if len(labels) <= len(np.unique(labels)):
         raise FormatError(
-            f"{len(labels)} sweeps of as many materials are too few for a linear discriminant; record more"
+            f"{len(labels)} sweeps of as many materials are too few for a linear discriminant; "
+            "record more"
         )
     lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, labels)
     weight, bias = lda.coef_, lda.intercept_

@@ -118,7 +118,10 @@ class Method:
         if self.library:
             return f"runs in {self.library} alone and has no graph"
         if self.input != "raw" and self.input not in features.KINDS:
-            return f"looks at the features {self.input!r} of prior work, which the box does not compute"
+            return (
+                f"looks at the features {self.input!r} of prior work, which the box does not "
+                "compute"
+            )
         return ""
 
     @property

@@ -254,7 +254,7 @@ def train_network(
 
     A material that does not occur gets a logit that no sweep can raise. calibrated: hold some
     groups out for the temperature; else train on all, with temperature 1. int8: kinds of nodes that
-    are in int8 in the precision "int8"; without any there is no such precision. unfinished: as in
+    are in int8 in the precision "int8"; without any that precision is left out. unfinished: as in
     `learn`. Raises FormatError if only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())

@@ -1,8 +1,8 @@
-"""MultiRocket-Hydra and QUANT with aeon's default settings. In: sweeps. Out: the METHODS
-multirocket-hydra and quant.
+"""MultiRocket-Hydra and QUANT with aeon's default settings: the METHODS multirocket-hydra and
+quant.
 
-They are what a user of a time-series library would take. They have no graph: they are timed in
-aeon, and cannot be packed.
+A user of a time-series library would take these. They have no graph, so they are timed in aeon and
+cannot be packed.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from train.models.training import one_thread
 
 Array = NDArray[Any]
 SHORTEST = 10
-"""Frames: kernels have nine, and MultiRocket takes the differences of a window too. QUANT would
+"""Smallest number of frames: kernels have nine, and MultiRocket also uses differences. QUANT would
 need fewer."""
 BATCH = 64
-"""Sweeps that are transformed at a time: QUANT makes a hundred thousand features of a long one."""
+"""Number of sweeps that are transformed at a time: QUANT makes a hundred thousand features of a
+long sweep."""
 LEAST = 1e-4
-"""Of the probabilities of QUANT's 200 trees, before their logarithm."""
+"""Least probability of QUANT's 200 trees, before their logarithm."""
 Fit = Callable[[Array, Array, int], Callable[[Array], Array]]
-"""(series float32 [N, R * C, T], labels [N] from 0 on, seed) -> what gives scores [n, k] of
-series."""
+"""(series float32 [N, R * C, T], labels [N] from 0 on, seed) -> a function from series to scores
+[n, k]."""
 
 
 @dataclass(frozen=True)
 class AeonModel:
-    """A classifier of aeon. scores: as Fit gives it; present [k]: labels that were trained, of
+    """A classifier of aeon. scores: see Fit; present [k]: labels that were trained, among
     `classes`."""
 
     name: str
@@ -57,7 +58,7 @@ class AeonModel:
         return found
 
     def graph(self) -> onnx.ModelProto:
-        """There is none: raises FormatError."""
+        """Raises FormatError, because there is no graph."""
         raise FormatError(
             f"{self.name} runs in aeon alone and has no graph; choose another method for the box"
         )
@@ -66,12 +67,13 @@ class AeonModel:
 def train(sweeps: Dataset, inputs: Array, seed: int, *, name: str, fit: Fit) -> AeonModel:
     """A classifier of aeon fitted to `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
-    Raises FormatError where aeon is missing, windows are too short, or only one material occurs.
+    Raises FormatError if aeon is missing, if windows are too short, or if only one material occurs.
     """
     sweeps.require_materials()
     if inputs.shape[1] < SHORTEST:
         raise FormatError(
-            f"a window of {inputs.shape[1]} frames is too short for {name}; record at least {SHORTEST} frames"
+            f"a window of {inputs.shape[1]} frames is too short for {name}; record at least "
+            f"{SHORTEST} frames"
         )
     present, labels = np.unique(sweeps.labels, return_inverse=True)
     try:
@@ -93,7 +95,7 @@ def series(counts: Array) -> Array:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """One thread, and the random states of numpy and PyTorch, which aeon seeds, as they were."""
+    """Use one thread, and restore the random states of numpy and PyTorch, which aeon seeds."""
     before = np.random.get_state()
     try:
         with one_thread(), torch.random.fork_rng(devices=[]):
@@ -103,14 +105,14 @@ def _undisturbed() -> Iterator[None]:
 
 
 def fit_multirocket_hydra(x: Array, labels: Array, seed: int) -> Callable[[Array], Array]:
-    """Margins of its ridge, as Fit; of two classes scikit-learn gives only the second one's."""
+    """Margins of its ridge, as Fit; for two classes scikit-learn gives only those of the second."""
     from aeon.classification.convolution_based import MultiRocketHydraClassifier
 
     it = MultiRocketHydraClassifier(random_state=seed, n_jobs=1).fit(x, labels)
 
     def scores(x: Array) -> Array:
-        """What `it` compares: its own method returns labels alone, with which no recordings could
-        be fused."""
+        """The margins that `it` compares; its own method returns only labels, which cannot be
+        fused."""
         hydra = it._scale_hydra.transform(it._transform_hydra.transform(x))
         rocket = it._scale_multirocket.transform(it._transform_multirocket.transform(x))
         margins = SHARPENING * it.classifier.decision_function(

@@ -1,9 +1,8 @@
-"""The paper's classical classifiers. In: features of training sweeps. Out: Models that the box
-runs.
+"""The paper's classical classifiers on features, as models that the box runs.
 
 `learn` trains every method on features: it fits a scikit-learn estimator, writes it as an ONNX
-graph and finds one temperature on groups that were held out. A model answers by running its graph
-as the box does, so that what is scored here is what is exported.
+graph and finds one temperature on held-out groups. A model answers by running its graph as the box
+does, so the scored model is the exported one.
 """
 
 from __future__ import annotations
@@ -42,26 +41,25 @@ Array = NDArray[Any]
 NEIGHBOURS = 4
 """The paper's k; also the fewest sweeps that a feature method is trained on."""
 SMOOTHING = 0.1
-"""Added to the neighbours' votes before their logarithm: a class without a vote is unlikely, not
-impossible."""
+"""Added to the neighbours' votes before their logarithm, so that a class without a vote is unlikely
+rather than impossible."""
 FOLDS = 5
-"""Parts of the training set, at most, that are held out one after another to find the
-temperature."""
+"""Largest number of parts of the training set that are held out in turn to find the temperature."""
 SHARPENING = 10
 """Factor on logits before platt_temperature, which only softens: votes are less certain than they
-might be."""
+could be."""
 ABSENT = math.log(LEAST_PROBABILITY)
 """Log probability of a material without a sweep in training: the box's lower limit when it fuses
 sweeps."""
 LIMIT = 1e9
-"""Features are clipped here, so that no broken reading overflows float32; no valid one comes
-near."""
+"""Features are clipped here, so that a broken reading does not overflow float32; valid readings are
+far below."""
 OPSETS = {"": OPSET, "ai.onnx.ml": 3, "com.microsoft": 1}
 """Operators that the box's onnxruntime has."""
 
 
 class Estimator(Protocol):
-    """An estimator in the form of scikit-learn, as far as it is used here."""
+    """An estimator of scikit-learn, as far as it is used here."""
 
     classes_: Array
 
@@ -77,10 +75,10 @@ class Estimator(Protocol):
 class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
     """One normal distribution for each class (Bishop 2006, sec. 4.2), with equal priors.
 
-    A class's covariance is that of its sweeps and of one sweep more, which varies as the whole set
-    does, each feature by itself: this ridge of 1 / (n + 1) keeps the matrix regular where sweeps
-    are few or features collinear. independent: no covariance between features. first: use only the
-    first so many features; 0 for all.
+    The covariance of a class is that of its sweeps and of one more sweep, which varies as the whole
+    set does, each feature by itself. This ridge of 1 / (n + 1) keeps the matrix regular if sweeps
+    are few or features collinear. independent: no covariance between features. first: number of
+    features to use, from the first on; 0 for all.
     """
 
     def __init__(self, independent: bool = False, first: int = 0) -> None:
@@ -118,8 +116,8 @@ class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lea
         return labels
 
     def nodes(self, g: GraphBuilder, features: str) -> str:
-        """`decision_function` in ONNX, which skl2onnx does not know; the name of its output [1,
-        K]."""
+        """`decision_function` in ONNX, which skl2onnx does not have; returns the name of its output
+        [1, K]."""
         white = g(
             "MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_)
         )
@@ -133,7 +131,7 @@ def svm(**options: Any) -> Pipeline:
 
     The paper does not say that features were standardised. But gamma = 1 / N suits features of unit
     variance: on raw H-features, which are small fractions, the RBF kernel is nearly flat.
-    break_ties: where several classes have equally many votes the larger confidence wins, as in the
+    break_ties: if several classes have equally many votes, the larger confidence wins, as in the
     graph.
     """
     return make_pipeline(StandardScaler(), SVC(gamma="auto", break_ties=True, **options))
@@ -152,7 +150,7 @@ class FeatureModel:
     model: onnx.ModelProto
 
     def graph(self) -> onnx.ModelProto:
-        """What the box runs."""
+        """The graph for the box."""
         return self.model
 
     def logits(self, inputs: Array) -> Array:
@@ -168,16 +166,17 @@ class FeatureModel:
 
 
 def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: int) -> FeatureModel:
-    """Train what `make` makes on `inputs`, features float32 [N, F] of `sweeps`. Nothing is random:
-    `seed` is unused.
+    """Train an estimator of `make` on `inputs`, features float32 [N, F] of `sweeps`. `seed` is
+    unused because nothing is random.
 
-    The temperature is that of the sweeps held out in turn: by position, or by recording where there
-    is only one position or each position has its own materials; 1 where nothing can be held out.
-    Raises FormatError where there are too few sweeps or only one material.
+    The temperature is that of sweeps held out in turn: by position, or by recording if there is
+    only one position or if each position has its own materials; 1 if nothing can be held out.
+    Raises FormatError if there are too few sweeps or only one material.
     """
     if len(sweeps.require_materials()) < NEIGHBOURS:
         raise FormatError(
-            f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} or more"
+            f"{sweeps.source}: {len(sweeps)} sweeps are too few to learn from; give {NEIGHBOURS} "
+            "or more"
         )
     features, labels, classes = inputs.astype(np.float64), sweeps.labels, len(sweeps.materials)
     held_out, held_out_labels = [np.empty((0, classes))], [labels[:0]]

@@ -1,9 +1,8 @@
-"""DS-CNN, a small network as it is deployed on microcontrollers. In: an Effort. Out: the METHOD
-ds-cnn.
+"""DS-CNN, a small network for microcontrollers: the METHOD ds-cnn.
 
 A convolution, then four depthwise separable ones, each with batch norm, and a mean over time (Zhang
-et al. 2017, "Hello Edge"). Theirs sees an image of 49 x 10 speech features; here it sees the series
-of the taxels.
+et al. 2017, "Hello Edge"). The published network sees an image of 49 x 10 speech features, this one
+the series of the taxels.
 """
 
 from __future__ import annotations
@@ -28,10 +27,11 @@ Array = NDArray[Any]
 CHANNELS, BLOCKS, TAPS = 64, 4, 9
 """As in the small DS-CNN; a depthwise kernel of 3 x 3 becomes one of nine frames."""
 STEPS, FIRST_TAPS = 50, 10
-"""About so many steps of time are left after the first convolution, whose kernel has ten frames or
-two strides."""
+"""Approximate number of time steps after the first convolution, whose kernel has ten frames or two
+strides."""
 RECIPE = TrainingRecipe(ema=0.9, dropout=0.0)
-"""That of our own networks with a shorter average, as batch norms want it; no means are dropped."""
+"""The recipe of our own networks with a shorter average, which batch norms need; no means are
+dropped."""
 INT8_NODES = ("Conv", "Relu")
 
 

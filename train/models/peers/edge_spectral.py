@@ -1,9 +1,9 @@
-"""The recipe of the edge tools: spectral features and a small dense network. In: an Effort. Out:
-the METHOD edge-spectral.
+"""The usual recipe of edge tools, spectral features and a small dense network: the METHOD
+edge-spectral.
 
-Of each taxel the log power spectrum, averaged over half-overlapping frames, with root mean square,
-skewness and kurtosis, as the spectral block of Edge Impulse makes them (Hymel et al. 2022); then
-dense layers of 20 and 10 neurons, its default.
+The features of each taxel are the log power spectrum, averaged over half-overlapping frames, with
+root mean square, skewness and kurtosis, as in the spectral block of Edge Impulse (Hymel et al.
+2022). They are followed by dense layers of 20 and 10 neurons, its default.
 """
 
 from __future__ import annotations
@@ -33,17 +33,19 @@ from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 SHORTEST, LONGEST = 64, 256
-"""Frames of a Fourier transform: the largest power of two within half a window, from 64 to 256."""
+"""Number of frames of a Fourier transform: the largest power of two within half a window, from 64
+to 256."""
 HIDDEN = (20, 10)
 FLOOR = 1e-6
-"""Added to a power before its logarithm and to a variance, where the variance of all taxels
-together is 1."""
+"""Added to a power before its logarithm and to a variance; the variance of all taxels together is
+1."""
 RECIPE = TrainingRecipe(dropout=0.0, noise=0.0, gain=0.0)
-"""That of our own networks without what changes sweeps: the tools' blocks augment nothing."""
+"""The recipe of our own networks without changes of the sweeps, because the tools' blocks augment
+nothing."""
 
 
 def transform_length(window: int) -> int:
-    """Frames of a transform for windows of so many frames."""
+    """Number of frames of a transform for windows of this many frames."""
     return int(np.clip(2 ** int(np.log2(max(window // 2, 1))), SHORTEST, LONGEST))
 
 
@@ -145,7 +147,10 @@ def build(format: SweepFormat, classes: int, samples: Array) -> Network:
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The method, trained with this effort. log: called after every iteration."""
-    about = "log spectra and statistics of each taxel + dense layers of 20 and 10, as the edge tools do (Hymel et al. 2022)"
+    about = (
+        "log spectra and statistics of each taxel + dense layers of 20 and 10, as the edge tools "
+        "do (Hymel et al. 2022)"
+    )
     return (network_method("edge-spectral", about, build, scale_steps(RECIPE, effort), log),)
 
 

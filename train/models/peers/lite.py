@@ -1,11 +1,13 @@
-"""LITE, a small network for time series with hand-crafted filters. In: an Effort. Out: the METHOD
-lite.
+"""LITE, a small network for time series with hand-crafted filters: the METHOD lite.
 
 Three convolutions of 32 filters and 40, 20 and 10 frames beside fixed detectors of rise, fall and
 peak, then two depthwise separable ones and a mean over time (Ismail-Fawaz et al. 2023, "LITE").
 With several taxels the first layer is separable too, and each taxel has the detectors (Ismail-Fawaz
-et al. 2024, "Look Into the LITE"). Not as there: one network, not five together; trained as our own
-are, not for 1,500 epochs; a stride in the first layer where windows are long.
+et al. 2024, "Look Into the LITE").
+
+Three things differ from the publication: it is one network instead of five together, it is trained
+as our own networks are instead of for 1,500 epochs, and the first layer has a stride if windows are
+long.
 """
 
 from __future__ import annotations
@@ -32,11 +34,11 @@ Array = NDArray[Any]
 FILTERS = 32
 FIRST_TAPS = (40, 20, 10)
 LATER = ((20, 2), (10, 4))
-"""Frames of a kernel and their distance, of the two separable convolutions."""
+"""Number of frames of a kernel and their distance, for the two separable convolutions."""
 DETECTORS = (2, 4, 8, 16, 32, 64)
-"""Frames of a rise; a peak has half as many again, and there is none of two."""
+"""Number of frames of a rise; a peak has half as many again, and there are no peaks of two."""
 STEPS = 256
-"""At least so many steps of time are left by the stride. The published network has no stride."""
+"""Least number of time steps after the stride. The published network has no stride."""
 
 
 class SameConv(nn.Conv1d):
@@ -57,7 +59,7 @@ class SameConv(nn.Conv1d):
         )
 
     def ends(self, steps: int) -> tuple[int, int]:
-        """Zeros before and after so many steps."""
+        """Number of zeros before and after this many steps."""
         reach = (self.kernel_size[0] - 1) * self.dilation[0] + 1
         missing = max((-(-steps // self.stride[0]) - 1) * self.stride[0] + reach - steps, 0)
         return missing // 2, missing - missing // 2
@@ -91,8 +93,8 @@ def fixed(filters: Array, taxels: int, stride: int) -> SameConv:
 
 
 def separable(channels: int, taps: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """A kernel for each channel, FILTERS mixtures of them, batch norm; a single channel is not
-    mixed but has FILTERS kernels."""
+    """A kernel for each channel, FILTERS mixtures of them, batch norm; a single channel has FILTERS
+    kernels instead of a mixture."""
     if channels == 1:
         return nn.Sequential(SameConv(1, FILTERS, taps, stride, dilation), nn.BatchNorm1d(FILTERS))
     depthwise = SameConv(channels, channels, taps, stride, dilation, groups=channels)
@@ -100,7 +102,7 @@ def separable(channels: int, taps: int, stride: int = 1, dilation: int = 1) -> n
 
 
 class Lite(Network):
-    """LITE, in its multivariate form where there are several taxels."""
+    """LITE, in its multivariate variant if there are several taxels."""
 
     def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
         super().__init__(format, scale)
@@ -131,7 +133,7 @@ class Lite(Network):
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; batch norms are folded into the convolutions before
-        them where they can be."""
+        them if possible."""
         g, frames = GraphBuilder(), self.format.window
         sweep = g("Mul", centred(g, self.format)[0], g.constant(self.scale))
         parts = [g("Relu", _convolved(g, sweep, layer, frames)) for layer in self.learnt]
@@ -147,8 +149,8 @@ class Lite(Network):
 
 
 def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
-    """Nodes of a SameConv, or of those of `separable`, over so many steps; a batch norm is folded
-    into the one before."""
+    """Nodes of a SameConv, or of those of `separable`, for this many steps; a batch norm is folded
+    into the convolution before it."""
     convs: list[nn.Conv1d] = []
     for one in [*layer.children()] or [layer]:
         if isinstance(one, nn.BatchNorm1d):
@@ -177,7 +179,7 @@ def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
 
 
 def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
-    """A batch norm of what is no convolution."""
+    """A batch norm that does not follow a convolution."""
     assert isinstance(norm, nn.BatchNorm1d)
     mean, variance = norm.running_mean, norm.running_var
     assert mean is not None
@@ -195,7 +197,10 @@ def build(format: SweepFormat, classes: int, samples: Array) -> Network:
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The method, trained with this effort. log: called after every iteration."""
-    about = "LITE, 10,000 weights, some filters hand-crafted (Ismail-Fawaz et al. 2023, 2024); also in int8"
+    about = (
+        "LITE, 10,000 weights, some filters hand-crafted (Ismail-Fawaz et al. 2023, 2024); also in "
+        "int8"
+    )
     return (
         network_method("lite", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),
     )

@@ -1,8 +1,8 @@
-"""MiniRocket, the usual alternative for time series. In: sweeps. Out: the METHOD minirocket, aeon's
-transform and ridge.
+"""MiniRocket, the usual alternative for time series: the METHOD minirocket, aeon's transform and
+ridge.
 
-aeon fits the transform; its parameters are written as a graph, to which the head is fitted and
-which runs on the box.
+aeon fits the transform. Its parameters are written as a graph, which runs on the box and to which
+the head is fitted.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from train.onnx_tools.graph_builder import GraphBuilder
 
 Array = NDArray[Any]
 LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
-"""Length of a kernel, and the 84 kernels: which three of the nine taps are 2, the others -1
-(Dempster et al., sec. 3.1)."""
+"""Length of a kernel, and the 84 kernels: for each, the three of nine taps that are 2; the others
+are -1 (Dempster et al., sec. 3.1)."""
 FEATURES = 10_000
 """The default of aeon and of Dempster et al.; rounded down to a multiple of 84."""
 ALPHAS = np.logspace(-3, 3, 10)
-"""Ridge penalties that leave-one-out chooses from, as in aeon's MiniRocketClassifier and the
+"""Ridge penalties that leave-one-out selects from, as in aeon's MiniRocketClassifier and the
 authors' code."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
-    Raises FormatError where aeon is missing, a window is shorter than a kernel, or `sweeps` are too
-    few.
+    Raises FormatError if aeon is missing, if a window is shorter than a kernel, or if `sweeps` are
+    too few.
     """
     return train_linear_head(
         transform(sweeps.require_materials().format, fitted(inputs, seed)),
@@ -51,14 +51,15 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 
 def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
-    """aeon's parameters of the transform, fitted to raw counts [N, T, R, C]; see `transform` for
-    what they are.
+    """aeon's parameters of the transform, fitted to raw counts [N, T, R, C]; `transform` describes
+    them.
 
     numpy's global random state, which aeon seeds, is restored. Raises FormatError as `train`.
     """
     if inputs.shape[1] < LENGTH:
         raise FormatError(
-            f"a window of {inputs.shape[1]} frames is too short for minirocket; record at least {LENGTH}"
+            f"a window of {inputs.shape[1]} frames is too short for minirocket; record at least "
+            f"{LENGTH}"
         )
     try:
         from aeon.transformations.collection.convolution_based import MiniRocket
@@ -86,8 +87,8 @@ def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelP
 
     parameters: for each dilation and kernel the number of taxels; those taxels one after another;
     the dilations [D]; the number of biases of each kernel per dilation [D]; the biases [F] by
-    dilation and kernel, as the features are. Where dilation number plus kernel number is even, the
-    window is padded with zeros; else the kernel stays within it.
+    dilation and kernel, in the order of the features. If dilation number plus kernel number is
+    even, the window is padded with zeros; else the kernel stays within it.
     """
     counts, taxels, dilations, per_kernel, biases = parameters
     g, size, at = GraphBuilder(), format.channels, 0

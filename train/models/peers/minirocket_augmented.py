@@ -1,7 +1,6 @@
-"""MiniRocket with the augmented copies that our own training gets. In: sweeps. Out: the METHOD
-minirocket-augmented.
+"""MiniRocket with the augmented copies of our own training: the METHOD minirocket-augmented.
 
-Beside `minirocket` it shows what is owed to the augmentation and what to the features.
+A comparison with `minirocket` separates the effect of the augmentation from that of the features.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from train.models.recipe.augment import SLOW, Augmentation, copies, default_augm
 
 Array = NDArray[Any]
 COPIES = 2
-"""Of each training sweep, beside itself: as many as the closed-form head of the compact network
+"""Number of copies of each training sweep, as many as the closed-form head of the compact network
 sees."""
 
 
@@ -30,8 +29,8 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`, and COPIES of
     them.
 
-    A copy belongs to the recording of its sweep, so that none of what is held out for the
-    temperature is trained on. Raises FormatError as minirocket.train does.
+    A copy belongs to the recording of its sweep, so that training does not see copies of sweeps
+    that are held out for the temperature. Raises FormatError as minirocket.train does.
     """
     known = replace(
         sweeps, samples=inputs, groups=sweeps.groups | {"recording": sweeps.group("recording")}
@@ -43,8 +42,8 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 
 def augmentation(window: int) -> Augmentation:
-    """That of our own training for a window of so many frames; of one that our networks cannot
-    take, as for slow sensors."""
+    """The augmentation of our own training for a window of this many frames; that of slow sensors
+    if our networks cannot take the window."""
     try:
         return default_augmentation(DEFAULT.zero_sum(window))
     except FormatError:

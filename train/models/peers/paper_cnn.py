@@ -1,5 +1,4 @@
-"""The paper's CNN and TactNet-II. In: an Effort. Out: the METHODS paper-cnn, paper-cnn-centred and
-tactnet2.
+"""The paper's CNN and TactNet-II: the METHODS paper-cnn, paper-cnn-centred and tactnet2.
 
 Both convolve over one image, time by taxels; the layers of each are an ImageLayers.
 """
@@ -29,7 +28,7 @@ from train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
-"""Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, where one
+"""Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, because a
 core needs about a second and a half for each."""
 PAPER_RECIPE = TrainingRecipe(
     batch=50,
@@ -42,9 +41,9 @@ PAPER_RECIPE = TrainingRecipe(
     gain=0.0,
     cycle=False,
 )
-"""As printed (section IV.D); the paper's p_d = .75 is the share that is kept."""
+"""The recipe as printed (section IV.D); the paper's p_d = .75 is the share that is kept."""
 INT8_NODES = ("Conv", "Relu", "MaxPool", "Gemm")
-"""Kinds of nodes that the int8 form of the paper's CNN has in int8."""
+"""Kinds of nodes of the paper's CNN that are in int8 in the precision "int8"."""
 TACTNET2_RECIPE = TrainingRecipe(
     steps=120,
     batch=32,
@@ -58,7 +57,7 @@ TACTNET2_RECIPE = TrainingRecipe(
 )
 """Adversarial training as in Goodfellow et al. 2015, half of the cost; dropout as in Gal and
 Ghahramani 2016. The numbers are our choice, so that one core needs about half a minute for 480
-sweeps; an adversarial step larger than .01 only cost accuracy on positions held out inside a
+sweeps. An adversarial step larger than .01 lowered the accuracy on positions held out inside a
 training set."""
 
 
@@ -67,7 +66,8 @@ class ImageLayers:
     """Layers of an ImageNetwork. channels: of each convolution; strides: of each in (time, taxels);
     pool: in time.
 
-    norm: whether batch norms follow the convolutions. dense: neurons of the layer before the head.
+    norm: whether batch norms follow the convolutions. dense: number of neurons of the layer before
+    the head.
     """
 
     channels: tuple[int, ...]
@@ -78,21 +78,23 @@ class ImageLayers:
 
 
 KERNEL = (15, 5)
-"""Of the paper's convolutions, frames by taxels (table I)."""
+"""Kernel of the paper's convolutions, frames by taxels (table I)."""
 PAPER = ImageLayers(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
 """The paper's CNN (eq. 6 to 9, table I)."""
 TACTNET2 = ImageLayers(
     channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024
 )
-"""TactNet-II as far as it is published: three convolutions, batch norm, 1.84 M parameters (Tulbure and Baeuml 2018; here
-1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its predecessor. Channels, the dense layer and strides
-are our choice; the strides replace most of the pooling, at a twentieth of the work."""
+"""TactNet-II as far as it is published: three convolutions, batch norm, 1.84 M parameters (Tulbure
+and Baeuml 2018; here 1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its
+predecessor. Channels, the dense layer and strides are our choice; the strides replace most of the
+pooling, at a twentieth of the work."""
 
 
 class ImageNetwork(Network):
-    """Convolutions over one image, time by taxels, then a dense layer: the form of the paper's CNN.
+    """Convolutions over one image, time by taxels, then a dense layer, as in the paper's CNN.
 
-    Zero padding keeps sizes; a pooling window that reaches past the end pools what is there.
+    Zero padding keeps sizes; a pooling window that reaches past the end pools only the steps before
+    it.
     """
 
     def __init__(
@@ -123,7 +125,7 @@ class ImageNetwork(Network):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def _convolutions(self) -> Iterator[tuple[nn.Conv2d, nn.Module]]:
-        """Each convolution with what follows it, a batch norm or nothing."""
+        """Each convolution with its batch norm, or None."""
         for conv, norm in zip(self.convs, self.norms, strict=True):
             assert isinstance(conv, nn.Conv2d)
             yield conv, norm
@@ -170,10 +172,10 @@ class ImageNetwork(Network):
 def build_paper_cnn(
     format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
 ) -> Network:
-    """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`, since
-    no scale is printed.
+    """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`,
+    because the paper prints no scale.
 
-    15,891,910 parameters for 1500 x 4 x 4 and six materials.
+    It has 15,891,910 parameters for 1500 x 4 x 4 and six materials.
     """
     mean = float(samples.mean(dtype=np.float64))
     scale = float(1 / max(samples.std(dtype=np.float64), 1e-6))
@@ -192,8 +194,8 @@ def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> Network
     """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted, as in the
     compact network.
 
-    Dropout is off at test time, on the box and here: the mean field of the published Monte Carlo
-    dropout, so that the same sweep always gets the same answer.
+    Dropout is off at test time, on the box and here. This is the mean field of the published Monte
+    Carlo dropout; the same sweep always gets the same answer.
     """
     return ImageNetwork(format, classes, texture_scale(samples), None, TACTNET2)
 

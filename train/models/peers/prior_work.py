@@ -1,9 +1,8 @@
-"""Methods of the work that the paper compares itself with. In: features of training sweeps. Out:
-METHODS, `explore`.
+"""Methods of prior work that the paper compares itself with, and the exploration of Xu et al. 2013.
 
-train.features.prior_work computes their features as far as a pressure skin allows, baselines.learn
-trains them. `explore` is the exploration of Xu et al. 2013, for any method: sweeps are added until
-the posterior is high enough.
+train.features.prior_work computes their features as far as a pressure skin allows, and
+baselines.learn trains them. `explore` works with any method: sweeps are added until the posterior
+is high enough.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ Array = NDArray[Any]
 METHODS = (
     Method(
         "fishel-bayes",
-        "roughness and fineness, independent normal distributions for each class, Bayes (Fishel and Loeb 2012)",
+        "roughness and fineness, independent normal distributions for each class, Bayes (Fishel "
+        "and Loeb 2012)",
         "L",
         partial(learn, partial(Gauss, independent=True, first=2)),
     ),
@@ -42,7 +42,8 @@ METHODS = (
     ),
     Method(
         "correlation-svm",
-        "activity, mobility, complexity, correlations between taxels, RBF SVM (Kaboli, Chathuranga et al. 2015)",
+        "activity, mobility, complexity, correlations between taxels, RBF SVM (Kaboli, Chathuranga "
+        "et al. 2015)",
         "correlation",
         partial(learn, svm),
     ),
@@ -53,13 +54,12 @@ those of baselines.svm; that of Hoelscher et al. is linear."""
 
 def explore(log_probabilities: Array, min_posterior: float) -> tuple[int, int]:
     """One object, sweep after sweep, until a label's posterior reaches `min_posterior`: (label,
-    sweeps used).
+    number of sweeps used).
 
-    log_probabilities: [S, K] of its S sweeps in the order in which they are made. Priors are equal
-    and sweeps independent, so that log probabilities add (Xu et al. 2013; the product that the box
-    computes). A probability counts as at least 1e-12, as on the box. Where no posterior is high
-    enough all sweeps are used. Raises FormatError where there is no sweep, or `min_posterior` is
-    not a probability.
+    log_probabilities: [S, K] of its S sweeps in their order. Priors are equal and sweeps
+    independent, so log probabilities are added (Xu et al. 2013; the product that the box computes).
+    A probability counts as at least 1e-12, as on the box. If no posterior is high enough, all
+    sweeps are used. Raises FormatError without a sweep, or if `min_posterior` is not a probability.
     """
     if not 0 < min_posterior <= 1:
         raise FormatError(
@@ -68,7 +68,8 @@ def explore(log_probabilities: Array, min_posterior: float) -> tuple[int, int]:
     if log_probabilities.ndim != 2 or 0 in log_probabilities.shape:
         shape = list(log_probabilities.shape)
         raise FormatError(
-            f"log probabilities have the shape {shape}; give [sweeps, materials], at least one of each"
+            f"log probabilities have the shape {shape}; give [sweeps, materials], at least one of "
+            "each"
         )
     posterior = softmax(np.maximum(log_probabilities, ABSENT).cumsum(axis=0))
     enough = posterior.max(axis=1) >= min_posterior

@@ -1,4 +1,4 @@
-"""A recurrent network, the paper's future work. In: an Effort. Out: the METHOD recurrent."""
+"""A recurrent network, the paper's future work: the METHOD recurrent."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ STATE, PATCHES, MIN_PATCH = 64, 128, 8
 """Size of the state, number of patches that cover a window (approximately), frames of the shortest
 patch."""
 RECIPE = TrainingRecipe(steps=400)
-"""That of the compact network with fewer iterations."""
+"""The recipe of the compact network with fewer iterations."""
 
 
 class Recurrent(Network):
     """A gated recurrent unit over patches of time whose channels are the taxels; the head sees its
     mean state.
 
-    A patch is two strides long; about PATCHES of them cover the window, whatever its rate and
-    length.
+    A patch is two strides long; about PATCHES of them cover the window, for any rate and length.
     """
 
     def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:

@@ -1,15 +1,16 @@
-"""ST-HMP, learned dictionaries. In: sweeps. Out: the METHOD st-hmp, a graph of pooled sparse codes
-with a linear SVM.
+"""ST-HMP, learned dictionaries: the METHOD st-hmp, a graph of pooled sparse codes with a linear
+SVM.
 
 Madry, Bo, Kragic, Fox, ICRA 2014, built on hierarchical matching pursuit: Bo, Ren, Fox, NIPS 2011
-and ISER 2012. The text of 2014 was not available; from the others: a dictionary learned with K-SVD
-on patches less their means, orthogonal matching pursuit with a fixed number of atoms, codes split
+and ISER 2012. The text of 2014 was not available. From the others: a dictionary learned with K-SVD
+on patches minus their means, orthogonal matching pursuit with a fixed number of atoms, codes split
 by sign, the largest of each over a pyramid of cells in space and in time, each cell divided by its
-length (contrast normalisation), a linear SVM. Our adaptation to a skin that slides instead of a
-hand that closes: texture is in time, so a patch has several frames as well as taxels; its taxels
-are its channels, and each loses its own mean, as colours do in their work; the grid is hardly
-larger than one patch, so there is one layer. Several axes of a taxel are columns beside each other,
-which a patch holds together.
+length (contrast normalisation), a linear SVM.
+
+Our adaptation is to a skin that slides instead of a hand that closes. Texture is in time, so a
+patch has several frames as well as taxels. Its taxels are its channels, and the mean of each is
+subtracted, as for colours in their work. The grid is hardly larger than one patch, so there is one
+layer. Several axes of a taxel are columns beside each other, which a patch holds together.
 """
 
 from __future__ import annotations
@@ -31,21 +32,21 @@ from train.onnx_tools.graph_builder import GraphBuilder, run
 
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
-"""Of a patch: frames, taxels along each axis, and frames from one to the next. Fixed before any
-data was examined, half as long as the compact network's first kernel. A short window's patches are
-half as long as it, and none is wider than the grid."""
+"""Sizes of a patch: frames, taxels along each axis, and frames from one patch to the next. They
+were fixed before any data was examined, at half the length of the compact network's first kernel.
+In a short window patches are half as long as the window, and no patch is wider than the grid."""
 MIN_WINDOW = 8
-"""Frames of the shortest window."""
+"""Number of frames of the shortest window."""
 ATOMS, ACTIVE = 100, 4
-"""Atoms of the dictionary, and of each patch's code."""
+"""Number of atoms of the dictionary, and of the code of a patch."""
 SAMPLED, ROUNDS = 4000, 8
-"""Patches that the dictionary is learned from, and rounds of K-SVD."""
+"""Number of patches that the dictionary is learned from, and rounds of K-SVD."""
 MIN_RESIDUAL = 0.01
-"""Smallest squared length, of 1, of an atom's part orthogonal to those chosen before; smaller
-values are raised to it, so that division is safe."""
+"""Smallest squared length, of 1, of an atom's part that is orthogonal to the atoms chosen before;
+smaller values are raised to it, so that division is safe."""
 LEVELS = (1, 2, 4)
-"""Of the pyramid in time: parts of the window. In space there are two: the whole grid, and its
-quarters."""
+"""Levels of the pyramid in time: parts of the window. In space there are two: the whole grid, and
+its quarters."""
 CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
@@ -53,12 +54,13 @@ CONTRAST = 0.1
 def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
     """ST-HMP and a linear SVM on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
-    Raises FormatError where a window is too short, or `sweeps` are too few.
+    Raises FormatError if a window is too short, or if `sweeps` are too few.
     """
     format = sweeps.require_materials().format
     if format.window < MIN_WINDOW:
         raise FormatError(
-            f"a window of {format.window} frames is too short for st-hmp; record at least {MIN_WINDOW}"
+            f"a window of {format.window} frames is too short for st-hmp; record at least "
+            f"{MIN_WINDOW}"
         )
     rng = np.random.default_rng(seed)
     patches = sample_patches(inputs, rng)
@@ -69,7 +71,7 @@ def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
 
 def sample_patches(inputs: Array, rng: np.random.Generator) -> Array:
     """Patches drawn from raw counts [N, T, R, C] or [N, T, R, C, A]: float64 [SAMPLED, frames, r, c
-    * A], each column less its mean there."""
+    * A], each column minus its mean in the patch."""
     frames, (rows, cols) = (
         min(FRAMES, inputs.shape[1] // 2),
         (min(SIDE, n) for n in inputs.shape[2:4]),
@@ -87,10 +89,10 @@ def learn_dictionary(patches: Array, rng: np.random.Generator) -> Array:
     """K-SVD (Aharon, Elad, Bruckstein 2006) on patches [n, frames, r, c]: atoms float32 [ATOMS,
     frames, r, c].
 
-    Each atom in turn becomes the main direction of the residual, without it, of the patches that
-    use it, by one step of power iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that no
-    patch uses becomes the patch with the largest residual. Atoms have the length 1, or 0 where the
-    patches leave no residual.
+    Each atom in turn is removed; the main direction of the residual of its patches replaces it, by
+    one step of power iteration (Rubinstein, Zibulevsky, Elad 2008). An atom that no patch uses
+    becomes the patch with the largest residual. Atoms have the length 1, or 0 if the patches leave
+    no residual.
     """
     x = patches.reshape(len(patches), -1)
     atoms = _unit(x[rng.choice(len(x), ATOMS, replace=False)])
@@ -158,7 +160,7 @@ def pooled(format: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
 
 
 def _parts(n: int, parts: int) -> list[tuple[int, int]]:
-    """`n` positions in so many parts (first, last + 1), which overlap by one where they do not
+    """`n` positions in this many parts (first, last + 1), which overlap by one if they do not
     divide evenly."""
     return [(i * n // parts, -(-(i + 1) * n // parts)) for i in range(parts)]
 
@@ -172,9 +174,9 @@ def _codes(g: GraphBuilder, format: SweepFormat, atoms: Array, step: int, scale:
     """Orthogonal matching pursuit of all patches of `sweep` at once: codes [patches, ATOMS], by
     time, row, column.
 
-    Atoms sum to zero on each taxel, so their products with a patch equal those with the patch less
-    its means: one convolution. After it the pursuit needs only the products of atoms with each
-    other (batch OMP; Rubinstein et al. 2008).
+    Atoms sum to zero on each taxel, so their products with a patch do not depend on its means: one
+    convolution computes them. After it the pursuit needs only the products of atoms with each other
+    (batch OMP; Rubinstein et al. 2008).
     """
     flat = atoms.reshape(len(atoms), -1)
     shape = [1, 1, format.window, format.rows, format.cols * format.axes]
@@ -246,7 +248,7 @@ def _solved(
 
 
 def _unit(vectors: Array) -> Array:
-    """Vectors [..., d] at length 1; what has none stays zero."""
+    """Vectors [..., d] at length 1; a vector of zeros stays as it is."""
     scaled: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
     return scaled
 

@@ -136,7 +136,7 @@ def _moved(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> A
     source = row + augmentation.shift * _symmetric(rng, n, 1) * _chosen(
         augmentation.moved, rng, n, 1
     )
-    # what lies under the row that enters is unknown: as much as its neighbour feels, nothing, or in
+    # the load on the row that enters is unknown: that of its neighbour, nothing, or something in
     # between
     level = np.where((source < 0) | (source > rows - 1), _uniform(rng, n, rows), np.float32(1))
     near = np.maximum(1 - np.abs(source.clip(0, rows - 1)[..., None] - row), 0)

@@ -210,7 +210,7 @@ class Candidates:
     def plain(self) -> dict[str, Heads]:
         """The usual candidate, and magnitudes alone.
 
-        The usual one adds three discriminants for each kind of filters. All see the magnitudes, the
+        It adds three discriminants for each kind of filters. All see the magnitudes, the
         second also the shares and the spectrum, the third also the distribution and the spectrum.
         An average is seldom worse than the better of two, and no held-out part has to show which
         that is.
@@ -246,8 +246,8 @@ class Candidates:
 
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
-    """The candidate with the lowest loss if it is `better` than the usual one, else the usual
-    one. Plain candidates are compared first, then extensions of the best of them."""
+    """The candidate with the lowest loss if it is `better` than the usual candidate, else the
+    latter. Plain candidates are compared first, then extensions of the best of them."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():

@@ -1,7 +1,6 @@
-"""The methods of the default recipe. In: an Effort. Out: the METHODS default, default-reattached,
-filter-bank.
+"""The methods of the default recipe: default, default-reattached and filter-bank.
 
-Each is what the box runs, the int8 graph; the form "float" is the same before quantization.
+Each is the int8 graph that the box runs; its precision "float" is the model before quantization.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ Array = NDArray[Any]
 def train(
     sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log
 ) -> CompactModel:
-    """Choose and fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of
-    `sweeps`.
+    """Fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of `sweeps`, but
+    without calibration.
 
-    Raises FormatError as recipe.fit, and where only one material occurs.
+    Raises FormatError as recipe.fit, and if only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
     fit = recipe.fit(known, seed, replace(settings, calibrate=False), log)
@@ -49,26 +48,29 @@ def train(
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
     """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which
-    chooses and trains nothing."""
+    neither chooses nor trains."""
     settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
     return (
         Method(
             "default",
-            "the box's default: filters, spectrum and trained stages as held-out groups of the training sweeps ask for",
+            "the box's default: filters, spectrum and trained stages as held-out groups of the "
+            "training sweeps ask for",
             "raw",
             partial(train, settings=settings),
             effort=f"{settings.steps} iterations of stages",
         ),
         Method(
             PACKAGED,
-            "as default, but all see augmented copies, as of a skin put back, and filters join stages only where that is better",
+            "as default, but all see augmented copies, as of a skin put back, and filters join "
+            "stages only where that is better",
             "raw",
             partial(train, settings=replace(settings, reattached=True)),
             effort=f"{settings.steps} iterations of stages",
         ),
         Method(
             "filter-bank",
-            "random zero-sum filters, log mean magnitude and share above a quantile, shrinkage LDA in closed form, int8",
+            "random zero-sum filters, log mean magnitude and share above a quantile, shrinkage LDA "
+            "in closed form, int8",
             "raw",
             partial(train, settings=recipe.Settings(steps=0, choose=False)),
         ),

@@ -1,11 +1,11 @@
-"""The distribution of each taxel's counts and of their changes. In: a format, raw counts. Out:
-Levels, and nodes in a trunk.
+"""The distribution of each taxel's counts and of their changes: shares above levels, and their
+nodes in a trunk.
 
-A filter asks what goes on between neighbouring frames; how often a taxel is how high, and how far
-it moves from one frame to the next, is other evidence (Dempster et al. 2024, QUANT, which sorts to
-find quantiles). Here levels are fixed and frames above them counted, which needs no sorting: a
-share for each taxel, signal and level. Counts are about their mean over the window, so that no
-offset matters.
+A filter responds to neighbouring frames. How often a taxel is at a height, and how far it moves
+from one frame to the next, is other evidence (Dempster et al. 2024, QUANT, which sorts to find
+quantiles). Here levels are fixed and the frames above them are counted, which needs no sorting. A
+feature is a share for each taxel, signal and level. The mean over the window is subtracted from
+counts, so that offsets do not matter.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from train.onnx_tools.graph_builder import FLOAT, GraphBuilder
 
 Array = NDArray[Any]
 SIGNALS = 2
-"""Counts about their mean, and differences between neighbouring frames."""
+"""Number of signals: counts without their mean, and differences between neighbouring frames."""
 MOST_FEATURES = 256
 FEWEST_LEVELS, MOST_LEVELS = 4, 16
 MOST_FRAMES = 256
-"""Frames of a window that are looked at, at most; they are evenly spaced."""
+"""Largest number of frames of a window to count; they are evenly spaced."""
 APART = 1e-3
-"""A level lies in the middle between two values that are this far apart, in deviations: whole
-counts never equal it."""
+"""Distance, in deviations, of the two values between which a level lies in the middle: whole counts
+never equal it."""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """taxels: int [n], ascending, those that are looked at. levels: float32 [SIGNALS, n, k], of
+    """taxels: int [n], ascending, the taxels that are used. levels: float32 [SIGNALS, n, k], of
     scaled counts."""
 
     taxels: Array
     levels: Array
 
     def __len__(self) -> int:
-        """How many features they give."""
+        """Number of features."""
         return int(self.levels.size)
 
     def weights(self) -> dict[str, Array]:
-        """As a Fit keeps them."""
+        """The weights that a Fit keeps."""
         return {f"distribution.{name}": values for name, values in vars(self).items()}
 
     @classmethod
     def of(cls, weights: Mapping[str, Array]) -> Levels:
-        """What `weights` gave. Raises KeyError where it is not there."""
+        """The levels that gave these `weights`. Raises KeyError if there were none."""
         return cls(**{name: weights[f"distribution.{name}"] for name in cls.__dataclass_fields__})
 
 
 def fitted(samples: Array, scale: float, rng: np.random.Generator) -> Levels:
-    """Levels at evenly spaced quantiles of raw counts [N, T, R, C, ...] of training sweeps. Of more
-    taxels than MOST_FEATURES allows, random ones are looked at."""
+    """Levels at evenly spaced quantiles of raw counts [N, T, R, C, ...] of training sweeps. If
+    there are more taxels than MOST_FEATURES allows, random ones are used."""
     n, window = samples.shape[:2]
     counts = samples.reshape(n, window, -1)
     taxels = np.sort(rng.permutation(counts.shape[2])[: MOST_FEATURES // (SIGNALS * FEWEST_LEVELS)])
@@ -76,8 +76,8 @@ def fitted(samples: Array, scale: float, rng: np.random.Generator) -> Levels:
 
 
 def _levels(values: Array, number: int) -> Array:
-    """Quantiles [number] of `values` [n], each moved up to the middle between two of them, or above
-    the largest: a taxel that never moves is at none of its levels."""
+    """Quantiles [number] of `values` [n], each moved up to the middle between two values, or above
+    the largest. A taxel that never moves is not above any of its levels."""
     ordered = np.sort(values)
     at = np.quantile(ordered, (np.arange(number) + 0.5) / number, method="lower")
     above = np.searchsorted(ordered, at + max(APART * float(ordered.std()), 1e-12), side="right")
@@ -86,7 +86,7 @@ def _levels(values: Array, number: int) -> Array:
 
 
 def _looked(window: int) -> Stage:
-    """The frames that are looked at, each with the next one."""
+    """The frames that are used, each with the next one."""
     hop = max(window // MOST_FRAMES, 1)
     return Stage(2, hop, (window - 2) // hop + 1, 2, hop)
 
@@ -100,9 +100,9 @@ def pooled(
     int8: bool,
     prefixes: bool = False,
 ) -> str:
-    """Taxels [n, R * C, T], which are scaled counts once they are multiplied by `step`, n being 1
-    or PREFIXES -> shares [1, 1 or PREFIXES, len(some)]: of each signal, taxel and level. int8: whether
-    frames are counted in integers."""
+    """Taxels [n, R * C, T], which times `step` are scaled counts, n being 1 or PREFIXES -> shares
+    [1, 1 or PREFIXES, len(some)] for each signal, taxel and level. int8: whether frames are counted
+    in integers."""
     if len(some.taxels) < format.channels:
         x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
     looked, taxels = _looked(format.window), len(some.taxels)

@@ -124,7 +124,7 @@ class Fit:
         )
 
     def in_float(self) -> Fit:
-        """The same fit with its float trunk and float head in place of those in int8; not
+        """The same fit with its float trunk and float head instead of those in int8; not
         calibrated yet."""
         head = {f"int8.{name}": self.weights[f"head.{name}"] for name in ("weight", "bias")}
         return replace(self, weights=self.weights | head, ranges=None, calibration=None)
@@ -275,11 +275,11 @@ def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
 
 @dataclass(frozen=True)
 class CompactModel:
-    """A fit as the box runs it. forms: "float", the same before quantization.
+    """A fit as the box runs it.
 
-    fit: what it comes from, with the sweeps that were trained on and held out. weight [K, F], bias
-    [K]: its head for all materials. ran: what was computed or chosen. cost: of the training of
-    stages.
+    fit: its origin, with training and held-out sweeps. weight [K, F], bias [K]: its head for all
+    materials. ran: a description of the computation. cost: of the training of stages. precisions:
+    "float", the model before quantization.
     """
 
     fit: Fit
@@ -290,8 +290,8 @@ class CompactModel:
     precisions: Mapping[str, Model] = field(default_factory=dict)
 
     def features(self, inputs: Array, prefixes: bool = False) -> Array:
-        """Raw counts [n, T, R, C] -> what the head sees, float32 [n, F]; of each tenth [n, 10, F],
-        see graph.trunk_graph."""
+        """Raw counts [n, T, R, C] -> the features that the head sees, float32 [n, F]; with
+        `prefixes` [n, 10, F], see graph.trunk_graph."""
         return run(self.fit.trunk(prefixes=prefixes), inputs)
 
     def logits(self, inputs: Array) -> Array:

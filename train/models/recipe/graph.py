@@ -202,7 +202,7 @@ class _TrunkNodes:
         return [spectrum.nodes(self.g, self.raw, self.attenuation, *given)]
 
     def prepared(self, ranges: Ranges | None) -> Prepared:
-        """Taxels in units of what is left to the weights of the first convolution.
+        """Taxels in units of `step`, which the weights of the first convolution take up.
 
         Bytes stay bytes if the kernels sum to zero. From other counts the level is subtracted. If
         that is the mean of the whole window, and prefixes are wanted, each prefix has a level and a

@@ -197,7 +197,7 @@ class Judged:
 
 
 def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
-    """A model for the materials of `sweeps`, each of which must occur. A fifth of the groups is
+    """A model for the materials of `sweeps`, which must all occur. A fifth of the groups is
     held out from stages and calibration.
 
     Raises FormatError if the window is shorter than a filter, if every taxel is constant, or if
@@ -325,7 +325,8 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
     if not np.ptp(sweeps.samples, axis=1).any():
         raise FormatError(
-            "every taxel of every sweep is constant; check the skin, nothing can be learnt from this"
+            "every taxel of every sweep is constant; check the skin, nothing can be learnt from "
+            "this"
         )
     scale = texture_scale(sweeps.samples)
     architecture = replace(

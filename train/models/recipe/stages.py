@@ -228,8 +228,8 @@ def _select_depth(
 
 
 def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
-    """`augment` for sweeps of `format` as the training loop calls it: in PyTorch, with the seed from
-    its generator."""
+    """`augment` for sweeps of `format` as the training loop calls it: in PyTorch, seeded by its
+    generator."""
     rows = format.rows if format.cols > 1 else 1
 
     def change(x: Tensor, rng: Generator) -> Tensor:
