@@ -3,6 +3,7 @@ code, and the workflow publishes what `make site` builds."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import re
 import sys
@@ -56,6 +57,36 @@ def test_a_broken_link_is_named(build: ModuleType, tmp_path: Path):
         "README.md: missing.md",
         "README.md: ../../../etc/hosts",
     ]
+
+
+def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
+    build: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """By their titles; links to Markdown lead to the pages made of it, linked files come along."""
+
+    def write(command: list[str], **_: object) -> None:
+        page = command[-1] / "soak" / "index.html"
+        page.parent.mkdir(parents=True)
+        page.write_text(
+            '<title>Soak</title><a href="../../README.md"><a href="../../docs/skins.md#load">'
+            '<img src="soak.svg">'
+        )
+        page.with_name("soak.svg").write_text("<svg/>")
+
+    monkeypatch.setattr(build.subprocess, "run", write)
+    studies = dataclasses.replace(build.STUDIES, groups={"pages": {"pages": "write them"}})
+    monkeypatch.setattr(build, "STUDIES", studies)
+    sources, site = tmp_path / "src", tmp_path / "site"
+    build.results(sources)
+    listed = (sources / build.RESULTS).read_text()
+    assert '- <a href="results/soak/index.html">Soak</a>' in listed
+    build.take_over(Path("results/soak/index.html"), sources, site)
+    shown = (site / "results" / "soak" / "index.html").read_text()
+    assert re.findall(r'href="([^"]+)"', shown) == [
+        "../../index.html",
+        "../../docs/skins.html#load",
+    ]
+    assert (site / "results" / "soak" / "soak.svg").is_file()
 
 
 def test_links_of_the_built_site_are_followed(build: ModuleType, tmp_path: Path):

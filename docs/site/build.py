@@ -26,6 +26,8 @@ from train.studies.command import PROGRAM as STUDIES
 HERE = Path(__file__).resolve().parent
 
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
+RESULTS = "results.md"
+TITLE = re.compile(r"<title>([^<]*)</title>")
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
 CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
 CHAPTERS = {
@@ -44,7 +46,7 @@ CHAPTERS = {
         "docs/skins",
         "docs/faults",
     ],
-    "Results": ["docs/*/README"],
+    "Results": ["results", "docs/*/README"],
     "Project": [
         "CHANGELOG",
         "CONTRIBUTING",
@@ -63,9 +65,9 @@ def main() -> int:
     sources, site = build / "site-src", build / "site"
     for folder in (sources, site):
         shutil.rmtree(folder, ignore_errors=True)
+    results(sources)
     lost = gather(sources)
     if not lost:
-        results(sources / "results")
         command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", "auto"]
         command += ["-b", "html", "-d", str(build / "site-cache"), "-c", str(HERE)]
         if code := subprocess.run([*command, sources, site], check=False).returncode:
@@ -82,30 +84,40 @@ def gather(out: Path) -> list[str]:
     known = manual.references() | {"training-commands": training_commands()}
     lost: list[str] = []
     names = sorted(pages())
+    listed = names + [RESULTS] * (out / RESULTS).exists()
     for name in names:
         text = manual.filled((ROOT / name).read_text("utf-8"), known)
         target = out / ("index.md" if name == "README.md" else name)
         target.parent.mkdir(parents=True, exist_ok=True)
         text = linked(Path(name), text, out, lost)
-        target.write_text(text + contents(names) * (name == "README.md"), "utf-8")
+        target.write_text(text + contents(listed) * (name == "README.md"), "utf-8")
     for page in ROOT.glob("docs/**/*.html"):
         shutil.copyfile(page, out / page.relative_to(ROOT))
     return lost
 
 
 def results(out: Path) -> None:
-    """Have the studies write their pages, if they are installed."""
-    if "pages" in STUDIES.descriptions():
-        subprocess.run(
-            [sys.executable, "-m", "train.studies", "pages", "--out", out], check=True, cwd=ROOT
-        )
+    """Have the studies write their pages into `out`/results, and list them on a page."""
+    if "pages" not in STUDIES.descriptions():
+        return
+    command = [sys.executable, "-m", "train.studies", "pages", "--out"]
+    subprocess.run([*command, (out / "results").absolute()], check=True, cwd=ROOT)
+    written = sorted((out / "results").rglob("*.html"))
+    titles = {page: TITLE.search(page.read_text("utf-8")) for page in written}
+    links = (
+        f'- <a href="{page.relative_to(out)}">{title[1] if title else page.stem}</a>'
+        for page, title in titles.items()
+    )
+    text = ["# Result pages", "", "The studies make these pages from their results.", "", *links]
+    (out / RESULTS).write_text("\n".join([*text, ""]), "utf-8")
 
 
 def take_over(page: Path, sources: Path, site: Path) -> None:
-    """Copy a page of results into the site with the files that it links to. Its link to README
-    leads to the site's first page."""
+    """Copy a page of results into the site with the files that it links to. Its links to Markdown
+    lead to the pages that Sphinx has made of it."""
     text = (sources / page).read_text("utf-8")
     text = re.sub(r'href="((?:\.\./)+)README\.md"', r'href="\1index.html"', text)
+    text = re.sub(r'href="(?![a-z]+:)([^"#]+)\.md(#[^"]*)?"', r'href="\1.html\2"', text)
     (site / page).parent.mkdir(parents=True, exist_ok=True)
     (site / page).write_text(text, "utf-8")
     for target in filter(None, map(local, REFERENCE.findall(text))):
