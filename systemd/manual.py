@@ -150,19 +150,20 @@ def _unnamed(name: str, key: Key) -> str:
 
 
 def _default(key: Key) -> str:
-    return f"0x{key.default:04x}" if "hex" in key.limits else json.dumps(key.default)
+    return json.dumps(key.default)
 
 
 def allowed(key: Key) -> str:
     """The values that a setting may have."""
     if "line" in key.limits:
         return "GPIO lines" if get_origin(key.hint) is tuple else "GPIO line"
+    if "allowed" in key.limits:
+        return str(key.limits["allowed"])
     if get_args(key.hint):
         return ", ".join(json.dumps(one) for one in get_args(key.hint))
     if key.hint in (str, bool):
         return {str: "text", bool: "true, false"}[key.hint]
-    step = f", step {key.limits['step']}" if "step" in key.limits else ""
-    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}{step}"
+    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}"
 
 
 def command_sections(top: argparse.ArgumentParser, level: str = "##") -> str:

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from appliance.bundle import bundle
-from appliance.core import config
 from appliance.core.types import Sweep
 from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
@@ -18,7 +17,7 @@ from appliance.sim import devices, rig, script, skin
 from appliance.tools import pseudo_terminal
 from tests.factories import browser as browsers
 from tests.factories import log_lines
-from tests.factories.paths import NO_SITE
+from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import OnSweep, Rigged
 
 
@@ -51,7 +50,7 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             simulated = simulated or devices.build(
                 skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim"
             )
-            settings = config.load(None, sets, site=NO_SITE)
+            settings = load_settings(sets)
             far_end, name = stack.enter_context(pseudo_terminal.pair())
             port = SerialSink(
                 replace(settings.serial, port=name), simulated.clock, simulated.source

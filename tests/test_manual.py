@@ -174,7 +174,7 @@ def test_settings_have_default_limits_and_meaning(manual: ModuleType):
 def test_settings_of_the_text_exist():
     """A `section.key` in the text is a setting."""
     sections = "|".join(config._SECTIONS)
-    files = {"sensor.toml"}
+    files = {"skin.toml"}
     found = set(re.findall(rf"`((?:{sections})\.[a-z_]+)", MANUAL)) - files
     assert found <= {*config._KEYS}
 
@@ -365,7 +365,7 @@ def test_the_trial_is_described_as_it_is():
     settings = config.StoreConfig()
     text = PAGES["how-to/deliver.md"]
     assert f"`store.trial_sweeps` ({settings.trial_sweeps})" in text.replace("\n", " ")
-    assert f"`store.trial_s` ({settings.trial_s:.0f} s)" in text.replace("\n", " ")
+    assert f"streamed for {settings.trial_s:.0f} s" in text.replace("\n", " ")
     assert f" {state.MOST_STARTS} starts " in text.replace("\n", " ")
 
 

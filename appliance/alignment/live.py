@@ -36,7 +36,7 @@ class Expected:
     """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its
     threshold, in counts, and place: its positions in training, both None without such a bundle, or
     where it does not know them. unloaded: counts [R, C] along the normal that an unloaded skin
-    gives by the bundle; 0 without. fingertip: setting `sensor.fingertip`."""
+    gives by the bundle; 0 without. fingertip: setting `skin.fingertip`."""
 
     format: SweepFormat
     bundle: str = NO_BUNDLE
@@ -194,7 +194,7 @@ class Alignment:
         self._enumerations = self._sensor.counters.enumerations
 
     def read(self) -> None:
-        """Read frames from the skin; waits at most `sensor.timeout_ms`."""
+        """Read frames from the skin; waits at most a tenth of a second."""
         frames = self._sensor.read()
         if self._sensor.counters.enumerations != self._enumerations:
             self._enumerations = self._sensor.counters.enumerations

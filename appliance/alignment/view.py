@@ -17,7 +17,7 @@ class View:
     "in-place". message: that in words. hint: what the person may do. load: raw counts above the
     unloaded skin, [rows][columns]; empty before there are any. full: load that is shown as the
     strongest. centre: of the contact, and nearest: the trained position nearest to it, mm from the
-    centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `sensor.fingertip`.
+    centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `skin.fingertip`.
     """
 
     number: int

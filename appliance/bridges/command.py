@@ -35,8 +35,8 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         return
     if settings.serial.port == LINKS[kind]:
         args.link = Path(LINKS[kind])
-    elif kind == "modbus" and settings.feed.socket and not args.allow_writes:
-        args.feed = settings.feed.socket
+    elif kind == "modbus" and settings.store.feed and not args.allow_writes:
+        args.feed = str(settings.store.feed)
     else:
         why = " and its feed cannot be written to" if kind == "modbus" else ""
         raise ConfigError(

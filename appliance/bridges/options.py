@@ -7,9 +7,9 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from appliance.core.config import FeedConfig, SerialConfig
+from appliance.core.config import SerialConfig, StoreConfig
 
-FEED, BAUD = FeedConfig().socket, SerialConfig().baud
+FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
 """Connections at a time."""
 PORTS = {"tcp": 1503, "modbus": 1502}

@@ -26,8 +26,7 @@ from appliance.core.status import Status
 from appliance.tools import pseudo_terminal
 
 STALE_S = 3.5
-"""Without a sentence for this long the box counts as dead; it sends a state once a second
-(serial.state_s)."""
+"""Without a sentence for this long the box counts as dead; it sends a state once a second."""
 COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
     "START": Palpate.start,
     "STOP": Palpate.stop,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle
-from appliance.cli.commands import load_settings
+from appliance.cli.commands import load_settings, status_file
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
@@ -147,7 +147,7 @@ def streaming(settings: Config, store: Store) -> SweepFormat | None:
     """The format of the skin that streams into the service now: that of the bundle that runs. None
     where that is not known."""
     try:
-        report = status.read(Path(settings.store.status), SystemClock().now_ns())
+        report = status.read(status_file(settings), SystemClock().now_ns())
         running = store.running().bundle
     except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
         return None

@@ -57,9 +57,9 @@ def load_settings(args: argparse.Namespace) -> Config:
     """The settings that a command's options ask for. --every and --sweep are settings of the
     trigger by the clock."""
     sets = list(args.set)
-    for key, option in (("skin", "skin"), ("port", "skin_port")):
+    for key, option in (("profile", "skin"), ("port", "skin_port")):
         if value := getattr(args, option, None):
-            sets.append(f"sensor.{key}={value}")
+            sets.append(f"skin.{key}={value}")
     every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:
@@ -68,9 +68,19 @@ def load_settings(args: argparse.Namespace) -> Config:
                 f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
             )
         mode = "timed"
-    for key, value in (("mode", mode), ("every_s", every), ("sweep_s", sweep)):
-        sets += [f"trigger.{key}={value}"] if value is not None else []
-    return config.load(args.board, sets, folder=args.config_dir)
+    sets += [f"trigger.mode={mode}"] if mode else []
+    settings = config.load(args.board, sets, folder=args.config_dir)
+    times = {name: s for name, s in (("every_s", every), ("sweep_s", sweep)) if s is not None}
+    return replace(settings, trigger=replace(settings.trigger, **times)) if times else settings
+
+
+def status_file(settings: Config) -> Path:
+    """The file with the state of the service. Raises ConfigError if the settings name none."""
+    if not settings.store.status:
+        raise ConfigError(
+            'store.runtime = "" turns the status file off; set it to a folder, and restart the service'
+        )
+    return settings.store.status
 
 
 def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
@@ -287,7 +297,7 @@ def _reports(
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 
-    expected = Expected.by(current, settings.sensor.fingertip)
+    expected = Expected.by(current, settings.skin.fingertip)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     return [
         *observers,
@@ -298,8 +308,8 @@ def _reports(
 
 def _status(settings: Config, facts: Facts) -> list[Observer]:
     """The file that `palpate status` reads, where the settings name one that can be written."""
-    path = Path(settings.store.status)
-    if not settings.store.status or not os.access(path.parent, os.W_OK):
+    path = settings.store.status
+    if not path or not os.access(path.parent, os.W_OK):
         return []
     return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
 
@@ -309,13 +319,13 @@ def _feed(
 ) -> list[Observer]:
     """What programs that watch the box read, where the settings name a socket; its default is for a
     service, whose folder is there. model: what the feed's first line says of it."""
-    path = Path(settings.feed.socket)
-    default = settings.sources["feed.socket"] == "code"
-    if not settings.feed.socket or (default and not os.access(path.parent, os.W_OK)):
+    path = settings.store.feed
+    default = settings.sources["store.runtime"] == "code"
+    if not path or (default and not os.access(path.parent, os.W_OK)):
         return []
     from appliance.service.feed import FeedServer
 
-    known = {"source": source, "skin": settings.sensor.skin, **model}
+    known = {"source": source, "skin": settings.skin.profile, **model}
     return [
         FeedServer(
             path,
@@ -440,7 +450,7 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
         raise ConfigError(
             "early answers end with an enrolment, whose labels they do not know; set classifier.early = false"
         )
-    key = EnrolmentKey(Path(settings.store.enrolment_key))
+    key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key
 
@@ -501,7 +511,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     """What is known of the skin: by the bundle, where there is one that fits it or no skin yet."""
     from appliance.alignment.live import Expected
 
-    current, fingertip = None, settings.sensor.fingertip
+    current, fingertip = None, settings.skin.fingertip
     try:
         current = load_bundle(settings, answers=False)
     except BundleError as e:
@@ -539,7 +549,7 @@ def run_status(args: argparse.Namespace) -> int:
     from appliance.service import status
 
     now_ns = SystemClock().now_ns()
-    report = status.read(Path(load_settings(args).store.status), now_ns)
+    report = status.read(status_file(load_settings(args)), now_ns)
     print(json.dumps(report, indent=1) if args.json else "\n".join(status.lines(report, now_ns)))
     return status.exit_code(report)
 

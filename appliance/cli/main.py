@@ -105,11 +105,11 @@ def _simulated(
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps
 
-    seen = sweeps.view(settings.sensor.skin, profile.format)
+    seen = sweeps.view(settings.skin.profile, profile.format)
     acts, source, format = script.named(name, format, args.seed, spread=spread, seen=seen)
     acts = islice(acts, args.sweeps)
     return terminal.build(
-        settings.sensor.skin, profile, format, acts, clock, source, remember=remember
+        settings.skin.profile, profile, format, acts, clock, source, remember=remember
     )
 
 

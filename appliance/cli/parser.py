@@ -29,7 +29,7 @@ def settings() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one value"
     )
     common.add_argument(
-        "--config-dir", type=Path, metavar="DIR", help="where sensor.toml and the board files are"
+        "--config-dir", type=Path, metavar="DIR", help="where skin.toml and the board files are"
     )
     return common
 
@@ -46,10 +46,10 @@ def _shared() -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argpars
     devices.add_argument(
         "--skin",
         metavar="NAME",
-        help="profile of the skin, or the file of one (sensor.skin); with --sim the name of an emulated one",
+        help="profile of the skin, or the file of one (skin.profile); with --sim the name of an emulated one",
     )
     devices.add_argument(
-        "--port", dest="skin_port", metavar="PATH", help="serial port of the skin (sensor.port)"
+        "--port", dest="skin_port", metavar="PATH", help="serial port of the skin (skin.port)"
     )
     devices.add_argument(
         "--virtual", action="store_true", help="with --sim: do not wait for the time to pass"
@@ -70,10 +70,10 @@ def _trigger() -> argparse.ArgumentParser:
         help="trigger.mode: two-lines or one-line; serial: commands START and STOP; key: the space bar; timed",
     )
     trigger.add_argument(
-        "--every", type=float, metavar="S", help="timed: seconds from one start to the next (5)"
+        "--every", type=_short, metavar="S", help="timed: seconds from one start to the next (5)"
     )
     trigger.add_argument(
-        "--sweep", type=float, metavar="S", help="timed: seconds from start to stop (3)"
+        "--sweep", type=_short, metavar="S", help="timed: seconds from start to stop (3)"
     )
     return trigger
 
@@ -98,6 +98,11 @@ def _seconds(text: str, least: float = 1.0) -> float:
             f"{text} is no number of seconds that will do; use {least:g} to 3600"
         )
     return seconds
+
+
+def _short(text: str) -> float:
+    """The time of a sweep, for argparse."""
+    return _seconds(text, least=0.1)
 
 
 def parser(runs: Mapping[str, Callable[[argparse.Namespace], int]]) -> argparse.ArgumentParser:
@@ -333,6 +338,9 @@ def _skin_commands(add: Callable[..., Any], devices: argparse.ArgumentParser) ->
         required=True,
         metavar="PATH",
         help="where it is; `palpate skin detect` lists the ports",
+    )
+    new.add_argument(
+        "--baud", type=_count, metavar="N", help="the skin's speed (default: common speeds in turn)"
     )
     new.add_argument(
         "--grid",

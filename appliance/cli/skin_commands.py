@@ -32,7 +32,7 @@ def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
     devices = open_devices(None)
     settings = devices.wire(load_settings(args))
-    failed, port = 0, settings.sensor.link == "serial"
+    failed, port = 0, settings.skin.link == "serial"
     with closing(skins.open_board(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
         log.info(
@@ -76,7 +76,7 @@ def run_detect(args: argparse.Namespace) -> int:
     # a port that is soldered on may lead to the robot, or to nothing: only the named one is opened
     usb = [port for port in there if port.vendor_id or args.port]
     found = 0
-    for line in skin_detect.on_usb(settings.sensor):
+    for line in skin_detect.on_usb(settings.skin):
         print(line, flush=True)
         found += 1
     if usb:
@@ -124,7 +124,7 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
             SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
         )
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        name = settings.sensor.skin
+        name = settings.skin.profile
         skin_show.run(
             sensor, format, name, devices.source, devices.clock, [screen, *pages], stopped
         )
@@ -142,7 +142,7 @@ def run_new(args: argparse.Namespace) -> int:
     if args.grid:
         _make(path.parent)  # before a user has listened in vain
     port, clock = args.port, SystemClock()
-    bauds = (settings.sensor.baud,) if settings.sensor.baud else skin_new.BAUDS
+    bauds = (args.baud,) if args.baud else skin_new.BAUDS
     log.info(
         f"listening at {port}: {args.seconds:g} s at each speed, until one shows a pattern; touch the skin"
     )
@@ -162,7 +162,7 @@ def run_new(args: argparse.Namespace) -> int:
     use = (
         f"--skin {shlex.quote(str(path))}"
         if args.out
-        else f'--skin {path.stem} (sensor.skin = "{path.stem}")'
+        else f'--skin {path.stem} (skin.profile = "{path.stem}")'
     )
     print(f"{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with {use}")
     return 0

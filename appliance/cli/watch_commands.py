@@ -15,11 +15,12 @@ from appliance.core.log import TroubleLog, log
 def run_watch(args: argparse.Namespace) -> int:
     """`palpate watch`: until Ctrl-C or SIGTERM."""
     settings, clock = load_settings(args), SystemClock()
-    path, stopped = settings.feed.socket, stop_flag()
-    if not path:
+    socket, stopped = settings.store.feed, stop_flag()
+    if not socket:
         raise ConfigError(
-            'feed.socket = "" turns the feed off, so there is nothing to watch; set it to a path'
+            'store.runtime = "" turns the feed off, so there is nothing to watch; set it to a folder'
         )
+    path = str(socket)
     if args.web is not None:
         from appliance.watch.access import Access
         from appliance.watch.web import PageWatcher

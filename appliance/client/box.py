@@ -99,8 +99,8 @@ class Palpate:
         return self._line.trouble
 
     def silent_s(self) -> float:
-        """Time since the last sentence; infinite before the first. The box sends one a second
-        (serial.state_s)."""
+        """Time since the last sentence; infinite before the first. The box sends one a
+        second."""
         return (self._clock.now_ns() - self._heard_ns) / 1e9 if self._heard_ns else float("inf")
 
     def wait_ready(self, timeout_s: float) -> BoxState:

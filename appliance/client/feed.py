@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from appliance.core.clock import Clock, SystemClock, wait_readable
-from appliance.core.config import FEED_SCHEMA, FeedConfig
+from appliance.core.config import FEED_SCHEMA, StoreConfig
 from appliance.core.errors import FeedError, FormatError
 
-DEFAULT = FeedConfig().socket
+DEFAULT = str(StoreConfig().feed)
 MOST_LINE = 1 << 20
 """Bytes of a line; the box sends far shorter ones."""
 RETRY_NS = 500_000_000
@@ -197,5 +197,5 @@ def _why(e: OSError) -> str:
     if isinstance(e, BlockingIOError):
         return "the box has no room for another connection now; it is tried again"
     if isinstance(e, (FileNotFoundError, ConnectionRefusedError)):
-        return "no palpate offers its feed there; start it (systemctl start palpate), or see feed.socket"
+        return "no palpate offers its feed there; start it (systemctl start palpate), or see store.runtime"
     return f"{str(e.strerror or e).lower()}; see palpate status"

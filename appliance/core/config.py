@@ -1,7 +1,7 @@
 """The settings of the box. In: TOML files and `--set` options. Out: one frozen `Config` that knows
 each value's source.
 
-Layers, each overriding those before it: the defaults below, `sensor.toml`, `board-NAME.toml`,
+Layers, each overriding those before it: the defaults below, `skin.toml`, `board-NAME.toml`,
 `/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: a field's type and limits say
 what a file may hold.
 """
@@ -9,15 +9,26 @@ what a file may hold.
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
 from appliance.core.errors import ConfigError
-from appliance.core.schema import Key, closest, gpio_line, keys, number, read_table, shown
+from appliance.core.schema import (
+    Key,
+    closest,
+    custom,
+    fixed,
+    gpio_line,
+    keys,
+    number,
+    read_table,
+    shown,
+)
 
 SITE = Path("/etc/palpate/palpate.toml")
 """The settings of this robot's installation; the file may be missing."""
@@ -25,53 +36,71 @@ FEED_SCHEMA = 1
 """Version of the feed's lines (PROTOCOL.md, part 4), for who writes and who reads them."""
 
 
-@dataclass(frozen=True, slots=True)
-class SensorConfig:
-    """Which skin it is, where, and how it is read.
+_USB = re.compile(r"([0-9a-f]{4}):([0-9a-f]{4})(?::(.+))?", re.ASCII | re.IGNORECASE)
 
-    skin: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's, ""
-    for that. rate_hz: frames per second in place of the profile's, 0 for that. tare: send the
-    profile's command for it whenever the skin is found, which must be unloaded then. fingertip: the
-    side of the grid that is nearest to the end of the finger, for pictures; "" where nobody has
-    said it. vendor_id, product_id: USB ids. serial: the board's serial number, "" for any. link:
-    "vendor" (bulk transfers), "acm" (a serial port over USB, without the kernel's driver), or
-    "serial" (any serial port, with the kernel's driver). port: path of this serial port; "" finds
-    the one with the ids. baud: its bits per second, 0 takes the profile's. Profiles of other
-    protocols have ids of their own and use `port`, `serial` and `baud`. read_bytes: size of one
-    read, in whole USB packets. timeout_ms: longest wait of one read. silence_ms: time without a
-    frame after which the skin counts as lost. retry_ms: time between two searches for a missing
-    skin.
+
+def _usb(value: Any) -> str | None:
+    """Reader of skin.usb, for `custom`."""
+    known = isinstance(value, str) and value.isprintable() and _USB.fullmatch(value)
+    return value if known else None
+
+
+@dataclass(frozen=True, slots=True)
+class SkinConfig:
+    """The skin: its kind, its port, and how frames are read.
+
+    profile: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's,
+    "" for that. rate_hz: frames per second in place of the profile's, 0 for that. tare: send the
+    profile's tare command whenever the skin is found; it must be unloaded then. fingertip: the side
+    of the grid that is nearest to the end of the finger, for pictures; "" if unknown. usb: USB ids
+    of the board, and its serial number if several are connected, as in "1209:7ac7:E661"; profiles
+    with ids of their own use the serial number alone. link: "vendor" (bulk transfers), "acm" (a
+    serial port over USB, without the kernel's driver), or "serial" (any serial port, with the
+    kernel's driver). port: path of this serial port; "" finds the port by its USB ids. silence_ms: time without a frame after which the
+    skin counts as silent and is started again.
     """
 
-    skin: str = "palpate"
+    profile: str = "palpate"
     grid: str = ""
     rate_hz: float = number(0.0, 0.0, 100_000.0)
     tare: bool = False
     fingertip: Literal["", "first-row", "last-row", "first-column", "last-column"] = ""
-    vendor_id: int = number(0x1209, 1, 0xFFFF, hex=True)
-    product_id: int = number(0x7AC7, 1, 0xFFFF, hex=True)
-    serial: str = ""
+    usb: str = custom("1209:7ac7", 'USB ids such as "1209:7ac7" or "1209:7ac7:SERIAL"', _usb)
     link: Literal["vendor", "acm", "serial"] = "vendor"
     port: str = ""
-    baud: int = number(0, 0, 4_000_000)
-    read_bytes: int = number(4096, 512, 1 << 20, step=512)
-    timeout_ms: int = number(100, 1, 1_000)
     silence_ms: int = number(500, 1, 60_000)
-    retry_ms: int = number(250, 1, 60_000)
+    baud: int = fixed(0)  # of the serial port; 0: the profile's
+    read_bytes: int = fixed(4096)  # whole USB packets (512): a smaller read can overflow
+    timeout_ms: int = fixed(100)  # a read waits this long, and with it edges and commands
+    retry_ms: int = fixed(250)  # between two searches for a missing skin
+
+    @property
+    def vendor_id(self) -> int:
+        """First half of the USB ids."""
+        return int(self.usb[:4], 16)
+
+    @property
+    def product_id(self) -> int:
+        """Second half of the USB ids."""
+        return int(self.usb[5:9], 16)
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the board, "" for any."""
+        return self.usb[10:]
 
 
 @dataclass(frozen=True, slots=True)
 class TriggerConfig:
-    """What starts and stops a sweep: the robot's lines, by the kernel's names (`gpioinfo`; "" means
-    not wired), or not a line.
+    """Start and stop of sweeps.
 
     mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls,
-    `stop` is not used. "serial": commands on the serial line. "key": the space bar. "timed": a
-    sweep of `sweep_s` every `every_s`. new_object: its rising edge announces another object.
-    active_low: inverts all three lines. bias: the inputs' resistor. glitch_us: time for which a
-    level must hold to count. storm_edges: largest number of edges in one burst; more are taken for
-    a broken wire. every_s: with "timed", seconds from one START to the next. sweep_s: with "timed",
-    seconds from START to STOP.
+    `stop` is not used. "serial": commands on the serial line. "key": the space bar. "timed": by the
+    clock, a sweep of 3 s every 5 s (`run` and `record` have options for other times). start, stop:
+    the robot's GPIO lines, by the kernel's names (`gpioinfo` lists them); "" means not wired.
+    new_object: a GPIO line whose rising edge announces another object. active_low: inverts all
+    three lines, and pulls open inputs up instead of down. glitch_us: time for which a level must
+    hold to count.
     """
 
     mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"
@@ -79,11 +108,10 @@ class TriggerConfig:
     stop: str = gpio_line()
     new_object: str = gpio_line()
     active_low: bool = False
-    bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     glitch_us: int = number(500, 1, 1_000_000)
-    storm_edges: int = number(2000, 2, 1_000_000)
-    every_s: float = number(5.0, 0.1, 3600.0)
-    sweep_s: float = number(3.0, 0.1, 3600.0)
+    storm_edges: int = fixed(2000)  # more edges in one burst come from a broken wire
+    every_s: float = fixed(5.0)  # timed: from one START to the next (--every)
+    sweep_s: float = fixed(3.0)  # timed: from START to STOP (--sweep)
 
     @property
     def by_lines(self) -> bool:
@@ -93,10 +121,10 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """The box's lines to the robot; "" means not wired.
+    """The box's GPIO lines to the robot; "" means not wired.
 
-    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code,
-    lowest bit first. settle_us: time from setting them to the rise of `result_valid`.
+    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code, lowest bit first. settle_us: time from setting these lines to the
+    rise of `result_valid`.
     """
 
     ready: str = gpio_line()
@@ -110,43 +138,40 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
-    """Limits of a sweep. max_duration_s: without a stop edge for this long the sweep is answered
-    `long`.
+    """Limits of a sweep.
 
-    late_ms: longest wait after the stop edge for frames of the window. lead_ms: time from the start
-    edge to the first frame of the window for early answers (500 is the middle of the paper's three
-    seconds).
+    max_duration_s: a sweep without a stop edge for this long is answered `long`.
     """
 
     max_duration_s: float = number(12.0, 0.1, 3600.0)
-    late_ms: int = number(500, 1, 60_000)
-    lead_ms: int = number(500, 0, 60_000)
+    late_ms: int = fixed(500)  # frames of a window are waited for so long after the stop edge
+    lead_ms: int = fixed(500)  # early answers: from the start edge to the window; with 500 ms it is
+    # the middle of the paper's three seconds
 
 
 @dataclass(frozen=True, slots=True)
 class SerialConfig:
-    """The serial line to the robot. port: a device path, "" for none. baud: bits per second, 8N1.
+    """The serial line to the robot.
 
-    queue: largest number of sentences that wait for a slow reader; then the oldest is dropped.
-    state_s: time between two STA sentences.
+    port: a device path, "" for none. baud: bits per second, 8N1.
     """
 
     port: str = ""
     baud: int = number(115200, 1200, 4_000_000)
-    queue: int = number(64, 1, 65_536)
-    state_s: float = number(1.0, 0.05, 3600.0)
+    queue: int = fixed(64)  # sentences that wait for a slow reader; then the oldest is dropped
+    state_s: float = fixed(1.0)  # between two STA sentences
 
 
 @dataclass(frozen=True, slots=True)
 class ClassifierConfig:
-    """The network. bundle: path of a bundle; "" for the one that was deployed last, or else the
-    packaged one. allow_unsigned: let a robot be answered by a `bundle` that nobody signed.
+    """The classifier.
 
-    fuse: rule by which the sweeps of one object are fused into one answer; "none" answers each by
-    itself. early: answer while the finger still slides, as soon as the bundle's rule allows.
-    min_probability: least probability for status ok; 0 takes the bundle's threshold. max_sweeps:
-    after this many fused sweeps of one object below `min_probability` the answer is `undecided`; 0
-    means no limit.
+    bundle: path of a bundle; "" for the bundle that was deployed last, or else the packaged one.
+    allow_unsigned: let an unsigned `bundle` answer a robot. fuse: rule by which the sweeps of one
+    object are fused into one answer; "none" answers each sweep alone. early: answer while the
+    finger still slides, as soon as the bundle's rule allows. min_probability: least probability for
+    status ok; 0 takes the bundle's threshold. max_sweeps: after this many fused sweeps of one
+    object below `min_probability` the answer is `undecided`; 0 means no limit.
     """
 
     bundle: str = ""
@@ -159,52 +184,62 @@ class ClassifierConfig:
 
 @dataclass(frozen=True, slots=True)
 class StoreConfig:
-    """What the box stores. folder: bundles, recordings and black box (layout: deployment/store.py).
+    """The folders of the box.
 
-    signers: file of the keys whose bundles are accepted, in the format ALLOWED SIGNERS of
-    ssh-keygen. enrolment_key: folder of the key with which this box signs the labels that it
-    enrolled (deployment/enrolment_key.py). status: the file that `palpate status` reads, "" for
-    none. trial_sweeps, trial_s: a new bundle is committed once it has named this many sweeps, or
-    the skin has streamed for this long. black_box: number of latest sweeps to keep, 0 for none.
+    folder: bundles, recordings and black box (layout: deployment/store.py). keys: `allowed_signers`
+    (keys whose bundles are accepted, in the format of ssh-keygen) and `enrolment/` (the key that
+    signs what this box enrolled). runtime: the status file and the socket of the feed (PROTOCOL.md,
+    part 4); "" for neither. black_box: number of latest sweeps to keep, 0 for none.
+    trial_sweeps: a new bundle is committed once it has given a label to this many sweeps, or the
+    skin has streamed for 600 s.
     """
 
     folder: str = "/var/lib/palpate"
-    signers: str = "/etc/palpate/allowed_signers"
-    enrolment_key: str = "/etc/palpate/enrolment"
-    status: str = "/run/palpate/status.json"
-    trial_sweeps: int = number(20, 1, 100_000)
-    trial_s: float = number(600.0, 1.0, 1e6)
+    keys: str = "/etc/palpate"
+    runtime: str = "/run/palpate"
     black_box: int = number(0, 0, 100_000)
+    trial_sweeps: int = number(20, 1, 100_000)
+    trial_s: float = fixed(600.0)  # the skin has streamed for so long: the trial ends as well
 
+    @property
+    def signers(self) -> Path:
+        """The file of the keys whose bundles are accepted."""
+        return Path(self.keys) / "allowed_signers"
 
-@dataclass(frozen=True, slots=True)
-class FeedConfig:
-    """What the box offers to programs that watch it (PROTOCOL.md, part 4). socket: path of the
-    feed, "" for none."""
+    @property
+    def enrolment_key(self) -> Path:
+        """The folder of this box's key for enrolments."""
+        return Path(self.keys) / "enrolment"
 
-    socket: str = "/run/palpate/feed.sock"
+    @property
+    def status(self) -> Path | None:
+        """The file that `palpate status` reads."""
+        return Path(self.runtime) / "status.json" if self.runtime else None
+
+    @property
+    def feed(self) -> Path | None:
+        """The socket of the feed."""
+        return Path(self.runtime) / "feed.sock" if self.runtime else None
 
 
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
-    """The page of `palpate watch --web`. address: where it listens; beyond this machine only with
-    token and certificate.
+    """The page of `palpate watch --web`.
 
-    names: further host names by which browsers may ask for it, separated by spaces. folder: token,
-    certificate.pem and key.pem.
+    address: where it listens, then further host names by which browsers may ask for it, separated
+    by spaces. Addresses beyond this machine need token and certificate.
     """
 
     address: str = "127.0.0.1"
-    names: str = ""
-    folder: str = "/etc/palpate/watch"
+    folder: str = fixed("/etc/palpate/watch")  # token, certificate.pem and key.pem
 
 
 @dataclass(frozen=True, slots=True)
 class BridgeConfig:
-    """`palpate bridge` on the box, where no option says otherwise. address: where it listens, at
-    the port of its kind.
+    """`palpate bridge` on the box; its options override these values.
 
-    allow_writes: whether peers may start, stop, tare and abort. A bridge has no password.
+    address: where it listens, at the port of its kind. allow_writes: whether peers may start, stop,
+    tare and abort. A bridge has no password.
     """
 
     address: str = "127.0.0.1"
@@ -221,14 +256,13 @@ class Config:
     """
 
     board: str
-    sensor: SensorConfig
+    skin: SkinConfig
     trigger: TriggerConfig
     output: OutputConfig
     sweep: SweepConfig
     serial: SerialConfig
     classifier: ClassifierConfig
     store: StoreConfig
-    feed: FeedConfig
     watch: WatchConfig
     bridge: BridgeConfig
     sources: Mapping[str, str] = field(compare=False)
@@ -254,7 +288,7 @@ def load(
 
     board: NAME of a `board-NAME.toml`; None or "" takes `board = "NAME"` in `site`, and without
     that no line is wired. sets: "section.key=value", the value in TOML or a bare string. folder:
-    where `sensor.toml` and the boards' files are; None means `firmware_config/` beside the package,
+    where `skin.toml` and the boards' files are; None means `firmware_config/` beside the package,
     in an installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError naming
     the file, the key, the value and what is allowed.
     """
@@ -264,7 +298,7 @@ def load(
     board, named_in = (
         (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
     )
-    layers = [(folder / "sensor.toml", _read(folder / "sensor.toml", needed=False))]
+    layers = [(folder / "skin.toml", _read(folder / "skin.toml", needed=False))]
     if board != "":
         path = _board_file(folder, board, named_in)
         layers.append((path, _read(path, needed=True)))
@@ -276,8 +310,8 @@ def load(
             values[name], sources[name] = value, where.name
     _check_lines(values, sources)
     groups = {
-        s: group(**{f.name: values[f"{s}.{f.name}"] for f in fields(group)})
-        for s, group in _SECTIONS.items()
+        section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
+        for section, group in _SECTIONS.items()
     }
     return Config(board=board, sources=MappingProxyType(sources), folder=folder, **groups)
 
@@ -286,12 +320,10 @@ def describe(config: Config) -> str:
     """One line per value, `section.key = value   # source`; the text is TOML that can be loaded as
     a site file."""
     values = {"board": json.dumps(config.board)}
-    for name, key in _KEYS.items():
+    for name in _KEYS:
         section, _, last = name.partition(".")
         value = getattr(getattr(config, section), last)
-        values[name] = (
-            f"0x{value:04x}" if "hex" in key.limits else json.dumps(value, ensure_ascii=False)
-        )
+        values[name] = json.dumps(value, ensure_ascii=False)
     return "\n".join(
         f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
     )

@@ -20,10 +20,14 @@ _Number = TypeVar("_Number", int, float)
 _Kind = TypeVar("_Kind")
 
 
-def number(default: _Number, least: _Number, most: _Number, **more: object) -> _Number:
-    """A number field with its limits. more: `step` allows whole multiples only, `hex` prints it in
-    hexadecimal."""
-    return field(default=default, metadata={"least": least, "most": most, **more})
+def number(default: _Number, least: _Number, most: _Number) -> _Number:
+    """A number field with its limits."""
+    return field(default=default, metadata={"least": least, "most": most})
+
+
+def fixed(value: _Kind) -> _Kind:
+    """A field that files cannot set: a constant that stands beside the settings it belongs to."""
+    return field(default=value, metadata={"fixed": True})
 
 
 def gpio_line() -> str:
@@ -61,12 +65,9 @@ class Key:
             return tuple(value) if names else None
         if self.hint in (str, bool):
             return value if _fits(value, self.hint) else None
-        if (
-            type(value) not in (int, self.hint)
-            or not self.limits["least"] <= value <= self.limits["most"]
-        ):
-            return None
-        return None if "step" in self.limits and value % self.limits["step"] else self.hint(value)
+        known = type(value) in (int, self.hint)
+        within = known and self.limits["least"] <= value <= self.limits["most"]
+        return self.hint(value) if within else None
 
     @property
     def allowed(self) -> str:
@@ -79,14 +80,17 @@ class Key:
             plain = {bool: "true or false", str: "a string in quotes, without control characters"}
             return plain.get(self.hint, 'names such as ["GPIO16"]')
         kind = "a whole number" if self.hint is int else "a number"
-        kind = f"a multiple of {self.limits['step']}" if "step" in self.limits else kind
         return f"{kind} from {self.limits['least']} to {self.limits['most']}"
 
 
 def keys(kind: Any) -> dict[str, Key]:
-    """The fields of the dataclass `kind` as keys of a TOML table, by name."""
+    """The fields of the dataclass `kind` as keys of a TOML table, by name; without fixed ones."""
     hints = get_type_hints(kind)
-    return {f.name: Key(hints[f.name], f.default, f.metadata) for f in fields(kind)}
+    return {
+        f.name: Key(hints[f.name], f.default, f.metadata)
+        for f in fields(kind)
+        if "fixed" not in f.metadata
+    }
 
 
 def read_table(

@@ -185,7 +185,7 @@ class Sweep:
     empty.
 
     share: 1; less for a sweep that is still going on: the share of a window's frames that has come,
-    counted from `sweep.lead_ms` after the start edge; `frames` then are these frames. start_ns,
+    counted from half a second after the start edge; `frames` then are these frames. start_ns,
     stop_ns: trigger edges, host monotonic (equal if one is missing; before the stop edge the last
     frame). lost: frames of the window that never arrived; if `status` is ok they were interpolated.
     complete_ns: when the last thing needed (stop edge or frame) had arrived. object: number of NEW

@@ -24,7 +24,7 @@ PROBE = b"palpate: does this key sign?"
 
 @dataclass(frozen=True, slots=True)
 class EnrolmentKey:
-    """The key in `folder`, by the setting store.enrolment_key."""
+    """The key in `folder`, below the setting store.keys."""
 
     folder: Path
 

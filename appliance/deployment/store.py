@@ -189,8 +189,8 @@ class Store:
         boot: Path = BOOT,
     ) -> None:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
-        key = EnrolmentKey(Path(settings.enrolment_key))
-        self.bundles = BundleFolder(self.folder / "bundles", Path(settings.signers), key)
+        key = EnrolmentKey(settings.enrolment_key)
+        self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key)
         self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
         self._old_state_file = self.folder / OLD_STATE_FILE
         self._clock, self._boot_file = clock or SystemClock(), boot

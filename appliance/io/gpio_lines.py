@@ -31,7 +31,7 @@ _ADVICE = {
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EBUSY: "another program or driver holds one of them; gpioinfo shows which",
     errno.ENXIO: "one of them cannot raise interrupts; choose another line",
-    errno.EINVAL: "the chip may not know this bias; try bias = 'as-is'",
+    errno.EINVAL: "the chip refuses a resistor or edges on one of them; choose another line",
     errno.ENODEV: "the chip is gone; plug it in and start again",
 }
 

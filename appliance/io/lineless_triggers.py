@@ -148,7 +148,7 @@ class TimedTrigger(LinelessTrigger):
         if config.every_s <= config.sweep_s:
             raise ConfigError(
                 f"a sweep of {config.sweep_s:g} s every {config.every_s:g} s leaves no pause; "
-                "let --every (trigger.every_s) be longer than --sweep (trigger.sweep_s)"
+                "let --every be longer than --sweep"
             )
         self._every_ns, self._sweep_ns = (
             round(config.every_s * SECOND),

@@ -49,5 +49,5 @@ def reply_to(request: packets.Request, read: Callable[[int, int], bytes], clock:
     sent = f"sends {len(data)} other bytes but" if data else "sends nothing and"
     raise SensorMismatch(
         f"the skin {sent} does not answer request {request.name}; check its firmware, or name its "
-        "profile with sensor.skin"
+        "profile with skin.profile"
     )

@@ -18,7 +18,7 @@ from typing import Any
 import serial
 
 from appliance.core.clock import Clock, wait_readable
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost
 from appliance.io import packets, serial_port
 from appliance.io.link import REPLY_MS, TTY_BYTES, reply_to
@@ -107,7 +107,7 @@ class BoardLink(SerialLink):
 
 
 def open_board(
-    config: SensorConfig, clock: Clock, ports: Callable[[], Iterable[PortInfo]] = serial_port.ports
+    config: SkinConfig, clock: Clock, ports: Callable[[], Iterable[PortInfo]] = serial_port.ports
 ) -> BoardLink:
     """Open the configured port, or the port with the configured USB ids. Raises SensorError."""
     path = config.port or find(((config.vendor_id, config.product_id),), config.serial, ports())
@@ -130,7 +130,7 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
     there = ", ".join(map(str, ports)) or "none"
     raise SensorAbsent(
         f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port "
-        "with --port (sensor.port)"
+        "with --port (skin.port)"
     )
 
 
@@ -160,10 +160,10 @@ def _refused(path: str, e: Exception) -> SensorError:
         )
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return SensorAbsent(
-            f"no port {path} (errno {code}); plug the skin in, or correct --port (sensor.port)"
+            f"no port {path} (errno {code}); plug the skin in, or correct --port (skin.port)"
         )
     return SensorLost(
-        f"{path} cannot be opened: {e}; check sensor.port and the baud rate of its profile"
+        f"{path} cannot be opened: {e}; check skin.port and the baud rate of its profile"
     )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from appliance.core.clock import Clock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import SensorError, SensorMismatch
 from appliance.core.types import SweepFormat, shown
 from appliance.io import packets, serial_port, skin_stream
@@ -69,7 +69,7 @@ class SerialSensor(LinkSensor):
 
     def __init__(
         self,
-        config: SensorConfig,
+        config: SkinConfig,
         profile: SkinProfile,
         format: SweepFormat,
         clock: Clock,
@@ -110,7 +110,7 @@ class SerialSensor(LinkSensor):
             port.close()
             raise
         link = ProfileLink(port, self._profile.commands(self._profile.stop, self._format.rate_hz))
-        return link, packets.Identity(0, (0, 0, 0), self._config.skin, info.serial)
+        return link, packets.Identity(0, (0, 0, 0), self._config.profile, info.serial)
 
     def _check_format(self) -> None:
         """Raises SensorMismatch if the skin cannot send the bundle's format."""
@@ -122,9 +122,9 @@ class SerialSensor(LinkSensor):
         if sent.skin != wanted.skin or not able:
             rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
             raise SensorMismatch(
-                f"the profile {self._config.skin} sends {shown(sent.shape)} {sent.dtype} at "
+                f"the profile {self._config.profile} sends {shown(sent.shape)} {sent.dtype} at "
                 f"{rates} Hz, wanted is "
-                f"{wanted}; correct sensor.skin, sensor.grid or sensor.rate_hz, or deploy a "
+                f"{wanted}; correct skin.profile, skin.grid or skin.rate_hz, or deploy a "
                 "bundle for this skin"
             )
 
@@ -133,8 +133,8 @@ class SerialSensor(LinkSensor):
             return super()._no_frame(bytes_came=False)
         return SensorMismatch(
             f"the skin sent bytes for {self._config.silence_ms} ms, "
-            f"but no frame of profile {self._config.skin} "
-            f"({shown(self._profile.format.shape)} {self._profile.number}); correct sensor.skin, "
-            "sensor.grid or "
-            "sensor.baud; `palpate skin detect` listens for what fits"
+            f"but no frame of profile {self._config.profile} "
+            f"({shown(self._profile.format.shape)} {self._profile.number}); correct skin.profile, "
+            "skin.grid or "
+            "the profile's baud; `palpate skin detect` listens for what fits"
         )

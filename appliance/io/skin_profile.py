@@ -13,7 +13,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import ConfigError
 from appliance.core.schema import closest, custom, keys, read_table, shown
 from appliance.core.schema import number as limited
@@ -211,8 +211,8 @@ def _contradiction(p: SkinProfile) -> str:
         )
     if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
         return (
-            'usb_ids, start, stop and tare are not for codec = "palpate"; sensor.link and '
-            "sensor.vendor_id say where it is"
+            'usb_ids, start, stop and tare are not for codec = "palpate"; skin.link and '
+            "skin.usb say where it is"
         )
     if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
         return (
@@ -239,7 +239,7 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
         near = closest(name, there)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(there) or 'none'}"
         raise ConfigError(
-            f"sensor.skin = {shown(name)} has no profile in {' or '.join(map(str, folders))}; "
+            f"skin.profile = {shown(name)} has no profile in {' or '.join(map(str, folders))}; "
             f"{hint}"
         )
     path = there[name]
@@ -296,8 +296,8 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
     return found
 
 
-def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
-    """The profile with the changes of sensor.grid, sensor.rate_hz and sensor.baud. Raises
+def adapted(profile: SkinProfile, config: SkinConfig) -> SkinProfile:
+    """The profile with the changes of skin.grid, skin.rate_hz and baud. Raises
     ConfigError."""
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
@@ -308,7 +308,7 @@ def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
     grid = _GRID.fullmatch(config.grid)
     if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
         raise ConfigError(
-            f"sensor.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32"
+            f"skin.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32"
         )
     changes: dict[str, Any] = {}
     if grid:
@@ -317,7 +317,7 @@ def adapted(profile: SkinProfile, config: SensorConfig) -> SkinProfile:
         if profile.rates_hz and config.rate_hz not in profile.rates_hz:
             allowed = ", ".join(f"{rate:g}" for rate in profile.rates_hz)
             raise ConfigError(
-                f"sensor.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of "
+                f"skin.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of "
                 f"{allowed}"
             )
         changes["rate_hz"] = config.rate_hz

@@ -74,7 +74,7 @@ def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacke
 
 def _of_another(why: str) -> str:
     return (
-        f"the skin is another one: {why}; correct sensor.grid, or name its profile with sensor.skin"
+        f"the skin is another one: {why}; correct skin.grid, or name its profile with skin.profile"
     )
 
 
@@ -243,7 +243,7 @@ class CountedStream:
             raise SensorMismatch(
                 f"the skin sends {pace * wanted:.1f} frames a second, {wanted:g} are expected "
                 f"({100 * (pace - 1):+.0f} %, "
-                f"at most {100 * RATE_WANDER:g}); set sensor.rate_hz for new recordings, or let "
+                f"at most {100 * RATE_WANDER:g}); set skin.rate_hz for new recordings, or let "
                 f"it send {wanted:g}"
             )
 

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from appliance.core.config import SITE, Config, SensorConfig
+from appliance.core.config import SITE, Config, SkinConfig
 from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError, FormatError, SensorAbsent, SensorMismatch
 from appliance.core.types import SweepFormat
@@ -30,7 +30,7 @@ def folders(settings: Config) -> list[Path]:
 def profile(settings: Config) -> SkinProfile:
     """The profile that the settings name, with their changes. Raises ConfigError."""
     return skin_profile.adapted(
-        skin_profile.load(settings.sensor.skin, folders(settings)), settings.sensor
+        skin_profile.load(settings.skin.profile, folders(settings)), settings.skin
     )
 
 
@@ -49,7 +49,7 @@ def sensor(
     def opened(path: str, baud: int) -> SerialLink:
         return SerialLink(path, baud, devices.clock, wait=devices.wait)
 
-    return SerialSensor(settings.sensor, chosen, format, devices.clock, tap, open_port=opened)
+    return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
 
 
 def open_board(settings: Config, devices: Devices) -> SkinLink:
@@ -58,9 +58,9 @@ def open_board(settings: Config, devices: Devices) -> SkinLink:
     chosen = profile(settings)
     if chosen.codec != "palpate":
         raise ConfigError(
-            f'sensor.skin = "{settings.sensor.skin}" sends a protocol of its maker (codec '
+            f'skin.profile = "{settings.skin.profile}" sends a protocol of its maker (codec '
             f'"{chosen.codec}"), not PROTOCOL.md; '
-            'use sensor.skin = "palpate" for a skin that does'
+            'use skin.profile = "palpate" for a skin that does'
         )
     return open_link(_config(settings, chosen), devices.backend, devices.clock)
 
@@ -111,5 +111,5 @@ def described(text: str) -> SweepFormat:
         raise ConfigError(f"--format {text}: {e}") from e
 
 
-def _config(settings: Config, chosen: SkinProfile) -> SensorConfig:
-    return replace(settings.sensor, baud=chosen.baud)
+def _config(settings: Config, chosen: SkinProfile) -> SkinConfig:
+    return replace(settings.skin, baud=chosen.baud)

@@ -24,7 +24,7 @@ class EdgeCounters:
     """Counts since the program started.
 
     glitches: bursts that did not change the level. lost_edges: dropped by the kernel because its
-    queue was full. storms: bursts of more than `trigger.storm_edges` edges.
+    queue was full. storms: bursts of more than `storm_edges` edges.
     """
 
     glitches: int = 0
@@ -239,11 +239,13 @@ def _roles(config: TriggerConfig) -> list[tuple[str, _Meaning]]:
 
 
 def _input_settings(config: TriggerConfig, gpio: Any) -> Any:
-    """Both edges, time-stamped by the kernel with the monotonic clock, not debounced."""
+    """Both edges, time-stamped by the kernel with the monotonic clock, not debounced. An open input
+    is pulled to its inactive level: a broken wire starts no sweep."""
+    bias = gpio.line.Bias
     return gpio.LineSettings(
         direction=gpio.line.Direction.INPUT,
         edge_detection=gpio.line.Edge.BOTH,
         event_clock=gpio.line.Clock.MONOTONIC,
-        bias=gpio.line.Bias[config.bias.upper().replace("-", "_")],
+        bias=bias.PULL_UP if config.active_low else bias.PULL_DOWN,
         active_low=config.active_low,
     )

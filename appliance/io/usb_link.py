@@ -14,7 +14,7 @@ import usb.util
 from usb.backend import libusb1
 
 from appliance.core.clock import Clock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import (
     SensorAbsent,
     SensorBusy,
@@ -147,7 +147,7 @@ class AcmLink(VendorLink):
         return reply_to(request, self.read, self._clock) if length else b""
 
 
-def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
+def open_board(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
     """Find and claim the configured readout board. Raises SensorError if it is absent, held,
     refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
@@ -172,7 +172,7 @@ def open_board(config: SensorConfig, backend: Any, clock: Clock) -> VendorLink:
         interface = usb.util.find_descriptor(_configuration(device), bInterfaceClass=wanted)
         if interface is None:
             raise SensorMismatch(
-                f"skin {ids} has no {config.link} interface (class {wanted}); see sensor.link"
+                f"skin {ids} has no {config.link} interface (class {wanted}); see skin.link"
             )
         return link(device, interface, clock)
     except usb.core.USBError as e:
@@ -246,7 +246,8 @@ def _explain(e: usb.core.USBError) -> SensorError:
     """The SensorError that explains an errno of libusb."""
     if e.errno == errno.EOVERFLOW:
         return SensorOverflow(
-            "a USB transfer was larger than sensor.read_bytes (errno 75); it is lost, increase it"
+            "a USB transfer was larger than a read (errno 75) and is lost; let the firmware send less"
+            " in one transfer"
         )
     if e.errno == errno.EACCES:
         return SensorDenied(

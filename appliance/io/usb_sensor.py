@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from appliance.core.clock import Clock, DeviceClock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import (
     FormatError,
     SensorError,
@@ -263,7 +263,7 @@ class LinkSensor(ABC):
 
     def __init__(
         self,
-        config: SensorConfig,
+        config: SkinConfig,
         format: SweepFormat,
         clock: Clock,
         stream: Callable[[SensorCounters], FrameStream],
@@ -406,7 +406,7 @@ class UsbSensor(LinkSensor):
 
     def __init__(
         self,
-        config: SensorConfig,
+        config: SkinConfig,
         format: SweepFormat,
         clock: Clock,
         backend: Any = None,
@@ -449,7 +449,7 @@ def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
         raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
 
 
-def open_link(config: SensorConfig, backend: Any, clock: Clock) -> SkinLink:
+def open_link(config: SkinConfig, backend: Any, clock: Clock) -> SkinLink:
     """Find and open the configured readout board. Raises SensorError if it is absent, held, refused
     or of another kind."""
     # imported when it is used, since most boxes use one kind of link

@@ -174,7 +174,7 @@ def _trigger(
         if config.sweep_s < window_s:
             raise ConfigError(
                 f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "
-                "use a longer --sweep (trigger.sweep_s)"
+                "use a longer --sweep"
             )
         return TimedTrigger(config, devices.clock, log.info)
     missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)

@@ -95,7 +95,7 @@ class FeedServer(Observer):
         self._state: tuple[object, ...] = ()
         self._log = TroubleLog(
             f"feed: {path} cannot be offered",
-            "classifying goes on; see feed.socket",
+            "classifying goes on; see store.runtime",
             end=f"feed: offered at {path}",
         )
 

@@ -125,7 +125,7 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
         }
     except OSError as e:
         raise ApplianceError(
-            f"{path} cannot be read: {e.strerror}; see store.status, or ask as root"
+            f"{path} cannot be read: {e.strerror}; see store.runtime, or ask as root"
         ) from e
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
         raise FormatError(f"{path}: not a status of this version ({e}); restart the service") from e

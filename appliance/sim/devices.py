@@ -58,15 +58,13 @@ class SimDevices(RobotDevices):
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated lines and skin."""
         ids = {
-            "vendor_id": usb.VENDOR_ID,
-            "product_id": usb.PRODUCT_ID,
-            "serial": "",
-            "skin": "palpate",
+            "usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}",
+            "profile": "palpate",
             "grid": "",
         }
         link = "acm" if self.backend.acm else "vendor"
-        sensor = replace(settings.sensor, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
-        return replace(RobotDevices.wire(self, settings), sensor=sensor)
+        skin_config = replace(settings.skin, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
+        return replace(RobotDevices.wire(self, settings), skin=skin_config)
 
 
 def robot_on_lines(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from appliance.core.clock import Clock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import FormatError, SensorError
 from appliance.core.types import SweepFormat, shown
 from appliance.io import packets, skin_codecs
@@ -118,17 +118,17 @@ def _on_port(
                 return
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
-            grid = f"the marks of {name}, but {taxels} taxels a frame; set sensor.grid to their rows x columns"
+            grid = f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x columns"
             own = "if it is another skin, describe it with `palpate skin new`"
             yield PortFinding(
                 port,
                 name,
-                f'{known}{grid}, sensor.skin = "{name}", sensor.port = "{port.path}"; {own}',
+                f'{known}{grid}, skin.profile = "{name}", skin.port = "{port.path}"; {own}',
             )
             return
     if write and (who := _asked(port.path, open_port, clock)):
         yield PortFinding(
-            port, DEFAULT, f'{known}{who}; set sensor.link = "serial", sensor.port = "{port.path}"'
+            port, DEFAULT, f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
         )
         return
     yield PortFinding(
@@ -198,9 +198,9 @@ def _settings(
     """What was measured, and what to set."""
     profile = profiles[fitting[0]]
     hz = measured_hz(profile, heard)
-    sets = [f'sensor.skin = "{fitting[0]}"', f'sensor.port = "{port.path}"']
+    sets = [f'skin.profile = "{fitting[0]}"', f'skin.port = "{port.path}"']
     if hz and not profile.rates_hz and abs(hz / profile.rate_hz - 1) > SAME_RATE:
-        sets.append(f"sensor.rate_hz = {hz:.1f}")
+        sets.append(f"skin.rate_hz = {hz:.1f}")
     more = f" (and as {', '.join(fitting[1:])})" if len(fitting) > 1 else ""
     form = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
     return f"sends {form_of(form)}{more}; set {', '.join(sets)}"
@@ -222,7 +222,7 @@ def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
 def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
     """Why no profile fits, and what to do."""
     if heard:
-        return f"sends {heard} bytes, but no frames of a profile; try sensor.grid, or describe it with `palpate skin new`"
+        return f"sends {heard} bytes, but no frames of a profile; try skin.grid, or describe it with `palpate skin new`"
     if write:
         return "sends nothing and answers nothing"
     asking = ", ".join(name for name, p in profiles.items() if p.start)
@@ -250,7 +250,7 @@ def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
     return (step - len(mark)) // each if whole else 0
 
 
-def on_usb(config: SensorConfig) -> list[str]:
+def on_usb(config: SkinConfig) -> list[str]:
     """A line for each board of PROTOCOL.md on USB with the configured ids; it is not opened."""
     import usb.core
 
@@ -259,7 +259,4 @@ def on_usb(config: SensorConfig) -> list[str]:
     except usb.core.NoBackendError:
         return []
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
-    return [
-        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of sensor.vendor_id and product_id"
-        for d in found
-    ]
+    return [f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of skin.usb" for d in found]

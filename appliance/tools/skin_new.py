@@ -58,7 +58,7 @@ def listen(
             f"nothing came in {seconds:g} s at {tried} baud; if the skin waits for a command, copy matrix.toml and write it there"
         )
     raise SensorMismatch(
-        f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --set sensor.baud=N, or listen longer"
+        f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --baud N, or listen longer"
     )
 
 

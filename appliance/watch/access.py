@@ -42,19 +42,21 @@ class Access:
 
         Raises ConfigError where these cannot be used.
         """
+        address, *names = settings.address.lower().split() or [""]
         try:
-            local = ipaddress.ip_address(settings.address).is_loopback
+            local = ipaddress.ip_address(address).is_loopback
         except ValueError as e:
             raise ConfigError(
-                f"watch.address {settings.address!r} is no IP address; use {HERE}, or 0.0.0.0 for the network"
+                f"watch.address: {address!r} is not an IP address; use {HERE}, or 0.0.0.0 for the"
+                " network, then host names"
             ) from e
         if local:
-            return cls(port, settings.address)
+            return cls(port, address)
         folder = Path(settings.folder)
         return cls(
             port,
-            settings.address,
-            (*_own_names(), *settings.names.lower().split()),
+            address,
+            (*_own_names(), *names),
             _token(folder / "token"),
             folder / "certificate.pem",
             folder / "key.pem",

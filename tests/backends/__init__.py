@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import Any, Protocol
 
 from appliance.core.clock import Clock
-from appliance.core.config import OutputConfig, SensorConfig, SerialConfig, TriggerConfig
+from appliance.core.config import OutputConfig, SerialConfig, SkinConfig, TriggerConfig
 from appliance.core.types import SweepFormat
 from appliance.io import packets
 from appliance.sim import skin
@@ -87,7 +87,7 @@ class Backend(Protocol):
     gpio: Any
     backend: Any
     format: SweepFormat
-    sensor: SensorConfig
+    sensor: SkinConfig
     trigger: TriggerConfig
     output: OutputConfig
     serial: SerialConfig

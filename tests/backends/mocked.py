@@ -27,7 +27,7 @@ class Mocked(real.Real):
     def __init__(self, stack: ExitStack, bench: mocks.MockedDevices) -> None:
         super().__init__(stack)
         settings = config.load(BOARD, site=NO_SITE)
-        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self.sensor, self.trigger, self.output = settings.skin, settings.trigger, settings.output
         self._inputs = [self.trigger.start, self.trigger.stop, self.trigger.new_object]
         self._bench, self._socket = bench, mocked_usb.Socket(bench)
         self._chip = mocked_gpio.Chip(bench, [f"GPIO{i}" for i in range(28)])

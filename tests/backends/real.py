@@ -12,7 +12,7 @@ import usb.core
 import usb.util
 
 from appliance.core.clock import SystemClock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.types import SweepFormat
 from appliance.sim import skin
 
@@ -24,7 +24,7 @@ class Real:
     backend = None  # pyusb takes libusb
     slack_s = 2.0  # a shared machine may stop for a second
     pulse_s = 0.02
-    sensor: SensorConfig
+    sensor: SkinConfig
     format: SweepFormat = skin.FORMAT
 
     def __init__(self, stack: ExitStack) -> None:

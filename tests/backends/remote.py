@@ -108,7 +108,7 @@ class Remote(real.Real):
     def __init__(self, stack: ExitStack, asker: Asker) -> None:
         super().__init__(stack)
         settings = config.load(None)
-        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self.sensor, self.trigger, self.output = settings.skin, settings.trigger, settings.output
         self.serial = settings.serial
         self._ask = asker.ask
         self.can = frozenset(self._ask("able")) | {"hold"}

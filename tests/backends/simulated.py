@@ -29,7 +29,7 @@ class Simulated:
         sim = devices.build(self.format, [], self.clock, "sim")
         settings = sim.wire(config.load(None, site=NO_SITE))
         self.gpio, self.backend = sim.gpio, sim.backend
-        self.sensor, self.trigger, self.output = settings.sensor, settings.trigger, settings.output
+        self.sensor, self.trigger, self.output = settings.skin, settings.trigger, settings.output
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
         self.put, self.pull, self.say, self.hear = (

@@ -63,7 +63,7 @@ class Wired(real.Real):
     def __init__(self, stack: ExitStack) -> None:
         super().__init__(stack)
         settings = config.load(os.environ.get("PALPATE_BOARD", "rpi5"))
-        self.sensor, self.trigger, self.serial = settings.sensor, settings.trigger, settings.serial
+        self.sensor, self.trigger, self.serial = settings.skin, settings.trigger, settings.serial
         self.output = replace(settings.output, class_bits=settings.output.class_bits[:2])
         out = gpiod.LineSettings(direction=Direction.OUTPUT, output_value=Value.INACTIVE)
         self._drivers = stack.enter_context(_request(DRIVERS.values(), out))

@@ -117,7 +117,7 @@ def measure(
             "tests.campaigns.feed_inside",
             os.fspath(_inside(path)),
         ]
-        box, sweeps = ThisMachine(counted, [f"feed.socket={path}"]), Script(seed)
+        box, sweeps = ThisMachine(counted, [f"store.runtime={path.parent}"]), Script(seed)
         stack.callback(box.close)
         box.start(seed, sweeps)
         listener = LatencyListener(box, sweeps)

@@ -195,7 +195,7 @@ def believed(box: Delivery, files: Files) -> bool:
     """Whether the signature by itself fits the manifest."""
     try:
         return bool(
-            signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], Path(box.how.signers))
+            signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], box.how.signers)
         )
     except BundleError:
         return False

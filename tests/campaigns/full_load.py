@@ -224,10 +224,9 @@ class FullLoad:
             *load.sets(skin, format, link),
             f"classifier.bundle={path}",
             "classifier.allow_unsigned=true",
-            f"serial.state_s={STATE_S}",
             f"store.folder={folder}",
             f"store.black_box={KEPT * full}",
-            f"feed.socket={self._feed(skin) if full else ''}",
+            f"store.runtime={self._feed(skin).parent if full else ''}",
         ]
         inside = (
             sys.executable,
@@ -235,10 +234,13 @@ class FullLoad:
             "tests.campaigns.full_load_inside",
             counts,
             folder / "sweeps" if full else "",
+            STATE_S,
         )
         box = SkinBox([*self._before, *map(str, inside)], chosen)
         stack.callback(box.close)
-        box.launch(*(["--shadow", str(path)] if full else []))
+        if full:
+            self._feed(skin).parent.mkdir()
+        box.launch(*load.times(format), *(["--shadow", str(path)] if full else []))
         return LoadedSide(skin, str(format), full, box, player, reading, counts, folder)
 
     def _reading(self, chosen: Sequence[str]) -> float:
@@ -259,7 +261,7 @@ class FullLoad:
         return median(float(re.findall(r"([\d.]+) % of a core", text)[0]) / 100 for text in texts)
 
     def _feed(self, skin: str) -> Path:
-        return self._folder / f"{skin}.sock"
+        return self._folder / f"{skin}-run" / "feed.sock"
 
     def _attach(self, side: LoadedSide) -> subprocess.Popen[bytes]:
         """Bridges, page and peers come."""

@@ -1,6 +1,7 @@
 """A box that is counted apart from its own counters: `python -m tests.campaigns.full_load_inside
-FILE FOLDER COMMAND...`. In: the command line of `palpate`; a folder for recordings, "" for none.
-Out: what that gives; FILE, whose lines of JSON tell what came in and went out.
+FILE FOLDER STATE_S COMMAND...`. COMMAND is the command line of `palpate`. FOLDER is for recordings,
+"" for none. STATE_S is the time between two STA sentences. Writes FILE, whose lines of JSON say what
+came in and went out.
 
 The recording is that of `palpate record`; here a box records and classifies at once, which is more
 than any command asks of it.
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +101,9 @@ class InsideCount(FrameCheck):
         self._file.write(json.dumps({"at_s": time.monotonic(), **line}) + "\n")
 
 
-def attach(file: Path, folder: str) -> None:
-    """From now on, let each box that is put together be counted, and record to `folder`."""
+def attach(file: Path, folder: str, state_s: float) -> None:
+    """From now on, let each box that is put together be counted, record to `folder`, and send its
+    state every `state_s`."""
     plain = assembly.box
 
     def box(
@@ -113,6 +116,7 @@ def attach(file: Path, folder: str) -> None:
         observers: Sequence[Any] = (),
         **more: Any,
     ) -> Box:
+        settings = replace(settings, serial=replace(settings.serial, state_s=state_s))
         count = InsideCount(file)
         count.listen(port)
         stack.callback(count.write_counts)  # after what is open was answered
@@ -137,5 +141,5 @@ def attach(file: Path, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    attach(Path(sys.argv[1]), sys.argv[2])
-    sys.exit(main(sys.argv[4:]))  # without the program's own name
+    attach(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
+    sys.exit(main(sys.argv[5:]))  # without the program's own name

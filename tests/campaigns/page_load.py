@@ -90,7 +90,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        feed = ["--set", f"feed.socket={folder}/feed.sock"]
+        feed = ["--set", f"store.runtime={folder}"]
         environ = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
         box = subprocess.Popen(
             [*RUN, "run", "--sim", "skin", *feed], stdout=subprocess.DEVNULL, cwd=ROOT, env=environ

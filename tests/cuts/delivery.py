@@ -76,7 +76,7 @@ class Shop:
         """Make all that."""
         key = folder / "key"
         run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", key], check=True)
-        (folder / "signers").write_text(f"shop {key.with_suffix('.pub').read_text()}")
+        (folder / "allowed_signers").write_text(f"shop {key.with_suffix('.pub').read_text()}")
         enrolment_key(folder / ENROLMENT)
         for counter, name in enumerate(NAMES[1:], 1):
             shutil.copytree(bundle.DEFAULT, folder / name)
@@ -94,12 +94,8 @@ class Shop:
     def words(self, folder: Path, *words: str | Path) -> list[str]:
         """A command of the box in `folder`. @: where bundles are copied to."""
         output = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
-        where = f"store.folder={folder / STORE}", f"store.signers={self.folder / 'signers'}"
-        how = (
-            "store.status=",
-            f"store.trial_sweeps={PROBATION}",
-            f"store.enrolment_key={self.folder / ENROLMENT}",
-        )
+        where = f"store.folder={folder / STORE}", f"store.keys={self.folder}"
+        how = "store.runtime=", f"store.trial_sweeps={PROBATION}"
         return output + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
@@ -311,7 +307,7 @@ def _apart(words: list[str]) -> tuple[int, str]:
 
 def _signs(args: argparse.Namespace, settings: Config) -> EnrolmentKey:
     """What a simulated skin taught is signed as what a real one did; the box itself refuses to."""
-    return EnrolmentKey(Path(settings.store.enrolment_key))
+    return EnrolmentKey(settings.store.enrolment_key)
 
 
 def _gone_for_a_moment(path: Path, target: str) -> None:

@@ -90,14 +90,9 @@ class Delivery:
         self.folder = folder
         self.key = key(folder / "keys")
         self.enrolment_key = enrolment_key(folder / "enrolment")
-        self.how = StoreConfig(
-            str(folder / "store"),
-            str(folder / "allowed_signers"),
-            str(folder / "enrolment"),
-            trial_sweeps=5,
-        )
+        self.how = StoreConfig(str(folder / "store"), str(folder), trial_sweeps=5)
         Path(self.how.folder).mkdir()
-        Path(self.how.signers).write_text(line(self.key))
+        self.how.signers.write_text(line(self.key))
         self.store = Store(self.how, prove)
         self._made = 0
 

@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import SensorBusy, SensorLost
 from appliance.core.types import Frames, SweepFormat
 from appliance.io import skin_profile
@@ -243,7 +243,7 @@ class WiredSkin:
         self.format = format or self.profile.format
         period_ns = self.profile.format.period_ns / rate
         self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
-        config = SensorConfig(skin=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]
+        config = SkinConfig(profile=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]
         adapted = skin_profile.adapted(self.profile, config)
         self.sensor = SerialSensor(
             config,

@@ -36,7 +36,7 @@ class PortReader:
     def __init__(
         self, port: str, rows: int = 3, cols: int = 5, rate_hz: float = 200, dtype: str = "uint8"
     ) -> None:
-        sensor = config.load(None, site=NO_SITE).sensor
+        sensor = config.load(None, site=NO_SITE).skin
         self.format = SweepFormat(rows, cols, rate_hz, 100, dtype)
         # silence: on a busy machine the interpreter may not run for a while
         settings = replace(sensor, link="serial", port=port, silence_ms=20_000)

@@ -26,7 +26,6 @@ mode = "one-line"
 start = "START"
 new_object = "STOP"
 glitch_us = 20000
-storm_edges = 200
 [output]
 ready = "READY"
 fault = "FAULT"

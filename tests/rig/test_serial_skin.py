@@ -35,8 +35,8 @@ Count = Callable[[int, int], int]
 Note = Callable[[str, str, int], None]
 
 SETTINGS = f"""
-[sensor]
-skin = "matrix"
+[skin]
+profile = "matrix"
 grid = "{skin.FORMAT.rows}x{skin.FORMAT.cols}"
 rate_hz = {skin.FORMAT.rate_hz}
 port = "{ADAPTER}"

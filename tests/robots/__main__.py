@@ -104,9 +104,7 @@ def box(port: str, feed: Path) -> Iterator[None]:
         "--set",
         f"serial.port={port}",
         "--set",
-        f"feed.socket={feed}",
-        "--set",
-        "store.status=",
+        f"store.runtime={feed.parent}",
         "--set",
         "store.folder=/nonexistent",
     ]
@@ -170,7 +168,9 @@ def run(sweeps: int) -> dict[str, list[float]]:
     times, ending = Times(), threading.Event()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        feeds = {"A": folder / "a.sock", "B": folder / "b.sock"}
+        feeds = {name: folder / name / "feed.sock" for name in "AB"}
+        for feed in feeds.values():
+            feed.parent.mkdir()
         line = LinkPort(folder / "line")
         stack.enter_context(
             Palpate("line", opener=lambda: line, listener=noting(times.seen("serial", "A")))

@@ -79,7 +79,7 @@ def measure(minutes: float, before: list[str]) -> dict[str, Any]:
     kinds = {name: Kind() for name in CASES}
     with ExitStack() as stack:
         feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
-        box, sweeps = SharedLine(before, [f"feed.socket={feed}"]), Script(1)
+        box, sweeps = SharedLine(before, [f"store.runtime={feed.parent}"]), Script(1)
         stack.callback(box.close)
         box.start(1, sweeps)
         listener = LatencyListener(box, sweeps)

@@ -111,8 +111,8 @@ def sides(
     """Both boxes, started."""
     found = {}
     for name, box in (
-        ("alone", ThisMachine(before, ["feed.socket="])),
-        ("attacked", SharedLine(before, [f"feed.socket={feed}"])),
+        ("alone", ThisMachine(before, ["store.runtime="])),
+        ("attacked", SharedLine(before, [f"store.runtime={feed.parent}"])),
     ):
         sweeps = Script(seed)
         sweeps[
@@ -162,7 +162,7 @@ def page_of(feed: Path) -> Iterator[int]:
         "--web",
         "0",
         "--set",
-        f"feed.socket={feed}",
+        f"store.runtime={feed.parent}",
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:

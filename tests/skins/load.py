@@ -139,6 +139,9 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         player = stack.enter_context(playing(name, current.format.rate_hz, link))
         real_time = hurry(BOX)
         settings = config.load(None, sets(name, current.format, link), site=Path("/dev/null"))
+        _, sweep_s, _, every_s = times(current.format)
+        trigger = replace(settings.trigger, sweep_s=float(sweep_s), every_s=float(every_s))
+        settings = replace(settings, trigger=trigger)
         far_end, port = stack.enter_context(pseudo_terminal.pair())
         sink = SerialSink(replace(settings.serial, port=port), clock, "emulator")
         box = assembly.box(settings, current, Devices(clock), sink, stack, observers=[check])
@@ -174,16 +177,19 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
 
 def sets(name: str, format: SweepFormat, link: Path) -> list[str]:
     """Settings of a box with this skin and no lines."""
-    sweep_s = format.window / format.rate_hz + LEAD_S
     chosen = {
-        "sensor.skin": name,
-        "sensor.port": link,
-        "sensor.rate_hz": format.rate_hz,
+        "skin.profile": name,
+        "skin.port": link,
+        "skin.rate_hz": format.rate_hz,
         "trigger.mode": "timed",
-        "trigger.sweep_s": sweep_s,
-        "trigger.every_s": sweep_s + PAUSE_S,
     }
     return [f"{key}={value}" for key, value in chosen.items()]
+
+
+def times(format: SweepFormat) -> list[str]:
+    """Options of `palpate run` for sweeps by the clock that hold a window of this format."""
+    sweep_s = format.window / format.rate_hz + LEAD_S
+    return ["--sweep", str(sweep_s), "--every", str(sweep_s + PAUSE_S)]
 
 
 def _turns(box: Box, far_end: int, seconds: float) -> None:

@@ -225,7 +225,7 @@ def test_what_a_person_put_there_stays(
     """A settings file of theirs is kept and named; a file in the way of the program ends the
     install before anything else."""
     settings, program, pid = (
-        "/etc/palpate/sensor.toml",
+        "/etc/palpate/skin.toml",
         "/usr/local/bin/palpate",
         host.service["MainPID"],
     )
@@ -676,7 +676,7 @@ except fleet.Failed as e:
 
 def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     """Its error is a line without the names of classes, as the box itself says it."""
-    (tmp_path / "sensor.toml").write_text("[sensor]\nbuad = 9600\n")
+    (tmp_path / "skin.toml").write_text("[skin]\nbuad = 9600\n")
     script = run_here("import install; print(install.SELF_TEST)")
     done = subprocess.run(
         [sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True
@@ -685,7 +685,7 @@ def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     assert "buad" in done.stderr
     assert "Error" not in done.stderr
     assert len(done.stderr.splitlines()) == 1
-    shutil.copy(ROOT / "firmware_config" / "sensor.toml", tmp_path)
+    shutil.copy(ROOT / "firmware_config" / "skin.toml", tmp_path)
     assert subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT).returncode == 0
 
 

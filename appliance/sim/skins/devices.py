@@ -32,8 +32,8 @@ class PlayedDevices(RobotDevices):
 
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated lines, and with the terminal as the skin's port."""
-        sensor = replace(settings.sensor, skin=self.name, port=str(self.player.path))
-        return replace(RobotDevices.wire(self, settings), sensor=sensor)
+        skin_config = replace(settings.skin, profile=self.name, port=str(self.player.path))
+        return replace(RobotDevices.wire(self, settings), skin=skin_config)
 
 
 def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:

@@ -70,8 +70,8 @@ def test_options_hold():
     "sets",
     [
         ("bridge.allow_writes=true",),
-        ("feed.socket=",),
-        ("serial.port=/dev/ttyAMA0", "feed.socket="),
+        ("store.runtime=",),
+        ("serial.port=/dev/ttyAMA0", "store.runtime="),
     ],
 )
 def test_no_way_to_the_box(sets: tuple[str, ...]):

@@ -279,7 +279,7 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
     assert commands[2] == "python3 client.py"
     words = [command.replace("/tmp/palpate-line", line).split()[1:] for command in commands[:2]]
     assert [given[0] for given in words] == ["bridge", "run"]
-    quiet = ["--set", "feed.socket=", "--set", "store.status="]
+    quiet = ["--set", "store.runtime="]
     command = [sys.executable, "-m", "appliance", *words[1], *quiet]
     with bridge(words[0][1], *words[0][2:]) as address, subprocess.Popen(command, cwd=ROOT) as run:
         try:
@@ -322,9 +322,7 @@ def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
         "--set",
         f"serial.port={tmp_path / 'line'}",
         "--set",
-        "feed.socket=",
-        "--set",
-        "store.status=",
+        "store.runtime=",
     ]
     with (
         bridge("tcp", "--link", tmp_path / "line", "--allow-writes") as address,

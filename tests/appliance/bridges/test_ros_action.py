@@ -273,9 +273,7 @@ def test_with_the_box_itself(tmp_path: Path):
     the box makes of it."""
     quiet = [
         "--set",
-        "feed.socket=",
-        "--set",
-        "store.status=",
+        "store.runtime=",
         "--set",
         "store.folder=/nonexistent",
     ]

@@ -66,7 +66,7 @@ BROKE = {
     "settings/brackets-in-brackets": "2000 brackets: RecursionError",
     "settings/delete-character": "a text with a control character was taken, and what `palpate config` printed did not load",
     "settings/key-with-a-line-end": "a message of two lines",
-    "settings/number-of-many-digits": "vendor_id of 4817 digits: ValueError while the message was made",
+    "settings/number-of-many-digits": "silence_ms of 4817 digits: ValueError while the message was made",
     "settings/tables-in-tables": "1500 tables in a value: RecursionError while the message was made",
     "settings/zero-character": "a path with a zero was taken: ValueError when the bundle was opened",
     "skin-papillarray/tail-of-a-later-packet": "a changed byte; with the next thirteen packets the sum fitted: a frame of no skin",

@@ -49,14 +49,14 @@ HEALTH = Health(
 @pytest.fixture
 def settings(tmp_path: Path) -> Config:
     """Of a box without deliveries, so that the packaged bundle runs."""
-    store = (f"store.folder={tmp_path}", f"store.status={tmp_path / 'status.json'}")
+    store = (f"store.folder={tmp_path}", f"store.runtime={tmp_path}")
     return config.load(None, store, site=Path("/dev/null"))
 
 
 def streaming(settings: Config, health: Health | None) -> object:
     """What an install learns of a service in this state, None where it does not run."""
     if health:
-        StatusFile(Path(settings.store.status), SystemClock()).turn(health)
+        StatusFile(settings.store.status, SystemClock()).turn(health)
     return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
 
 
@@ -100,7 +100,7 @@ def test_the_command_refuses_it_unless_it_is_told(
         Manifest.parse(held[bundle.MANIFEST]), counter=1, schema=SCHEMA
     ).json()
     folder = box.copied(deliveries.signed(held, box.key))
-    how = {"folder": box.how.folder, "signers": box.how.signers, "status": tmp_path / "status.json"}
+    how = {"folder": box.how.folder, "keys": box.how.keys, "runtime": tmp_path}
     StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
     command = [
         "install",

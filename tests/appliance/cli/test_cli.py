@@ -303,7 +303,7 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
             "--set",
             f"serial.port={tmp_path}/none",
             "--set",
-            "sensor.product_id=1",
+            "skin.usb=1209:0001",
         ]
     )
     lines = {line[6:20].strip(): line for line in capsys.readouterr().out.splitlines()}
@@ -551,7 +551,6 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
             "--every and --sweep are for --trigger timed",
         ),
         (["run", "--every", "3"], ConfigError, "a sweep of 3 s every 3 s leaves no pause"),
-        (["run", "--sweep", "0"], ConfigError, "trigger.sweep_s = 0.0 is not allowed"),
         (
             ["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"],
             ConfigError,
@@ -681,14 +680,14 @@ def test_skin_check_fails_with_a_part(
         (["--seconds", "0"], 2, "0 is no number of seconds that will do; use 1 to 3600"),
         (["--seconds", "long"], 2, "long is no number of seconds"),
         (
-            ["--set", "sensor.link=serial", "--set", "sensor.port=/dev/none"],
+            ["--set", "skin.link=serial", "--set", "skin.port=/dev/none"],
             69,
             "no port /dev/none",
         ),
         (
-            ["--set", "sensor.skin=anyskin"],
+            ["--set", "skin.profile=anyskin"],
             78,
-            'sensor.skin = "anyskin" sends a protocol of its maker (codec "fixed")',
+            'skin.profile = "anyskin" sends a protocol of its maker (codec "fixed")',
         ),
     ],
 )

@@ -37,10 +37,8 @@ def of(box: Delivery) -> list[str]:
     """The options that name the box's store, keys and status."""
     how = {
         "store.folder": box.how.folder,
-        "store.signers": box.how.signers,
-        "store.enrolment_key": box.how.enrolment_key,
-        "store.status": box.folder / "status.json",
-        "feed.socket": box.folder / "feed.sock",
+        "store.keys": box.how.keys,
+        "store.runtime": box.folder,
     }
     return [word for name, value in how.items() for word in ("--set", f"{name}={value}")]
 

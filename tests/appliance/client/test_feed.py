@@ -177,7 +177,7 @@ def test_verdicts_of_a_box_are_read(tmp_path: Path):
 
 def test_its_default_is_the_setting_of_the_box():
     """One path for both."""
-    assert config.FeedConfig().socket == DEFAULT
+    assert str(config.StoreConfig().feed) == DEFAULT
 
 
 def test_a_reader_loads_no_numpy():
@@ -200,7 +200,7 @@ def running(path: Path) -> Iterator[subprocess.Popen]:
         "--sim",
         "skin",
         "--set",
-        f"feed.socket={path}",
+        f"store.runtime={path.parent}",
     ]
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT

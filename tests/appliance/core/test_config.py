@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.core import config
+from appliance.core import config, schema
 from appliance.core.errors import ConfigError
 from tests.factories.paths import ROOT
 
@@ -25,9 +25,9 @@ BOARDS = sorted(path.stem.removeprefix("board-") for path in FIRMWARE.glob("boar
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with `sensor.toml`, two boards and an empty `palpate.toml`."""
-    (tmp_path / "sensor.toml").write_text(
-        "[sensor]\ntimeout_ms = 50\nretry_ms = 300\n[trigger]\nglitch_us = 100\n"
+    """A folder with `skin.toml`, two boards and an empty `palpate.toml`."""
+    (tmp_path / "skin.toml").write_text(
+        "[skin]\nsilence_ms = 50\nrate_hz = 300\n[trigger]\nglitch_us = 100\n"
     )
     (tmp_path / "board-a.toml").write_text(
         '[trigger]\nstart = "L1"\nstop = "L2"\nglitch_us = 200\n'
@@ -47,25 +47,25 @@ def _shipped(board: str | None = None, *sets: str) -> config.Config:
 
 
 def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
-    """Defaults, sensor.toml, board, site and --set each decide one value; of two --set the last
+    """Defaults, skin.toml, board, site and --set each decide one value; of two --set the last
     wins."""
-    (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nstorm_edges = 50\n")
+    (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nactive_low = true\n")
     c = _load(
         folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0"
     )
     assert (c.board, c.sources["board"]) == ("a", "--board")
     got = {
-        "sensor.silence_ms": (c.sensor.silence_ms, 500, "code"),
-        "sensor.timeout_ms": (c.sensor.timeout_ms, 50, "sensor.toml"),
+        "output.settle_us": (c.output.settle_us, 200, "code"),
+        "skin.silence_ms": (c.skin.silence_ms, 50, "skin.toml"),
         "trigger.start": (c.trigger.start, "L1", "board-a.toml"),
-        "trigger.storm_edges": (c.trigger.storm_edges, 50, "palpate.toml"),
+        "trigger.active_low": (c.trigger.active_low, True, "palpate.toml"),
         "trigger.glitch_us": (c.trigger.glitch_us, 400, "--set"),
         "serial.port": (c.serial.port, "/dev/ttyUSB0", "--set"),
     }
     for name, (value, want, source) in got.items():
         assert (value, c.sources[name]) == (want, source), name
     assert len(c.sources) == 1 + sum(
-        len(dataclasses.fields(getattr(c, s))) for s in config.Config.__slots__[1:-2]
+        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-2]
     )
 
 
@@ -77,7 +77,7 @@ def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path
 
 
 def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
-    """Without sensor.toml the defaults apply, and no line is wired."""
+    """Without skin.toml the defaults apply, and no line is wired."""
     (tmp_path / "palpate.toml").write_text("")
     c = _load(tmp_path)
     assert set(c.sources.values()) == {"code"}
@@ -89,28 +89,28 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
     """Sections are frozen and the sources are read-only."""
     c = _load(folder)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        c.sensor.timeout_ms = 1  # type: ignore[misc]
+        c.skin.silence_ms = 1  # type: ignore[misc]
     with pytest.raises(TypeError):
-        c.sources["sensor.timeout_ms"] = "me"  # type: ignore[index]
+        c.sources["skin.silence_ms"] = "me"  # type: ignore[index]
 
 
 @pytest.mark.parametrize(
     ("text", "name", "hint"),
     [
         ("[trigger]\nglich_us = 3", "trigger.glich_us", "did you mean trigger.glitch_us?"),
-        ("[sensor]\nqueue = 9", "sensor.queue", "did you mean serial.queue?"),
+        ("[skin]\nsettle_us = 9", "skin.settle_us", "did you mean output.settle_us?"),
         ("[triger]\nmode = 'one-line'", "triger", "did you mean trigger?"),
-        ("[gpio]\nx = 1", "gpio", "known are sensor, trigger, output, sweep, serial, classifier"),
-        ("queue = 9", "queue", "did you mean serial.queue?"),
-        ("sensor = 5", "sensor = 5", "write [sensor], its keys below"),
+        ("[gpio]\nx = 1", "gpio", "known are skin, trigger, output, sweep, serial, classifier"),
+        ("settle_us = 9", "settle_us", "did you mean output.settle_us?"),
+        ("skin = 5", "skin = 5", "write [skin], its keys below"),
         ("[trigger]\nglitch_us = 0", "trigger.glitch_us = 0", "a whole number from 1 to 1000000"),
         ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),
         ("[trigger]\nactive_low = 1", "trigger.active_low = 1", "true or false"),
         ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
         (
-            "[trigger]\nbias = ['pull-up']",
-            "trigger.bias = ['pull-up']",
-            'one of "pull-down", "pull-up"',
+            "[classifier]\nfuse = ['vote']",
+            "classifier.fuse = ['vote']",
+            'one of "product", "vote"',
         ),
         ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
         ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
@@ -129,21 +129,14 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
             "sweep.max_duration_s = nan",
             "a number from 0.1 to 3600.0",
         ),
-        (
-            "[sensor]\nread_bytes = 1000",
-            "sensor.read_bytes = 1000",
-            "a multiple of 512 from 512 to 1048576",
-        ),
-        (
-            "[sensor]\nproduct_id = 0x10000",
-            "sensor.product_id = 65536",
-            "a whole number from 1 to 65535",
-        ),
-        ("[sensor\nserial = 1", "not TOML", "line 1"),
-        ("[sensor]\n\nlink = vendor", "not TOML", "line 3"),
+        ("[skin]\nusb = '1209'", "skin.usb = '1209'", 'USB ids such as "1209:7ac7"'),
+        ("[skin]\nusb = 0x1209", "skin.usb = 4617", 'USB ids such as "1209:7ac7"'),
+        ("[skin]\ntimeout_ms = 9", "skin.timeout_ms is unknown", "did you mean skin."),
+        ("[skin\nport = 1", "not TOML", "line 1"),
+        ("[skin]\n\nlink = vendor", "not TOML", "line 3"),
     ],
 )
-@pytest.mark.parametrize("file", ["sensor.toml", "board-a.toml", "palpate.toml"])
+@pytest.mark.parametrize("file", ["skin.toml", "board-a.toml", "palpate.toml"])
 def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
     folder: Path, file: str, text: str, name: str, hint: str
 ) -> None:
@@ -161,7 +154,7 @@ def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
     [
         ("trigger.glich_us=3", "--set: trigger.glich_us", "did you mean trigger.glitch_us?"),
         ("serial.baud=fast", "--set: serial.baud = 'fast'", "a whole number from 1200 to 4000000"),
-        ("sensor.serial=1234", "--set: sensor.serial = 1234", "a string in quotes"),
+        ("skin.grid=1234", "--set: skin.grid = 1234", "a string in quotes"),
         ("glitch_us=3", "--set glitch_us=3", "use --set section.key=value"),
     ],
 )
@@ -176,7 +169,7 @@ def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint:
     [
         ("trigger.start=GPIO5", "trigger", "start", "GPIO5"),
         ("trigger.start=", "trigger", "start", ""),
-        ('sensor.serial="1234"', "sensor", "serial", "1234"),
+        ('skin.grid="1234"', "skin", "grid", "1234"),
         ("sweep.max_duration_s=3", "sweep", "max_duration_s", 3.0),
         ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
         ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
@@ -204,10 +197,10 @@ def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> N
 
 
 def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
-    """`board` in sensor.toml would be read too late."""
-    (folder / "sensor.toml").write_text('board = "a"\n')
+    """`board` in skin.toml would be read too late."""
+    (folder / "skin.toml").write_text('board = "a"\n')
     with pytest.raises(
-        ConfigError, match=r"sensor\.toml: board is chosen in .*palpate\.toml, or with --board"
+        ConfigError, match=r"skin\.toml: board is chosen in .*palpate\.toml, or with --board"
     ):
         _load(folder)
 
@@ -231,12 +224,12 @@ def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
         config.load(None, folder=folder, site=folder / "other.toml")
     with pytest.raises(ConfigError, match="cannot be read: is a directory"):
         config.load(None, folder=folder, site=folder)
-    (folder / "sensor.toml").write_bytes(b'[sensor]\nserial = "\xff"\n')
-    with pytest.raises(ConfigError, match=r"sensor\.toml: not TOML: .*utf-8"):
+    (folder / "skin.toml").write_bytes(b'[skin]\ngrid = "\xff"\n')
+    with pytest.raises(ConfigError, match=r"skin\.toml: not TOML: .*utf-8"):
         _load(folder)
 
 
-_NAMES = ["sensor.serial", "serial.baud", "output.class_bits", "trigger.mode", "x.y"]
+_NAMES = ["skin.grid", "skin.usb", "serial.baud", "output.class_bits", "trigger.mode", "x.y"]
 
 
 @pytest.mark.slow
@@ -252,7 +245,7 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
     """The printed text is a palpate.toml with the same settings."""
     sets = [
         "output.class_bits=['A', 'B']",
-        "sensor.serial=Ü𝄞 \\",
+        "skin.grid=Ü𝄞 \\",
         "sweep.max_duration_s=3",
         "trigger.active_low=true",
     ]
@@ -262,7 +255,7 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
     shown = {" ".join(line.split()) for line in lines}
     assert shown > {
         'board = "a" # --board',
-        "sensor.vendor_id = 0x1209 # code",
+        'skin.usb = "1209:7ac7" # code',
         'trigger.start = "L1" # board-a.toml',
     }
     (folder / "palpate.toml").write_text("\n".join(lines))
@@ -270,20 +263,34 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
 
 
 @pytest.mark.parametrize(
+    ("usb", "ids"),
+    [
+        ("1209:7ac7", (0x1209, 0x7AC7, "")),
+        ("2E8A:0005:E661:4", (0x2E8A, 5, "E661:4")),
+    ],
+)
+def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, str]) -> None:
+    """One setting holds both."""
+    skin = _load(folder, None, f"skin.usb={usb}").skin
+    assert (skin.vendor_id, skin.product_id, skin.serial) == ids
+
+
+@pytest.mark.parametrize(
     "section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")]
 )
 def test_each_field_is_explained(section: str) -> None:
-    """Every field's name stands in the docstring of its group."""
+    """The name of each setting stands in the docstring of its group."""
     group = type(getattr(_shipped(), section))
     assert [
-        f.name for f in dataclasses.fields(group) if not re.search(rf"\b{f.name}\b", group.__doc__)
+        name for name in schema.keys(group) if not re.search(rf"\b{name}\b", group.__doc__)
     ] == []
 
 
-def test_sensor_toml_shows_every_sensor_setting_as_the_code_has_it() -> None:
-    """The shipped sensor.toml is complete and changes nothing."""
-    table = tomllib.loads((FIRMWARE / "sensor.toml").read_text())
-    assert table == {"sensor": dataclasses.asdict(config.SensorConfig())}
+def test_skin_toml_shows_every_skin_setting_as_the_code_has_it() -> None:
+    """The shipped skin.toml is complete and changes nothing."""
+    table = tomllib.loads((FIRMWARE / "skin.toml").read_text())
+    known = schema.keys(config.SkinConfig)
+    assert table == {"skin": {name: key.default for name, key in known.items()}}
 
 
 HEADER = {
@@ -383,12 +390,10 @@ def test_one_cable_fits_both_boards() -> None:
 def test_rules_and_unit_agree_with_the_settings() -> None:
     """The udev rules carry the sensor's ids, and the unit's groups are those that sysusers makes
     and the rules use."""
-    sensor = config.SensorConfig()
+    skin = config.SkinConfig()
     rules = (FIRMWARE / "70-palpate.rules").read_text()
     assert (
-        rules.count(f'=="{sensor.vendor_id:04x}"')
-        == rules.count(f'=="{sensor.product_id:04x}"')
-        == 2
+        rules.count(f'=="{skin.vendor_id:04x}"') == rules.count(f'=="{skin.product_id:04x}"') == 2
     )
     unit, users = (
         (ROOT / "systemd" / f"palpate.{kind}").read_text() for kind in ("service", "sysusers")

@@ -232,7 +232,7 @@ def test_serial_number_chooses(need: Need):
     was found."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
-    with SensorReader(u, serial="0043") as reader:
+    with SensorReader(u, usb=f"{u.sensor.usb[:9]}:0043") as reader:
         reader.state("absent")
         assert len(reader.seconds(0.3)) == 0
         assert "serial number 0043" in str(reader.sensor.trouble)

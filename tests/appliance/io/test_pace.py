@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import usb.core
 
-from appliance.core.config import SensorConfig, SweepConfig
+from appliance.core.config import SkinConfig, SweepConfig
 from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, SweepFormat
 from appliance.io import packets as wire
 from appliance.io.usb_sensor import UsbSensor
@@ -30,7 +30,7 @@ Alter = Callable[[wire.Packet, wire.Packet], tuple[int, int]]
 
 def sensor_on(simulated: SimDevices, **settings) -> UsbSensor:
     """The real driver on the simulated bus."""
-    return UsbSensor(SensorConfig(**settings), FMT, simulated.clock, simulated.backend)
+    return UsbSensor(SkinConfig(**settings), FMT, simulated.clock, simulated.backend)
 
 
 def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[Frames, set[str]]:
@@ -151,7 +151,7 @@ def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
     rng = np.random.default_rng(8)
     format = SweepFormat(4, 4, rate_hz, 1500, "uint8")
     simulated = idle_devices(60, format, packet_frames=packet_frames)
-    sensor = UsbSensor(SensorConfig(silence_ms=2000), format, simulated.clock, simulated.backend)
+    sensor = UsbSensor(SkinConfig(silence_ms=2000), format, simulated.clock, simulated.backend)
     alter(
         simulated,
         lambda p, first: (p.seq, (p.t_us + int(rng.integers(0, 4000))) // 1000 * 1000),
@@ -192,7 +192,7 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
         return control(handle, kind, request, value, index, data, ms)
 
     backend.ctrl_transfer = spoken
-    sensor = sensor_on(simulated, serial="SIM0001")
+    sensor = sensor_on(simulated, usb="1209:7ac7:SIM0001")
     read_for(sensor, simulated, 1)
     assert sensor.state == state
     assert "udev" not in str(sensor.trouble) or state == "absent"

@@ -17,7 +17,7 @@ import pytest
 import serial
 
 from appliance.core.clock import SystemClock
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import (
     SensorAbsent,
     SensorBusy,
@@ -59,7 +59,7 @@ def board() -> Iterator[SerialBoard]:
 
 def sensor_on(board: SerialBoard, format: SweepFormat = FMT, **settings) -> UsbSensor:
     """The driver on the board's port."""
-    return UsbSensor(SensorConfig(port=str(board.path), **FAST | settings), format, CLOCK)
+    return UsbSensor(SkinConfig(port=str(board.path), **FAST | settings), format, CLOCK)
 
 
 def read_until(sensor: UsbSensor, done: Callable[[int], bool]) -> Frames:
@@ -236,7 +236,7 @@ def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: p
     [
         (errno.EBUSY, SensorBusy, "fuser"),
         (errno.EACCES, SensorDenied, "group dialout"),
-        (errno.ENOENT, SensorAbsent, "sensor.port"),
+        (errno.ENOENT, SensorAbsent, "skin.port"),
         (errno.EIO, SensorLost, "baud rate"),
     ],
 )
@@ -272,8 +272,8 @@ def test_ids_find_the_port(tmp_path: Path):
 
 
 def test_the_configured_ids_are_looked_for():
-    """Without sensor.port the ids of the settings choose."""
-    config = SensorConfig(link="serial", vendor_id=0x2E8A, product_id=5)
+    """Without skin.port the ids of the settings choose."""
+    config = SkinConfig(link="serial", usb="2e8a:0005")
     with pytest.raises(SensorAbsent, match="2e8a:0005"):
         serial_link.open_board(config, CLOCK, lambda: [PortInfo("/dev/ttyACM0", 0x1209, 0x7AC7)])
     with pseudo_terminal.pair() as (_, name):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.types import EPOCH_BITS
 from appliance.io.serial_sensor import SerialSensor
 from tests.factories.skin_wires import NAMES, PATH, WiredSkin, profile, taxels, wire
@@ -118,7 +118,7 @@ def test_absent_is_found_by_its_ids(name: str):
     else:
         assert skin.sensor.state == "absent"
         assert "/dev/serial/by-id/skin (1a86:7523" in str(skin.sensor.trouble)
-        assert "sensor.port" in str(skin.sensor.trouble)
+        assert "skin.port" in str(skin.sensor.trouble)
 
 
 @each
@@ -231,7 +231,7 @@ def test_wrong_rate(name: str, rate: float):
     else:
         figure = float(seen[0].split("sends ")[1].split(" frames")[0])
         assert figure == pytest.approx(rate * skin.format.rate_hz, rel=0.05)
-        assert "sensor.rate_hz" in seen[0]
+        assert "skin.rate_hz" in seen[0]
     skin.port.period_ns = skin.format.period_ns  # somebody corrects it
     skin.port.begun_ns = skin.clock.now_ns() - round(skin.port._next * skin.port.period_ns)
     skin.port.frames = lambda i: wire(name, i, skin.port.period_ns)
@@ -334,7 +334,7 @@ def test_commands(name: str):
 
 
 def test_tare():
-    """With sensor.tare the command goes out after those of the start. While it lasts no frame is
+    """With skin.tare the command goes out after those of the start. While it lasts no frame is
     passed on, and the skin does not count as streaming."""
     skin = WiredSkin("papillarray", tare=True)
     assert len(skin.seconds(1.9)) == 0
@@ -419,7 +419,11 @@ def test_a_sequence_number_shows_each_loss():
         b"" if i % 50 == 49 else b"\xaa\x55" + bytes([i % 256]) + wire("matrix", i)[2:]
     )
     skin.sensor = SerialSensor(
-        SensorConfig(skin="matrix", port=PATH), p, skin.format, skin.clock, open_port=skin.port.open
+        SkinConfig(profile="matrix", port=PATH),
+        p,
+        skin.format,
+        skin.clock,
+        open_port=skin.port.open,
     )
     frames = skin.seconds(10)
     assert skin.sensor.loss_known

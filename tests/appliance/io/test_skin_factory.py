@@ -38,7 +38,7 @@ def test_each_profile_has_its_sensor_and_form(name: str):
     """Skins of other protocols are read from a serial port; the form is the profile's, without
     asking anything."""
     simulated = idle_devices()
-    chosen = settings(f"sensor.skin={name}")
+    chosen = settings(f"skin.profile={name}")
     assert skins.announced(chosen, simulated) == profile(name).format
     assert isinstance(skins.sensor(chosen, profile(name).format, simulated), SerialSensor)
 
@@ -46,14 +46,14 @@ def test_each_profile_has_its_sensor_and_form(name: str):
 def test_the_protocol_has_the_old_sensor():
     """palpate is read as before, and its board is asked for the form."""
     simulated = idle_devices()
-    chosen = simulated.wire(settings("sensor.skin=flexitac", "sensor.grid=3x3"))
+    chosen = simulated.wire(settings("skin.profile=flexitac", "skin.grid=3x3"))
     assert isinstance(skins.sensor(chosen, skin.FORMAT, simulated), UsbSensor)
     assert skins.announced(chosen, simulated) == skin.FORMAT
 
 
 def test_a_rate_that_can_be_set_is_that_of_the_bundle():
     """A bundle for 250 Hz sets a skin that can do that; another rate is not promised."""
-    simulated, chosen = idle_devices(), settings("sensor.skin=papillarray")
+    simulated, chosen = idle_devices(), settings("skin.profile=papillarray")
     wanted = SweepFormat(3, 3, 250, 500, "float32", 3)
     assert skins.announced(chosen, simulated, wanted) == wanted
     assert skins.announced(chosen, simulated, replace(wanted, rate_hz=300)).rate_hz == 1000
@@ -75,7 +75,7 @@ def test_a_form_that_a_person_describes():
 def test_a_wrong_profile_is_named():
     """Nothing is guessed."""
     with pytest.raises(ConfigError, match="did you mean flexitac"):
-        skins.sensor(settings("sensor.skin=flexitak"), skin.FORMAT, idle_devices())
+        skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_on_a_real_terminal(playing: str):
     """The real pyserial on a real terminal: frames as they were sent; the port is free again after
     that."""
     clock = SystemClock()
-    chosen = settings("sensor.skin=flexitac", f"sensor.port={playing}")
+    chosen = settings("skin.profile=flexitac", f"skin.port={playing}")
     known = {taxels(profile("flexitac"), i).tobytes() for i in range(199)}
     for _ in range(2):
         with closing(

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.core import config
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import ConfigError
 from appliance.core.types import SweepFormat
 from appliance.io import skin_profile, skins
@@ -63,7 +63,7 @@ def written(tmp_path: Path, text: str) -> Path:
             'about = "a"\nsource = "s"\ncodec = "robotiq-tsf"\nnumber = "uint16"\n',
             "neither one finger",
         ),
-        ('about = "a"\nsource = "s"\ncodec = "palpate"\nusb_ids = ["1a86:7523"]', "sensor.link"),
+        ('about = "a"\nsource = "s"\ncodec = "palpate"\nusb_ids = ["1a86:7523"]', "skin.link"),
         ("about = a", "not TOML"),
         ("x = [" * 3000, "not TOML"),
     ],
@@ -82,7 +82,7 @@ def test_names(tmp_path: Path):
     palpate needs no file; a file is named by its ending."""
     folder = written(tmp_path, GOOD)
     with pytest.raises(
-        ConfigError, match=r"sensor\.skin = 'oven' has no profile in .*did you mean own"
+        ConfigError, match=r"skin\.profile = 'oven' has no profile in .*did you mean own"
     ):
         load("oven", [folder])
     for name in ("../own", ""):
@@ -163,19 +163,19 @@ def test_what_each_lacks():
 )
 def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepFormat):
     """Grid and rate come from the settings where they are set."""
-    assert adapted(profile(name), SensorConfig(**settings)).format == wanted
+    assert adapted(profile(name), SkinConfig(**settings)).format == wanted
 
 
 @pytest.mark.parametrize(
     ("name", "settings", "hint"),
     [
-        ("flexitac", {"grid": "12*32"}, "sensor.grid = '12*32' is not allowed; use rows x columns"),
+        ("flexitac", {"grid": "12*32"}, "skin.grid = '12*32' is not allowed; use rows x columns"),
         ("flexitac", {"grid": "0x4"}, "rows x columns"),
         ("flexitac", {"grid": "300x4"}, "rows x columns"),
         (
             "papillarray",
             {"rate_hz": 300.0},
-            "sensor.rate_hz = 300 cannot be set on this skin; use one of 100, 250",
+            "skin.rate_hz = 300 cannot be set on this skin; use one of 100, 250",
         ),
         ("robotiq-tsf", {"grid": "5x5"}, "neither one finger"),
     ],
@@ -183,7 +183,7 @@ def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepForma
 def test_settings_that_do_not_fit(name: str, settings: dict, hint: str):
     """The setting is named with what is allowed."""
     with pytest.raises(ConfigError) as e:
-        adapted(profile(name), SensorConfig(**settings))
+        adapted(profile(name), SkinConfig(**settings))
     assert hint in str(e.value)
 
 
@@ -191,7 +191,7 @@ def test_grid_is_not_for_the_protocol():
     """A board of PROTOCOL.md says itself what it sends."""
     for settings in ({"grid": "4x4"}, {"rate_hz": 100.0}):
         with pytest.raises(ConfigError, match="speaks PROTOCOL"):
-            adapted(SkinProfile(), SensorConfig(**settings))
+            adapted(SkinProfile(), SkinConfig(**settings))
 
 
 def test_commands():
@@ -213,7 +213,7 @@ def test_slow_skins_are_warned_of():
 def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """`/etc/palpate/skins` goes before what is delivered."""
     monkeypatch.setattr(skins, "OWN", written(tmp_path, GOOD))
-    settings = config.load(None, ["sensor.skin=own", "sensor.grid=2x3"], site=NO_SITE)
+    settings = config.load(None, ["skin.profile=own", "skin.grid=2x3"], site=NO_SITE)
     assert settings.folder == ROOT / "firmware_config"
     assert (skins.profile(settings).rows, skins.profile(settings).cols) == (2, 3)
 

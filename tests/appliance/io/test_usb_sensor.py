@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import usb.core
 
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets
 from appliance.io.usb_sensor import UsbSensor
@@ -22,9 +22,7 @@ FMT = skin.FORMAT
 def sensor_on(simulated: SimDevices, format: SweepFormat = FMT, **settings) -> UsbSensor:
     """The real driver on the simulated bus."""
     link = "acm" if simulated.backend.acm else "vendor"
-    return UsbSensor(
-        SensorConfig(link=link, **settings), format, simulated.clock, simulated.backend
-    )
+    return UsbSensor(SkinConfig(link=link, **settings), format, simulated.clock, simulated.backend)
 
 
 def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> Frames:
@@ -129,7 +127,7 @@ def test_serial_number_that_cannot_be_read(code: int):
     """A board whose descriptors may not be read is denied or failing, not absent."""
     simulated = idle_devices()
     simulated.backend.errors["control"] = code
-    sensor = sensor_on(simulated, serial="SIM0001")
+    sensor = sensor_on(simulated, usb="1209:7ac7:SIM0001")
     read_for(sensor, simulated, 0.3)
     assert sensor.state in ("denied", "lost")
     assert "absent" not in str(sensor.trouble)
@@ -333,10 +331,10 @@ def test_frames_of_another_form_than_announced():
 def test_no_fitting_interface():
     """A CDC-ACM board where a vendor device is configured: the message names the setting."""
     simulated = idle_devices(acm=True)
-    sensor = UsbSensor(SensorConfig(link="vendor"), FMT, simulated.clock, simulated.backend)
+    sensor = UsbSensor(SkinConfig(link="vendor"), FMT, simulated.clock, simulated.backend)
     read_for(sensor, simulated, 0.3)
     assert sensor.state == "mismatch"
-    assert "sensor.link" in str(sensor.trouble)
+    assert "skin.link" in str(sensor.trouble)
 
 
 def test_acm_board_that_never_answers():

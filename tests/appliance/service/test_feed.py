@@ -617,7 +617,7 @@ def test_a_path_that_cannot_be_bound_is_told_once(tmp_path: Path, logged: list[s
     offered = Offered(tmp_path / "run" / "feed.sock")
     offered.turns(2000)
     assert len(logged) == 1
-    assert "No such file or directory; classifying goes on; see feed.socket" in logged[0]
+    assert "No such file or directory; classifying goes on; see store.runtime" in logged[0]
     offered.path.parent.mkdir()
     offered.path.write_text("mine")
     offered.turns(2000)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from appliance.cli.main import main
-from appliance.core.config import SensorConfig
+from appliance.core.config import SkinConfig
 from appliance.core.errors import SensorLost, SensorMismatch
 from appliance.io import packets
 from appliance.io.usb_sensor import open_link
@@ -41,7 +41,7 @@ Fault = Callable[[SimDevices], object]
 
 def findings(simulated: SimDevices, seconds: float = 5) -> dict[str, PartResult]:
     """The findings of a board on the simulated bus, in their order."""
-    config = SensorConfig(link="acm" if simulated.backend.acm else "vendor")
+    config = SkinConfig(link="acm" if simulated.backend.acm else "vendor")
     link = open_link(config, simulated.backend, simulated.clock)
     found = list(skin_check.check(link, simulated.clock, seconds, port=False))
     link.close()
@@ -383,7 +383,7 @@ def of_a_port(
 ) -> dict[str, tuple[str, str]]:
     """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial
     port."""
-    sets = ("--set", "sensor.link=serial", "--set", f"sensor.port={port}")
+    sets = ("--set", "skin.link=serial", "--set", f"skin.port={port}")
     ended = main(["skin", "check", *sets, *options])
     lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
     assert ended == any(line[0] == "FAIL" for line in lines)

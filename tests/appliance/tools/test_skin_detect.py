@@ -37,12 +37,12 @@ def test_every_skin_is_found(name: str, rate: float):
     port = WirePort(clock, lambda i: wire(name, i), p.format.period_ns / rate)
     found = found_on(port, clock)
     assert found.profile == name
-    assert f'sensor.skin = "{name}", sensor.port = "/dev/ttyUSB0"' in found.detail
+    assert f'skin.profile = "{name}", skin.port = "/dev/ttyUSB0"' in found.detail
     assert port.sent == []
     assert not port.is_open
     hz = float(found.detail.split(" at ")[1].split(" Hz")[0])
     assert hz == pytest.approx(p.rate_hz * rate, rel=0.03)
-    assert ("sensor.rate_hz" in found.detail) == (rate != 1 and not p.rates_hz)
+    assert ("skin.rate_hz" in found.detail) == (rate != 1 and not p.rates_hz)
 
 
 def test_ids_come_first():
@@ -57,7 +57,7 @@ def test_another_grid_of_a_known_skin():
     clock = VirtualClock()
     port = WirePort(clock, lambda i: b"\xaa\x55" + bytes((i + k) % 160 for k in range(384)), 1e7)
     found = found_on(port, clock)
-    assert "384 taxels a frame; set sensor.grid" in found.detail
+    assert "384 taxels a frame; set skin.grid" in found.detail
     assert "if it is another skin, describe it with `palpate skin new`" in found.detail
     assert found.profile in ("flexitac", "matrix")
 
@@ -88,7 +88,7 @@ def test_a_board_of_the_protocol_has_to_be_asked():
     found = found_on(port, clock, write=True)
     assert found.profile == "palpate"
     assert "board pico 7 speaks PROTOCOL.md" in found.detail
-    assert 'sensor.link = "serial"' in found.detail
+    assert 'skin.link = "serial"' in found.detail
 
 
 @pytest.mark.parametrize(

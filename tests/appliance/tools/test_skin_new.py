@@ -150,7 +150,7 @@ def test_emulated_skins_are_described_and_read_again(
     profile is written."""
     with played(name) as player:
         common = ["skin", "new", "mine", "--seconds", "2", "--out", str(tmp_path)]
-        common += ["--port", str(player.path), "--set", "sensor.baud=115200"]
+        common += ["--port", str(player.path), "--baud", "115200"]
         assert main(common) == 0
         assert not list(tmp_path.iterdir())
         told = capsys.readouterr()
@@ -165,7 +165,7 @@ def test_emulated_skins_are_described_and_read_again(
     out, err = capsys.readouterr()
     path = tmp_path / "mine.toml"
     assert out.splitlines()[-1].endswith(f"use it with --skin {path}")
-    assert skins.profile(config.load(None, [f"sensor.skin={path}"])) == written
+    assert skins.profile(config.load(None, [f"skin.profile={path}"])) == written
     frames = int(re.search(r"mine.toml: (\d+) frames", out)[1])
     assert frames > 0.5 * 2 * Numbered(name).rate_hz
     assert "already" in err
@@ -214,8 +214,8 @@ def test_clock_of_the_command_is_the_systems() -> None:
                     "1",
                     "--port",
                     str(player.path),
-                    "--set",
-                    "sensor.baud=115200",
+                    "--baud",
+                    "115200",
                 ]
             )
             == 0

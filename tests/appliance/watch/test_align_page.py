@@ -257,7 +257,7 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
 def test_the_picture_shows_which_end_is_the_fingertip(
     browser: Any, page: PageServer, side: str, at: str
 ):
-    """A cap at the side that `sensor.fingertip` names; where it is not set, the page says how to
+    """A cap at the side that `skin.fingertip` names; where it is not set, the page says how to
     find it out."""
     seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
     seen.state("off")

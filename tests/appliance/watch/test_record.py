@@ -453,7 +453,7 @@ def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
     """As the watch page: without the token an order is not even looked at, over plain HTTP
     neither."""
     page_secrets(tmp_path / "secrets")
-    settings = WatchConfig(address="0.0.0.0", names="localhost", folder=str(tmp_path / "secrets"))
+    settings = WatchConfig(address="0.0.0.0 localhost", folder=str(tmp_path / "secrets"))
     token = (tmp_path / "secrets" / "token").read_text().strip()
     one = RecordedPage(tmp_path / "sweeps", Labels(), access=Access.configured(settings, 0))
     trusts = ssl.create_default_context(cafile=tmp_path / "secrets" / "certificate.pem")
@@ -488,7 +488,7 @@ def test_the_command_records_what_its_page_orders(tmp_path: Path):
         "--web",
         "0",
     ]
-    options = ["--out", str(tmp_path), "--set", "feed.socket="]
+    options = ["--out", str(tmp_path), "--set", "store.runtime="]
     with subprocess.Popen(
         [*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
     ) as run:

@@ -53,7 +53,7 @@ def guarded(
     """A page on the network, as `make install` sets it up: it, its token, and what a browser that
     trusts it has."""
     page_secrets(folder)
-    settings = WatchConfig(address="0.0.0.0", names="localhost", folder=str(folder))
+    settings = WatchConfig(address="0.0.0.0 localhost", folder=str(folder))
     token = (folder / "token").read_text().strip()
     with PageServer("watch.html", Access.configured(settings, 0), now_ns) as one:
         one.publish("view", {"number": 1})
@@ -459,7 +459,7 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path)
     (tmp_path / "token").write_text("0123456789abcdef0123456789abcdef\n")
     with pytest.raises(ConfigError, match=r"certificate.pem and key.pem cannot be used"):
         PageServer("watch.html", Access.configured(network, 0), now_ns)
-    with pytest.raises(ConfigError, match=r"watch.address 'tablet' is no IP address"):
+    with pytest.raises(ConfigError, match=r"watch.address: 'tablet' is not an IP address"):
         Access.configured(WatchConfig(address="tablet"), 0)
     assert Access.configured(WatchConfig(), 0) == Access(0)
 

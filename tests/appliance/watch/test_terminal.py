@@ -329,5 +329,5 @@ def test_json_passes_the_lines_on(offered: Offered, monkeypatch: pytest.MonkeyPa
 
 def test_a_feed_that_is_off_cannot_be_watched(capsys: pytest.CaptureFixture[str]) -> None:
     """The message names the setting."""
-    assert main(["watch", "--set", "feed.socket="]) == ConfigError.exit_code
-    assert 'feed.socket = "" turns the feed off' in capsys.readouterr().err
+    assert main(["watch", "--set", "store.runtime="]) == ConfigError.exit_code
+    assert 'store.runtime = "" turns the feed off' in capsys.readouterr().err

@@ -179,7 +179,7 @@ def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
         "--web",
         "0",
         "--set",
-        f"feed.socket={tmp_path}/none.sock",
+        f"store.runtime={tmp_path}/none",
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         address = re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1]

@@ -23,7 +23,7 @@ SEED, SWEEPS = 3, 2
 
 def settings(name: str) -> config.Config:
     """The settings of a box with this skin."""
-    return config.load(None, [f"sensor.skin={name}"], site=NO_SITE)
+    return config.load(None, [f"skin.profile={name}"], site=NO_SITE)
 
 
 @pytest.mark.slow
