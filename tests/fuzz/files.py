@@ -73,12 +73,9 @@ def _values(got: config.Config) -> Iterator[tuple[str, Any, Any, str]]:
         group = getattr(got, section.name)
         if is_dataclass(group):
             for field in fields(group):
-                yield (
-                    f"{section.name}.{field.name}",
-                    getattr(group, field.name),
-                    field,
-                    str(field.type),
-                )
+                if "fixed" not in field.metadata:
+                    name, value = f"{section.name}.{field.name}", getattr(group, field.name)
+                    yield name, value, field, str(field.type)
 
 
 def _names_the_place(message: str, data: bytes) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import FILE_KEYS
-from appliance.core import config, sentences
+from appliance.core import config, schema, sentences
 from appliance.core.types import (
     DATA_TYPES,
     Edge,
@@ -234,7 +234,7 @@ def words(target: str) -> Sequence[bytes]:
             for f in fields(config.Config)
         }
         sections = {name: group for name, group in groups.items() if is_dataclass(group)}
-        keys = [f.name for group in sections.values() for f in fields(group)]
+        keys = [key for group in sections.values() for key in schema.keys(group)]
         odd = [
             "board = ",
             " = ",
