@@ -119,7 +119,7 @@ def settings_tables() -> str:
         about, meanings = described(group)
         rows = "".join(
             f"| `{name}` | {_default(key)} | {_cell(allowed(key))} "
-            f"| {_cell(meanings.get(name.partition('.')[2]) or _unnamed(name, key))} |\n"
+            f"| {_cell(_meaning(name, key, meanings))} |\n"
             for name, key in config._KEYS.items()
             if name.startswith(f"{section}.")
         )
@@ -142,11 +142,13 @@ def described(group: Any) -> tuple[str, dict[str, str]]:
     return parts[0].strip(), meanings
 
 
-def _unnamed(name: str, key: Key) -> str:
-    """The meaning of a key that its docstring leaves out: GPIO lines are named by their signal."""
-    if "line" not in key.limits:
-        return ""
-    return f"the GPIO line {name.partition('.')[2].upper().replace('_', ' ')}"
+def _meaning(name: str, key: Key, meanings: Mapping[str, str]) -> str:
+    """The meaning of a key; a single GPIO line is named by its signal first."""
+    last = name.partition(".")[2]
+    text = meanings.get(last, "")
+    if "line" not in key.limits or get_origin(key.hint) is tuple:
+        return text
+    return f"{last.upper().replace('_', ' ')}: {text}".rstrip(": ")
 
 
 def _default(key: Key) -> str:
