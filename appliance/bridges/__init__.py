@@ -1,2 +1,2 @@
-"""Bridges from the box to what cells speak: TCP, Modbus TCP, ROS 2. Each is a process of its own
-beside the box."""
+"""Bridges from the box to the protocols of robot cells: TCP, Modbus TCP, ROS 2. Each is a process
+of its own beside the box."""

@@ -1,5 +1,5 @@
-"""`palpate bridge tcp|modbus|ros`: options, and what each starts. In: arguments. Out: an exit
-code."""
+"""`palpate bridge tcp|modbus|ros`: completes the options from the settings and starts the
+bridge."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ EVERY_S = 1.0
 
 
 def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
-    """Take from the settings of the box what no option says. Raises ConfigError where they have no
-    line for the bridge."""
+    """Fill in missing options from the settings of the box. Raises ConfigError if the settings give
+    the bridge no serial line."""
     if args.listen is None:
         args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
@@ -38,11 +38,11 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     elif kind == "modbus" and settings.store.feed and not args.allow_writes:
         args.feed = str(settings.store.feed)
     else:
-        why = " and its feed cannot be written to" if kind == "modbus" else ""
+        why = " and the feed is read-only" if kind == "modbus" else ""
         raise ConfigError(
-            f'serial.port = "{settings.serial.port}" is no line that this bridge can have{why}; '
+            f'serial.port = "{settings.serial.port}" is not a serial line for this bridge{why}; '
             "set serial.port = "
-            f'"{LINKS[kind]}", or name the box\'s line with --port'
+            f'"{LINKS[kind]}", or name the box\'s serial line with --port'
         )
 
 
@@ -53,9 +53,9 @@ def _source(args: argparse.Namespace) -> Source:
 
 
 def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
-    """Name and opener of the box's line."""
+    """Name of the box's serial line, and a function that opens it."""
     if args.link:
-        link = LinkPort(args.link)  # at once, so that a path that cannot be is told at once
+        link = LinkPort(args.link)  # now, so that a wrong path is reported at once
         return str(args.link), lambda: link
     return args.port, partial(open_port, args.port, args.baud)
 
@@ -109,12 +109,12 @@ def run_tcp(args: argparse.Namespace) -> int:
 
 
 def run_ros(args: argparse.Namespace) -> int:
-    """`palpate bridge ros`, until SIGTERM. Raises ConfigError where ROS 2 is not installed."""
+    """`palpate bridge ros`, until SIGTERM. Raises ConfigError if ROS 2 is not installed."""
     try:
         from appliance.bridges import ros
     except ImportError as e:
         raise ConfigError(
-            f"ROS 2 is not there ({e}); source its setup.bash, or install the wheels with the "
+            f"ROS 2 is not installed ({e}); source its setup.bash, or install the wheels with the "
             "extra [ros] of palpate's wheel"
         ) from e
     ros.run(args.ros_args)

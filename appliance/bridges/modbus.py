@@ -1,7 +1,7 @@
-"""The box as a Modbus TCP server. In: a Source. Out: registers, inputs and coils
-(docs/robots/modbus.md).
+"""The box as a Modbus TCP server, with the registers, inputs and coils of docs/robots/modbus.md.
 
-All registers that one request reads are of one moment. A coil is a command: it acts when it rises.
+All registers of one request show the same moment. A coil is a command that is sent when the coil
+rises.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from appliance.bridges.modbus_pdu import (
 )
 from appliance.bridges.server import TcpPeer
 from appliance.bridges.source import BoxView, Source
+from appliance.client.answers import Answer
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.log import log
 from appliance.core.status import Status
 
 VERSION = 1
-"""Of the map: it grows at the end; what is there keeps its meaning."""
+"""Version of the map of registers. It only grows at the end; the meaning of an entry never
+changes."""
 STATES = ("streaming", "absent", "busy", "denied", "mismatch", "silent", "lost")
-"""States of the skin; the code is the place, counted from 1. 0: the box is not heard."""
+"""States of the skin; the code is the index + 1. 0: the box is not heard."""
 STATUS_CODES: Mapping[Status, int] = {status: code for code, status in enumerate(Status, 1)}
 STALE = 99
-"""In place of a status while the box is not heard."""
+"""Status code while the box is not heard."""
 COILS = ("START", "STOP", "NEW", "TARE", "ABORT")
 ORDER = ("ABORT", "NEW", "TARE", "START", "STOP")
 """Order in which the commands of one write are sent."""
@@ -40,23 +42,23 @@ LABEL_WORDS = 16
 IDLE_S = 60.0
 """A connection without a request for this long is closed."""
 PACE_S = 0.005
-"""Rest after each request of a connection: whatever peers do, the other programs of the computer
-keep their share of it."""
+"""Pause after each request of a connection, so that a flood of requests leaves the other programs
+of the computer their share."""
 REQUEST_S = 5.0
-"""Longest time for the rest of a request, and for a peer to take a reply."""
+"""Longest time for the rest of a request, and for a peer to accept a reply."""
 
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """An entry of the map. words: registers that it takes, the highest first. get: its value."""
+    """An entry of the map. words: number of its registers, the highest first. get: its value."""
 
     name: str
     get: Callable[[BoxView], int]
     words: int = 1
 
 
-def _of_answer(get: Callable[[BoxView], float]) -> Callable[[BoxView], int]:
-    return lambda view: round(get(view)) if view.answer else 0
+def _of_answer(get: Callable[[Answer], float]) -> Callable[[BoxView], int]:
+    return lambda view: round(get(view.answer)) if view.answer else 0
 
 
 def _of_state(name: str) -> Callable[[BoxView], int]:
@@ -81,13 +83,13 @@ REGISTERS = (
     Register(
         "likeliest label code", lambda view: view.code(view.answer.label) if view.answer else 0
     ),
-    Register("probability", _of_answer(lambda view: 1000 * view.answer.probability)),  # type: ignore[union-attr]
-    Register("margin", _of_answer(lambda view: 1000 * view.answer.margin)),  # type: ignore[union-attr]
-    Register("latency", _of_answer(lambda view: 100 * view.answer.latency_ms)),  # type: ignore[union-attr]
-    Register("early", _of_answer(lambda view: view.answer.early)),  # type: ignore[union-attr]
-    Register("fused", _of_answer(lambda view: view.answer.fused)),  # type: ignore[union-attr]
-    Register("lost in the window", _of_answer(lambda view: view.answer.lost)),  # type: ignore[union-attr]
-    Register("sweep", _of_answer(lambda view: view.answer.sweep), 2),  # type: ignore[union-attr]
+    Register("probability", _of_answer(lambda answer: 1000 * answer.probability)),
+    Register("margin", _of_answer(lambda answer: 1000 * answer.margin)),
+    Register("latency", _of_answer(lambda answer: 100 * answer.latency_ms)),
+    Register("early", _of_answer(lambda answer: answer.early)),
+    Register("fused", _of_answer(lambda answer: answer.fused)),
+    Register("lost in the window", _of_answer(lambda answer: answer.lost)),
+    Register("sweep", _of_answer(lambda answer: answer.sweep), 2),
     Register("answered", _of_state("answered"), 2),
     Register("frames", _of_state("frames"), 2),
     Register("lost frames", _of_state("lost_frames"), 2),
@@ -110,7 +112,7 @@ COUNTERS = {
     "missed answers",
     "damaged sentences",
 }
-"""These wrap; anything else stays at the largest number that fits."""
+"""Entries that wrap; all others stay at the largest number that fits."""
 
 
 def registers(view: BoxView, *, alive: bool) -> list[int]:
@@ -139,7 +141,7 @@ def inputs(view: BoxView, *, alive: bool) -> list[bool]:
 
 
 class ModbusBridge:
-    """Serves connections. writes: whether coils may be written. One command is under way at a
+    """Serves connections. writes: whether coils may be written. Only one command is sent at a
     time."""
 
     def __init__(self, source: Source, clock: Clock, *, writes: bool) -> None:
@@ -147,7 +149,7 @@ class ModbusBridge:
         self._commanding = asyncio.Lock()
 
     async def serve(self, peer: TcpPeer) -> None:
-        """Answer the requests of one connection until it ends, hangs, or sends something else."""
+        """Answer the requests of one connection until it ends, hangs, or sends invalid bytes."""
         coils = [False] * len(COILS)
         rest = b""
         while data := await peer.read(REQUEST_S if rest else IDLE_S):
@@ -161,7 +163,7 @@ class ModbusBridge:
             await asyncio.sleep(PACE_S * len(found))
 
     async def answer(self, request: ModbusRequest, coils: list[bool]) -> bytes:
-        """The reply's function and data. coils: as this connection has left them."""
+        """The reply's function and data. coils: of this connection; they change with its writes."""
         try:
             wanted = pdu.parse(request.pdu)
             if isinstance(wanted, Reading):

@@ -1,8 +1,5 @@
-"""Modbus TCP as bytes (Modbus Application Protocol V1.1b3; Modbus Messaging on TCP/IP V1.0b). Pure
-functions.
-
-In: bytes of a connection. Out: requests, and replies to them.
-"""
+"""Modbus TCP as bytes, in pure functions: requests from the bytes of a connection, and replies to
+them (Modbus Application Protocol V1.1b3; Modbus Messaging on TCP/IP V1.0b)."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from enum import IntEnum
 from appliance.core.errors import FormatError
 
 HEADER = struct.Struct(">HHHB")
-"""Transaction, protocol (0), bytes that follow, unit."""
+"""Transaction, protocol (0), number of bytes that follow, unit."""
 MOST_PDU = 253
 READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS, WRITE_COIL, WRITE_COILS = 1, 2, 3, 4, 5, 15
 MOST_BITS, MOST_REGISTERS, MOST_COILS = 2000, 125, 1968
@@ -22,7 +19,7 @@ ON, OFF = 0xFF00, 0x0000
 
 
 class ExceptionCode(IntEnum):
-    """Exception codes."""
+    """Exception codes of the application protocol, section 7."""
 
     FUNCTION = 1
     ADDRESS = 2
@@ -32,7 +29,7 @@ class ExceptionCode(IntEnum):
 
 
 class RequestRefused(Exception):
-    """A request is answered with an exception code; no error of the program."""
+    """A request is answered with an exception code. It is not an error of the program."""
 
     def __init__(self, fault: ExceptionCode) -> None:
         super().__init__(fault.name)
@@ -50,7 +47,7 @@ class ModbusRequest:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Bits or registers that are asked for."""
+    """A request for bits or registers."""
 
     function: int
     address: int
@@ -59,7 +56,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Writing:
-    """Coils that are written, from `address` on."""
+    """A request to write coils, from `address` on."""
 
     function: int
     address: int
@@ -69,14 +66,14 @@ class Writing:
 def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes]:
     """The requests in `data`, which continues `rest`, and the new unfinished rest.
 
-    Raises FormatError for what is not Modbus TCP: where the next request would begin is then
-    unknown.
+    Raises FormatError for bytes that are not Modbus TCP, since the beginning of the next request is
+    then unknown.
     """
     data, found = rest + data, []
     while len(data) >= HEADER.size:
         transaction, protocol, length, unit = HEADER.unpack_from(data)
         if protocol or not 2 <= length <= MOST_PDU + 1:
-            raise FormatError(f"{data[: HEADER.size].hex()} is no header of Modbus TCP")
+            raise FormatError(f"{data[: HEADER.size].hex()} is not a header of Modbus TCP")
         end = HEADER.size + length - 1
         if len(data) < end:
             break
@@ -96,8 +93,8 @@ def refusal(pdu: bytes, fault: ExceptionCode) -> bytes:
 
 
 def parse(pdu: bytes) -> Reading | Writing:
-    """What a request wants. Raises RequestRefused: FUNCTION for one that is not served, VALUE for a
-    wrong length or number."""
+    """The content of a request. Raises RequestRefused: FUNCTION for an unsupported function, VALUE
+    for a wrong length or number."""
     function, data = pdu[0], pdu[1:]
     if function in (READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS):
         address, count = _pair(data)
@@ -134,7 +131,7 @@ def _pair(data: bytes) -> tuple[int, int]:
 
 
 def read(wanted: Reading, values: Sequence[int]) -> bytes:
-    """The reply to a reading of these bits or registers. Raises RequestRefused where it reaches
+    """The reply to a request for these bits or registers. Raises RequestRefused if it reaches
     beyond them."""
     chosen = values[wanted.address : wanted.address + wanted.count]
     if len(chosen) < wanted.count:
@@ -148,5 +145,5 @@ def read(wanted: Reading, values: Sequence[int]) -> bytes:
 
 
 def written(pdu: bytes) -> bytes:
-    """The reply to a writing that was carried out: function, address, and value or count."""
+    """The reply to a write that was carried out: function, address, and value or count."""
     return pdu[:5]

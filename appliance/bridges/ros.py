@@ -1,7 +1,6 @@
-"""The box as a ROS 2 node, with a lifecycle. In: its serial line or its feed, parameters. Out:
-verdicts, state, frames, diagnostics and services (docs/robots/ros2.md), in messages that every ROS
-2 has, and the action of palpate_msgs.
-"""
+"""The box as a ROS 2 node with a lifecycle, over its serial line or its feed. Publishes verdicts,
+state, frames and diagnostics in standard messages, and offers services and the action of
+palpate_msgs (docs/robots/ros2.md)."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ ENCODINGS = {
     "uint16": ("16UC", "H", 2),
     "float32": ("32FC", "f", 4),
 }
-"""Of sensor_msgs/Image: encoding, type of struct and bytes of a raw count, by data type."""
+"""For sensor_msgs/Image: encoding, type of struct and bytes of a raw count, by data type."""
 PARAMETERS: Mapping[str, Any] = {
     "port": "",
     "feed": "",
@@ -48,12 +47,12 @@ PARAMETERS: Mapping[str, Any] = {
     "allow_writes": False,
 }
 FIXED = frozenset({"allow_writes"})
-"""What no other node may set."""
+"""Parameters that no other node may set."""
 LOOK_S = 0.5
-"""How long the node waits at most before it looks whether it shall end."""
+"""Longest time between two checks whether the node has to end."""
 RELIABLE = QoSProfile(depth=50)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""A subscriber that comes later gets the last state, too."""
+"""A later subscriber also gets the last state."""
 
 
 def values(fields: Mapping[str, Any]) -> list[KeyValue]:
@@ -66,7 +65,7 @@ def values(fields: Mapping[str, Any]) -> list[KeyValue]:
 
 def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
     """An answer: OK with the label, WARN if the label cannot be used, ERROR if nothing was learned
-    of the object."""
+    about the object."""
     level = DiagnosticStatus.ERROR if answer.faulty else DiagnosticStatus.WARN
     fields = asdict(answer) | {
         "early": answer.early,
@@ -85,7 +84,7 @@ def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
 
 def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStatus:
     """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if
-    something was lost since `before`."""
+    anything was lost since `before`."""
     state = view.state
     hurt = [
         f"{count} {what}"
@@ -119,8 +118,8 @@ def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStat
 
 
 def image(taxels: Sequence[Any], dtype: str) -> Image:
-    """A frame of raw counts, rows along the sliding; one channel an axis. A count that is no number
-    becomes nan."""
+    """A frame of raw counts, rows along the direction of sliding, one channel for each axis. A
+    count that is not a number becomes NaN."""
     kind, letter, size = ENCODINGS[dtype]
     rows = [[cell if isinstance(cell, list) else [cell] for cell in row] for row in taxels]
     counts = [
@@ -138,7 +137,7 @@ def image(taxels: Sequence[Any], dtype: str) -> Image:
 
 
 class PalpateNode(LifecycleNode):  # type: ignore[misc]
-    """The node `palpate`. What the box says arrives in another thread and is published by the
+    """The node `palpate`. News of the box arrives in another thread and is published by the
     executor."""
 
     def __init__(self) -> None:
@@ -157,11 +156,11 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             self.trigger_activate()
 
     def setting(self, name: str) -> Any:
-        """A parameter."""
+        """A parameter of the node."""
         return self.get_parameter(name).value
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the line or the feed, and offer diagnostics and services."""
+        """Open the serial line or the feed, and offer diagnostics and services."""
         if bool(self.setting("port")) == bool(self.setting("feed")):
             self.get_logger().error("name the box with one of the parameters port and feed")
             return TransitionCallbackReturn.FAILURE
@@ -186,7 +185,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         asking = (
             MutuallyExclusiveCallbackGroup()
-        )  # a command may take seconds, verdicts do not wait for it
+        )  # a command may take seconds, and verdicts must not wait for it
         self._made = [
             (self.destroy_guard_condition, guard),
             (self.destroy_publisher, self._diagnostics),
@@ -203,15 +202,15 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the box."""
+        """Release the box."""
         return self.let_go()
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let go of the box."""
+        """Release the box."""
         return self.let_go()
 
     def let_go(self) -> TransitionCallbackReturn:
-        """Close the box's line or feed, and end what `on_configure` has begun."""
+        """Close the box's serial line or feed, and end everything that `on_configure` has begun."""
         if self._sweeps:
             self._sweeps.interrupt()
         if self._source:
@@ -226,7 +225,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         return TransitionCallbackReturn.SUCCESS
 
     def _sweep_action(self) -> SweepAction | None:
-        """The action, where its messages are installed."""
+        """The action, if its messages are installed."""
         try:
             from appliance.bridges.ros_action import SweepAction
         except ImportError as e:
@@ -237,7 +236,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         return SweepAction(self, self._box)
 
     def _box(self) -> Source:
-        """The box, for a command. Raises ApplianceError where none may be sent."""
+        """The box, for a command. Raises ApplianceError if commands are refused."""
         if self._source is None:
             raise ApplianceError("the node is not configured")
         if not self.setting("allow_writes"):
@@ -281,7 +280,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._frames.publish(message)
 
     def _show(self, view: BoxView) -> None:
-        """Publish the state if it is another."""
+        """Publish the state if it has changed."""
         alive = view.alive(self._monotonic.now_ns())
         state = view.state
         now = (alive, state.skin, state.sweeping, state.bundle) if state else (alive,)
@@ -290,7 +289,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             self._states.publish(self._array(box_status(view, view, alive=alive)))
 
     def _report(self) -> None:
-        """Diagnostics, once a second, and the state of a box that has fallen silent."""
+        """Publish diagnostics, once a second, and the state of a box that has fallen silent."""
         if self._source:
             view = self._source.view()
             alive = view.alive(self._monotonic.now_ns())
@@ -312,7 +311,8 @@ def run(arguments: Sequence[str]) -> None:
     )  # news; a command; a sweep; goals and cancelling meanwhile
     executor.add_node(node)
     try:
-        while rclpy.ok():  # a signal wakes the executor before it ends the context: a wait without end might sleep on
+        # a signal wakes the executor before it ends the context, so a wait without end might go on
+        while rclpy.ok():
             executor.spin_once(timeout_sec=LOOK_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

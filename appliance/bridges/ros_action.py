@@ -1,5 +1,5 @@
-"""The action ~/sweep of the ROS 2 node; imported only where palpate_msgs is installed. In: goals.
-Out: sweeps by command."""
+"""The action ~/sweep of the ROS 2 node: each goal is a sweep by command. Imported only if
+palpate_msgs is installed."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from appliance.client.answers import Answer
 from appliance.core.errors import ApplianceError
 
 LOG_S = 5.0
-"""At most one line of the log about rejected goals in this time."""
+"""Least time between two log lines about rejected goals."""
 END_S = 10.0
-"""Longest wait for a sweep that was interrupted: it may be asking the box."""
+"""Longest wait for a sweep that was interrupted, as it may be waiting for the box."""
 
 
 class SweepAction:
-    """Serves one goal at a time and rejects others meanwhile. box: the box, for commands; raises
-    ApplianceError."""
+    """Serves one goal at a time and rejects others meanwhile. box: gives the box for commands, or
+    raises ApplianceError."""
 
     def __init__(self, node: Node, box: Callable[[], Source]) -> None:
         self._box, self._log = box, node.get_logger()
@@ -43,13 +43,13 @@ class SweepAction:
         )
 
     def hear(self, news: object) -> None:
-        """Take what was heard of the box."""
+        """Take news of the box."""
         current = self._current
         if current:
             current.hear(news)
 
     def interrupt(self) -> None:
-        """Abort the sweep under way, at the box too, and wait until it has ended."""
+        """Abort the current sweep, at the box too, and wait until it has ended."""
         self._ending.set()
         if self._busy.acquire(timeout=END_S):
             self._busy.release()

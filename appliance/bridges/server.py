@@ -1,7 +1,6 @@
-"""A TCP server with limits, for the bridges. In: how one connection is served. Out: at most `most`
-at a time.
+"""A TCP server with limits, for the bridges: at most `most` connections at a time.
 
-A connection that has been silent is given up for a new one, so that idle or dead peers never keep a
+If it is full, a silent connection is closed for a new one, so that idle or dead peers never keep a
 controller out.
 """
 
@@ -17,11 +16,12 @@ from appliance.core.errors import ConfigError
 from appliance.core.log import log
 
 QUIET_S = 5.0
-"""A connection that has sent nothing for this long makes room where the server is full."""
+"""If the server is full, a connection that has sent nothing for this long is closed for a new
+one."""
 BUFFER = 64 * 1024
-"""Bytes that wait for one peer; one that does not read them is given up."""
+"""Most bytes that wait for one peer; a peer that does not read them is dropped."""
 CLOSE_S = 1.0
-"""Longest wait for a peer to take the rest."""
+"""Longest wait until a peer has read the rest."""
 
 Serve = Callable[["TcpPeer"], Awaitable[None]]
 
@@ -36,21 +36,21 @@ class TcpPeer:
         self._reader, self._writer, self._now_s = reader, writer, now_s
 
     async def read(self, timeout_s: float | None) -> bytes:
-        """What has come, b"" at the end. Raises TimeoutError, ConnectionError."""
+        """The bytes that have come, b"" at the end. Raises TimeoutError, ConnectionError."""
         async with asyncio.timeout(timeout_s):
             data = await self._reader.read(4096)
         self.heard_s = self._now_s()
         return data
 
     def write(self, data: bytes) -> None:
-        """Send without waiting; a peer that does not read is given up."""
+        """Send without waiting; a peer that does not read is dropped."""
         if self._writer.transport.get_write_buffer_size() + len(data) > BUFFER:
             self.drop()
         elif not self._writer.is_closing():
             self._writer.write(data)
 
     async def flush(self, timeout_s: float) -> None:
-        """Wait until the peer has taken what was sent. Raises TimeoutError, ConnectionError."""
+        """Wait until the peer has read everything. Raises TimeoutError, ConnectionError."""
         async with asyncio.timeout(timeout_s):
             await self._writer.drain()
 
@@ -59,8 +59,8 @@ class TcpPeer:
         self._writer.transport.abort()
 
     async def close(self) -> None:
-        """End the connection; what the peer does not take in CLOSE_S is thrown away, so that the
-        program can end."""
+        """End the connection. Bytes that the peer does not read within CLOSE_S are dropped, so that
+        the program can end."""
         with suppress(OSError, TimeoutError):
             self._writer.close()
             async with asyncio.timeout(CLOSE_S):
@@ -69,8 +69,8 @@ class TcpPeer:
 
 
 class TcpServer:
-    """Serves connections to `address`. peers: those that are open. refused: how many found it
-    full."""
+    """Serves connections to `address`. peers: the open connections. refused: number of connections
+    that found it full."""
 
     def __init__(self, serve: Serve, most: int) -> None:
         self.peers: set[TcpPeer] = set()
@@ -79,7 +79,7 @@ class TcpServer:
         self._serve, self._most = serve, most
 
     async def open(self, host: str, port: int) -> None:
-        """Listen. Raises ConfigError where that is not possible."""
+        """Listen. Raises ConfigError if that fails."""
         try:
             server = await asyncio.start_server(self._connected, host, port, limit=8192, backlog=64)
         except (OSError, OverflowError) as e:
@@ -90,8 +90,8 @@ class TcpServer:
         self.address = server.sockets[0].getsockname()[:2]
 
     def _make_room(self, now_s: float) -> bool:
-        """Whether one more may come; gives up the one that has been silent longest if there is no
-        room."""
+        """Whether there is room for another connection. If it is full, the connection that has been
+        silent longest is dropped."""
         if len(self.peers) < self._most:
             return True
         quietest = min(self.peers, key=lambda peer: peer.heard_s)
@@ -111,13 +111,13 @@ class TcpServer:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         connection.setsockopt(
             socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER
-        )  # else the kernel holds some megabytes
+        )  # the default of the kernel is some megabytes
         peer = TcpPeer(reader, writer, now_s)
         self.peers.add(peer)
         try:
             await self._serve(peer)
         except (OSError, TimeoutError):
-            pass  # a peer that is gone or hangs; the others do not notice
+            pass  # the peer is gone or hangs; the others are not affected
         finally:
             self.peers.discard(peer)
             await peer.close()

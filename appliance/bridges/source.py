@@ -1,5 +1,6 @@
-"""What a bridge shows of the box. In: its serial line, a pseudo-terminal that the box opens, or its
-feed. Out: a BoxView, and commands where the line carries them.
+"""The box as seen by a bridge: a BoxView, and commands if the connection carries them.
+
+The connection is the box's serial line, a pseudo-terminal that the box opens, or its feed.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
     "TARE": Palpate.tare,
     "ABORT": Palpate.abort,
 }
-"""What a bridge may pass on to the box."""
+"""Commands that a bridge may pass on to the box."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxView:
-    """The box as it was last heard.
+    """The last news of the box.
 
-    answers: how many were heard. beats: how many states were heard. heard_ns: when the last of
-    either came, 0 for never. labels: of the bundle `bundle`; empty while they are not known.
-    missed, damaged: as in Palpate; with the feed, missed counts its lost lines. trouble: why
-    nothing is heard, "" for no reason.
+    answers, beats: number of answers and of states so far. heard_ns: time of the last of either, 0
+    for never. labels: of the bundle `bundle`; empty while unknown. missed, damaged: as in Palpate;
+    with the feed, missed counts its lost lines. trouble: the reason why nothing is heard, "" for
+    none.
     """
 
     state: BoxState | None = None
@@ -63,41 +64,39 @@ class BoxView:
         return self.heard_ns > 0 and now_ns - self.heard_ns < STALE_S * 1e9
 
     def code(self, label: str) -> int:
-        """The code of a label on the class bits, 0 if it is not known."""
+        """The code of a label on the class bits, 0 if it is unknown."""
         return self.labels.index(label) + 1 if label in self.labels else 0
 
 
 class Source(Protocol):
-    """Where a bridge gets the box from. name: for a person."""
+    """A bridge's connection to the box. name: for messages."""
 
     name: str
 
-    def view(self) -> BoxView:
-        """The box as it was last heard."""
-        ...
+    def view(self) -> BoxView: ...
 
     def refresh(self) -> None:
-        """Ask for what does not come by itself; may take seconds. To be called about once a
+        """Ask for facts that do not come by themselves; may take seconds. To be called about once a
         second."""
         ...
 
     def send(self, command: str) -> str:
-        """Carry out one of COMMANDS; what the box says. Raises ApplianceError."""
+        """Carry out one of COMMANDS; the box's reply. Raises ApplianceError."""
         ...
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Wait until a sweep can begin, so that every earlier one is answered. Raises NoAnswer or
+        """Wait until a sweep can begin, so that every earlier sweep is answered. Raises NoAnswer or
         CommandRefused."""
         ...
 
     def close(self) -> None:
-        """Let go of the box."""
+        """Release the box."""
         ...
 
 
 class LineSource:
-    """The box over its serial line. heard: is called with each answer and state, in the thread that
-    reads."""
+    """The box over its serial line. heard: is called with each answer and state, in the reading
+    thread."""
 
     def __init__(
         self,
@@ -114,7 +113,6 @@ class LineSource:
         self._box = Palpate(name, baud=baud, listener=self._heard, opener=opener, clock=self._clock)
 
     def view(self) -> BoxView:
-        """The box as it was last heard."""
         return replace(
             self._view,
             missed=self._box.missed,
@@ -123,7 +121,7 @@ class LineSource:
         )
 
     def refresh(self) -> None:
-        """Ask for the labels of a bundle that is new."""
+        """Ask for the labels of a new bundle."""
         self._box.forget()  # nobody asks for results here
         view = self._view
         if view.state and view.state.bundle and view.state.bundle != view.bundle:
@@ -134,15 +132,13 @@ class LineSource:
             self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
 
     def send(self, command: str) -> str:
-        """Carry out one of COMMANDS; what the box says."""
+        """Carry out one of COMMANDS; the box's reply."""
         return COMMANDS[command](self._box) or "done"
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Wait until a sweep can begin."""
         self._box.wait_ready(timeout_s)
 
     def close(self) -> None:
-        """Close the line."""
         self._box.close()
 
     def _heard(self, news: Heard) -> None:
@@ -176,11 +172,10 @@ class FeedSource:
         self._thread.start()
 
     def view(self) -> BoxView:
-        """The box as it was last heard."""
         return replace(self._view, trouble=self._feed.trouble)
 
     def refresh(self) -> None:
-        """Nothing: `hello` brings the labels."""
+        """Does nothing: `hello` brings the labels."""
 
     def send(self, command: str) -> str:
         """Raises CommandRefused: the feed is read-only."""
@@ -189,11 +184,10 @@ class FeedSource:
         )
 
     def wait_ready(self, timeout_s: float) -> None:
-        """Raises CommandRefused: nothing can be begun."""
+        """Raises CommandRefused: the feed is read-only."""
         self.send("START")
 
     def close(self) -> None:
-        """Close the feed."""
         self._ending.set()
         self._thread.join(10)
 
@@ -207,12 +201,12 @@ class FeedSource:
                     KeyError,
                     TypeError,
                     ValueError,
-                ):  # of a later version; what is known is shown
+                ):  # a line of a later version; the known facts are shown
                     self._view = replace(self._view, damaged=self._view.damaged + 1)
         self._feed.close()
 
     def _take(self, line: Mapping[str, Any]) -> None:
-        """Raises KeyError, TypeError or ValueError for a line of another form."""
+        """Raises KeyError, TypeError or ValueError for an invalid line."""
         kind = line["type"]
         if kind == "hello":
             self.format = line["format"]
@@ -229,7 +223,7 @@ class FeedSource:
                     self._also(news)
 
     def _news(self, kind: str, line: Mapping[str, Any]) -> Heard | None:
-        if kind == "state":  # a change between two of health
+        if kind == "state":  # a change between two lines of health
             state = self._view.state
             return state and replace(state, skin=line["skin"], sweeping=bool(line["sweeping"]))
         if kind == "health":
@@ -255,18 +249,18 @@ class FeedSource:
 
 
 def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
-    """The view with what was heard now."""
+    """The view with this news."""
     if isinstance(news, Answer):
         return replace(view, answer=news, answers=view.answers + 1, heard_ns=now_ns)
     return replace(view, state=news, beats=view.beats + 1, heard_ns=now_ns)
 
 
 class LinkPort:
-    """A port that the box on this machine opens by a name: one end of a pseudo-terminal, the other
-    at `path`.
+    """A port that the box on this machine opens by a name: one end of a pseudo-terminal, with a
+    link to it at `path`.
 
-    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this one's group
-    may open it, the box among them. Raises ConfigError if something else is at `path`.
+    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this process's
+    group may open it, the box among them. Raises ConfigError if `path` is taken.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,6 +1,4 @@
-"""A sweep by command, from START to its answer, for bridges that offer it as one thing. In: a
-Source and what it hears. Out: the Answer, or an error that says why there is none.
-"""
+"""A sweep by command, from START to its answer, for bridges that offer it as one call."""
 
 from __future__ import annotations
 
@@ -19,15 +17,14 @@ from appliance.core.status import Status
 READY_S = 3.0
 """Longest wait until the box is ready for START."""
 ABORTED_S = 2.0
-"""Longest wait for the answer to a sweep that was aborted."""
+"""Longest wait for the answer to an aborted sweep."""
 TURN_S = 0.05
-"""Longest time until it is noticed that nobody wants the answer any more, or that the box is
-gone."""
+"""Longest time until a canceled sweep or a lost box is noticed."""
 LONGEST_S = 3600.0
 
 
 class Terms(Protocol):
-    """What is wanted: fields as in Sweep.action."""
+    """Parameters of a sweep: the fields of Sweep.action."""
 
     new_object: bool
     slide_s: float
@@ -37,8 +34,8 @@ class Terms(Protocol):
 class CommandedSweep:
     """Carries out one sweep at a time.
 
-    canceled: whether nobody wants the answer any more. say: is called with each phase, `sliding`,
-    `judging`, `early`, the last with the answer.
+    canceled: whether the answer is not wanted any more. say: is called with each phase, `sliding`,
+    `judging` or `early`, the last with the answer.
     """
 
     def __init__(
@@ -55,7 +52,7 @@ class CommandedSweep:
         self._heard_ns = 0
 
     def hear(self, news: object) -> None:
-        """Take what the source has heard; from any thread."""
+        """Take news of the source; from any thread."""
         self._heard_ns = self._clock.now_ns()
         if isinstance(news, Answer):
             self._answers.put(news)
@@ -63,13 +60,13 @@ class CommandedSweep:
     def run(self, terms: Terms) -> Answer:
         """The answer; it is `aborted` if the sweep was canceled.
 
-        Raises ConfigError for terms that cannot be, CommandRefused, NoAnswer or LinkLost; the box's
-        sweep is then aborted as far as the box can be reached.
+        Raises ConfigError for invalid terms, CommandRefused, NoAnswer or LinkLost. The box's sweep
+        is then aborted if the box can be reached.
         """
         check(terms)
         self._source.wait_ready(
             READY_S
-        )  # so every earlier sweep is answered, and the next answer is to this one
+        )  # so every earlier sweep is answered, and the next answer belongs to this sweep
         if self._canceled():
             raise CommandRefused("the sweep was canceled before START")
         if terms.new_object:
@@ -81,14 +78,14 @@ class CommandedSweep:
             answer = self._answered(terms)
         except CommandRefused:  # no sweep of ours is open
             raise
-        except Exception:  # whatever it is, the box is not left with an open sweep
+        except Exception:  # after any failure, the box must not be left with an open sweep
             with suppress(ApplianceError):
                 self._source.send("ABORT")
             raise
         return answer or self._aborted()
 
     def _answered(self, terms: Terms) -> Answer | None:
-        """The answer, None if the sweep was canceled; STOP is sent when it is due, or when the
+        """The answer, None if the sweep was canceled. STOP is sent when it is due, or when the
         answer is there."""
         begin_ns = self._clock.now_ns()
         stop_s = terms.slide_s or math.inf
@@ -121,11 +118,11 @@ class CommandedSweep:
         return None
 
     def _close(self, answer: Answer) -> None:
-        """Send STOP for a sweep that was answered before: it causes no answer, and without it the
-        next START does the same."""
+        """Send STOP for a sweep that was already answered. It causes no answer; without it, the
+        next START would end the sweep."""
         if (
             answer.status is not Status.NO_STOP
-        ):  # else another's START has closed it, and the STOP is the other's
+        ):  # else a START of another peer has closed it, and the STOP belongs to that peer
             with suppress(ApplianceError):
                 self._source.send("STOP")
 
@@ -140,7 +137,7 @@ class CommandedSweep:
             )
 
     def _aborted(self) -> Answer:
-        with suppress(CommandRefused):  # it was answered in this moment
+        with suppress(CommandRefused):  # it may just have been answered
             self._source.send("ABORT")
         answer = self._next(ABORTED_S)
         if answer is None:
@@ -159,14 +156,15 @@ class CommandedSweep:
 
 
 def check(terms: Terms) -> None:
-    """Raises ConfigError for times that cannot be."""
+    """Raises ConfigError for invalid times."""
     if not 0 <= terms.slide_s <= LONGEST_S:
         raise ConfigError(
-            f"slide_s = {terms.slide_s:g} is no time from START to STOP; use 0 to {LONGEST_S:g}"
+            f"slide_s = {terms.slide_s:g} is not a valid time from START to STOP; use 0 to "
+            f"{LONGEST_S:g}"
         )
     if not terms.slide_s < terms.timeout_s <= LONGEST_S:
         raise ConfigError(
-            f"timeout_s = {terms.timeout_s:g} is no longest time from START to the answer; use "
+            f"timeout_s = {terms.timeout_s:g} is not a valid limit from START to the answer; use "
             "more than slide_s ="
             f" {terms.slide_s:g}, up to {LONGEST_S:g}"
         )

@@ -1,7 +1,6 @@
-"""The serial line over TCP: what a controller with a socket needs, URScript for one. In: a port.
-Out: its sentences, to each peer; commands of the peers go to the box, one at a time, and the answer
-to a command to the peer that sent it.
-"""
+"""The serial line over TCP, for controllers with sockets, for example URScript. Each peer gets all
+sentences. Commands of the peers go to the box one at a time, and the answer goes to the peer that
+sent the command."""
 
 from __future__ import annotations
 
@@ -16,17 +15,17 @@ from appliance.core.errors import LinkLost
 from appliance.core.sentences import Sentence, sentence
 
 PACE_S = 0.02
-"""Time between two commands to the box, of all peers together: its loop answers each, and a flood
-must not reach it. Also between two of one peer, refused ones too, so that a peer that floods leaves
-the others their turn."""
+"""Least time between two commands to the box, of all peers together: its loop answers each, so a
+flood must not reach it. Also the least time between two commands of one peer, refused commands
+included, so that a flooding peer leaves the others their turn."""
 ANSWER_S = 2.0
-"""Longest wait for the box to answer a command."""
+"""Longest wait for the box's answer to a command."""
 QUESTIONS = ("ID", "STATE", "LABEL")
-"""Commands that change nothing, and need no permission."""
+"""Commands that change nothing and need no permission."""
 
 
 class TcpBridge:
-    """Passes sentences on. writes: whether peers may send commands that change something."""
+    """Passes sentences on. writes: whether peers may send commands that change the box."""
 
     def __init__(
         self,
@@ -39,14 +38,14 @@ class TcpBridge:
     ) -> None:
         self.server = TcpServer(self.serve, most)
         self._writes, self._loop, self._asking = writes, loop, asyncio.Lock()
-        self._next_s = 0.0  # when the next command may go to the box
+        self._next_s = 0.0  # earliest time of the next command to the box
         self._asked = ""  # the command that the box has not answered yet
         self._answer: asyncio.Future[bytes] = loop.create_future()
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
     @property
     def trouble(self) -> str:
-        """Why the line is not open, "" if it is."""
+        """The reason why the line is not open, "" if it is."""
         return self._line.trouble
 
     def close(self) -> None:
@@ -54,7 +53,7 @@ class TcpBridge:
         self._line.close()
 
     def _heard(self, heard: Sentence) -> None:
-        """In the thread of the line: what is damaged ends here."""
+        """In the thread of the line. Damaged sentences are dropped."""
         if heard.summed and not heard.error and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._pass_on, heard)
 
@@ -62,7 +61,7 @@ class TcpBridge:
         line = sentence(heard.kind, *heard.fields)
         if (
             heard.kind == "ANS"
-        ):  # one that comes too late, or that nobody has asked for, is for nobody
+        ):  # an answer that came too late, or that no peer has asked for, is dropped
             if heard.fields[:1] == [self._asked] and not self._answer.done():
                 self._answer.set_result(line)
             return
@@ -79,7 +78,7 @@ class TcpBridge:
                 await asyncio.sleep(PACE_S)
 
     async def _ask(self, command: Sentence) -> bytes:
-        """The box's answer to a command, or one that says why it has none."""
+        """The box's answer to a command, or an error answer with the reason why there is none."""
         why = command.error
         if not why and not self._writes and command.kind not in QUESTIONS:
             why = "this bridge is read-only; start it with --allow-writes"
@@ -97,7 +96,7 @@ class TcpBridge:
                 except LinkLost as e:
                     why = str(e)
                 except TimeoutError:
-                    why = f"the box has not answered within {ANSWER_S:g} s; see whether it is on"
+                    why = f"the box has not answered within {ANSWER_S:g} s; check whether it is on"
                 finally:
                     self._asked = ""
         return sentence("ANS", command.kind, "error", why)

@@ -1,2 +1,2 @@
-"""What other programs import to talk with the box: over its feed, over its serial line. numpy is
-not needed."""
+"""Clients for other programs: the box over its feed and over its serial line. They do not need
+numpy."""

@@ -1,5 +1,5 @@
-"""What the box says, as objects. In: the fields of RES, STA and ANS sentences (PROTOCOL.md, part
-2). Out: Answer, BoxState, BoxIdentity."""
+"""Answers and states of the box as objects, read from the fields of RES, STA and ANS sentences
+(PROTOCOL.md, part 2)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ ADVICE = {
     Status.UNSURE: "sweep the same object once more",
     Status.UNDECIDED: "sort the object out: it has been swept as often as is allowed",
 }
-"""What to do with an answer that has a label; for the others there is `status.REASONS`."""
+"""Advice for an answer with a label; for other answers see `status.REASONS`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
     """The answer to one sweep, with the fields of RES. Probability and margin are 0 to 1.
 
-    time_s: of the box's monotonic clock. lost: frames of the window that were lost. loss_known:
-    whether lost frames can be seen. missed: how many answers before this one did not arrive, as the
-    numbers of the sweeps show.
+    time_s: of the box's monotonic clock. lost: number of lost frames in the window. loss_known:
+    whether lost frames can be seen. missed: number of answers before this one that did not arrive,
+    counted by the numbers of the sweeps.
     """
 
     sweep: int
@@ -45,8 +45,7 @@ class Answer:
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> Answer:
-        """The answer in the fields of a RES sentence. Raises FormatError where they do not have its
-        form."""
+        """The answer in the fields of a RES sentence. Raises FormatError if they are invalid."""
         try:
             (
                 sweep,
@@ -85,43 +84,43 @@ class Answer:
 
     @classmethod
     def read(cls, line: str) -> Answer | None:
-        """The answer in a line, None if it is another sentence or damaged. Raises FormatError as
+        """The answer in a line; None if it is another sentence or damaged. Raises FormatError as
         `of` does."""
         heard = sentences.read(line.encode("ascii", "replace"))
         return cls.of(heard.fields) if heard.kind == "RES" and heard.summed else None
 
     @property
     def known(self) -> bool:
-        """The label can be used."""
+        """Whether the label can be used."""
         return self.status is Status.OK
 
     @property
     def unsure(self) -> bool:
-        """There is a label, but one more sweep of the same object is needed."""
+        """Whether there is a label, but one more sweep of the same object is needed."""
         return self.status is Status.UNSURE
 
     @property
     def faulty(self) -> bool:
-        """Nothing was learned of the object: the sweep, the skin or the wiring was not as it must
-        be."""
+        """Whether nothing was learned about the object, because of a fault of the sweep, the skin
+        or the wiring."""
         return not self.status.classified and self.status not in (Status.UNKNOWN, Status.RECORDED)
 
     @property
     def early(self) -> bool:
-        """It came while the finger was sliding: the finger may stop, and no other answer
-        follows."""
+        """Whether the answer came while the finger was sliding. The finger may stop, and no other
+        answer follows."""
         return self.share < 1
 
     @property
     def what_to_do(self) -> str:
-        """The reason for the status and what to do, with the box's detail."""
+        """The reason for the status and its remedy, with the box's detail."""
         text = ADVICE[self.status] if self.status in ADVICE else REASONS[self.status]
         return f"{text} ({self.detail})" if self.detail else text
 
 
 @dataclass(frozen=True, slots=True)
 class BoxState:
-    """The state of the box, with the fields of STA; counts are since its program has started."""
+    """The state of the box, with the fields of STA; it counts since the start of its program."""
 
     time_s: float
     skin: str
@@ -137,8 +136,8 @@ class BoxState:
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> BoxState:
-        """The state in the fields of STA or of the answer to STATE. Raises FormatError where they
-        have another form."""
+        """The state in the fields of STA or of the answer to STATE. Raises FormatError if they are
+        invalid."""
         try:
             time_s, skin, sweeping, *counts = fields[:9]
             answered, frames, lost, garbage, enumerations, dropped = map(int, counts)
@@ -163,14 +162,14 @@ class BoxState:
 
     @property
     def ready(self) -> bool:
-        """A sweep can begin."""
+        """Whether a sweep can begin."""
         return self.skin == "streaming" and not self.sweeping
 
 
 @dataclass(frozen=True, slots=True)
 class BoxIdentity:
-    """What answers: name, version and id of the bundle, the form of its sweeps, and the skin's
-    board."""
+    """Identity of the box: name, version and id of the bundle, the format of its sweeps, and the
+    readout board."""
 
     name: str
     version: str
@@ -180,7 +179,7 @@ class BoxIdentity:
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> BoxIdentity:
-        """The fields of the answer to ID. Raises FormatError where there are fewer."""
+        """The fields of the answer to ID. Raises FormatError if there are too few."""
         if len(fields) < 5:
             raise FormatError(
                 f"ID,{','.join(fields)}: {len(fields)} fields instead of 5; is the client older "

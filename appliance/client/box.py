@@ -1,9 +1,8 @@
-"""A client of the box for the robot's computer. In: its serial line. Out: answers to sweeps,
-commands carried out.
+"""A client of the box for the robot's computer, over the serial line.
 
 with Palpate("/dev/ttyUSB0") as box:
     box.wait_ready(timeout_s=10)
-    box.start()                          # trigger.mode = "serial"; else the robot's lines
+    box.start()                          # trigger.mode = "serial"; else the robot's GPIO lines
     ...                                  # slide
     box.stop()
     answer = box.result(timeout_s=2)
@@ -30,23 +29,23 @@ BAUD = 115200
 KEPT = 256
 """Most answers that wait for `result`; then the oldest is dropped and counted as missed."""
 POLL_S, QUESTION_S = 0.2, 1.0
-"""Time between two questions of `wait_ready`, and for the answer to one: a box that starts does not
-hear what was sent before."""
+"""Time between two questions of `wait_ready`, and for the answer to a question. A box that is
+starting does not receive earlier ones."""
 
 Heard = Answer | BoxState
 
 
 class Palpate:
-    """The box at the other end of a line. Threads may share one.
+    """The box at the other end of a serial line. Threads may share it.
 
     port: a serial device, a pseudo-terminal, or `socket://host:port`. timeout_s: longest wait for
-    the answer to a command. listener: is called with each answer and each state, in the thread that
-    reads. opener: opens the port, for tests and for what is no port.
+    the answer to a command. listener: is called with each answer and each state, in the reading
+    thread. opener: opens the port, for tests and for other kinds of ports.
 
-    trouble: why the line is not open, "" if it is. missed: answers that were lost. damaged:
-    sentences that were damaged, the last of which `damage` tells. restarts: how often the box's
-    program has begun anew. Whatever asks or waits has a deadline; a line that is lost meanwhile
-    ends the wait with LinkLost and is opened again.
+    trouble: the reason why the line is not open, "" if it is. missed: number of lost answers.
+    damaged: number of damaged sentences; `damage` describes the last. restarts: how often the box's
+    program has started again. All questions and waits have a deadline. A line that is lost ends a
+    wait with LinkLost, and is opened again.
     """
 
     def __init__(
@@ -68,8 +67,8 @@ class Palpate:
         self._asking = threading.Lock()
         self._replies: deque[list[str]] = deque(maxlen=KEPT)
         self._answers: deque[Answer] = deque()
-        # numbers of the newest answer and of those before it that did not come; answers that STA
-        # has counted
+        # the number of the newest answer, numbers of missing answers before it, and the count of
+        # answers in the last STA
         self._sweep: int | None = None
         self._absent: set[int] = set()
         self._answered: int | None = None
@@ -95,24 +94,24 @@ class Palpate:
 
     @property
     def trouble(self) -> str:
-        """Why the line is not open, "" if it is."""
+        """The reason why the line is not open, "" if it is."""
         return self._line.trouble
 
     def silent_s(self) -> float:
-        """Time since the last sentence; infinite before the first. The box sends one a
+        """Time since the last sentence; infinite before the first. The box sends one each
         second."""
         return (self._clock.now_ns() - self._heard_ns) / 1e9 if self._heard_ns else float("inf")
 
     def wait_ready(self, timeout_s: float) -> BoxState:
-        """Wait until a sweep can begin, and forget answers that nobody has asked for.
+        """Wait until a sweep can begin, and drop answers that `result` has not returned.
 
-        Raises NoAnswer with the reason if that takes longer; a line that is not there yet is waited
+        Raises NoAnswer with the reason if that takes longer. A line that is not there yet is waited
         for as well.
         """
         end_ns = self._end_ns(timeout_s)
         while True:
             try:
-                # a last question gets the time for its answer
+                # the last question also gets time for its answer
                 state = self.state(
                     min(self._timeout_s, QUESTION_S, max(POLL_S, self._left_s(end_ns)))
                 )
@@ -136,8 +135,8 @@ class Palpate:
                 raise NoAnswer(f"not ready within {timeout_s:g} s: {why}")
 
     def start(self) -> None:
-        """Begin a sweep by command (trigger.mode = "serial"), and forget answers that nobody has
-        asked for."""
+        """Begin a sweep by command (trigger.mode = "serial"), and drop answers that `result` has
+        not returned."""
         self.forget()
         self.ask("START")
 
@@ -154,20 +153,18 @@ class Palpate:
         self.ask("ABORT")
 
     def tare(self) -> str:
-        """Take the last half second as the unloaded skin; what the box says of it."""
+        """Take the last half second as the unloaded skin; returns the box's message."""
         return ",".join(self.ask("TARE"))
 
     def state(self, timeout_s: float | None = None) -> BoxState:
-        """The state of the box now."""
         return BoxState.of(self.ask("STATE", timeout_s=timeout_s))
 
     def identify(self) -> BoxIdentity:
-        """Which bundle answers, and through which skin."""
+        """Bundle and skin of the box."""
         return BoxIdentity.of(self.ask("ID"))
 
     def labels(self) -> tuple[str, ...]:
-        """The labels of the bundle; a label's code on the class bits is its place, counted from
-        1."""
+        """The labels of the bundle; the code of a label on the class bits is its index + 1."""
         found: list[str] = []
         count = 1
         while len(found) < count:
@@ -181,15 +178,15 @@ class Palpate:
         return tuple(found)
 
     def forget(self) -> None:
-        """Forget answers that nobody has asked for."""
+        """Drop answers that `result` has not returned."""
         with self._news:
             self._answers.clear()
 
     def result(self, timeout_s: float) -> Answer:
-        """The oldest answer that was not given yet; waits for it.
+        """The oldest answer that was not returned yet; waits for it.
 
-        Raises NoAnswer if none comes in time, LinkLost at once if the line is lost: the answer was
-        sent into nowhere.
+        Raises NoAnswer if none comes in time, and LinkLost at once if the line is lost, since the
+        answer is then lost too.
         """
         with self._news:
             losses = self._line.losses
@@ -206,15 +203,13 @@ class Palpate:
         raise NoAnswer(f"no answer to a sweep within {timeout_s:g} s; {self._why_silent()}")
 
     def ask(self, name: str, *texts: str, timeout_s: float | None = None) -> list[str]:
-        """Send a command; the fields of its answer. What follows a comma in `name` is taken as the
-        first of `texts`.
+        """Send a command; the fields of its answer. Text after a comma in `name` is the first of
+        `texts`.
 
         Raises CommandRefused with the box's reason, NoAnswer if it does not answer in time,
         LinkLost if the line is not open or is lost.
         """
-        name, *given = name.split(
-            ","
-        )  # as a person writes it: the box answers under the name alone
+        name, *given = name.split(",")  # as a person writes it; the box answers with the name alone
         wait_s = self._timeout_s if timeout_s is None else timeout_s
         end_ns = self._end_ns(wait_s)
         if not self._asking.acquire(timeout=max(0.0, wait_s)):
@@ -288,11 +283,11 @@ class Palpate:
             self._listener(news)
 
     def _counted(self, answer: Answer) -> Answer:
-        """The answer with the number of those that are missing before it: every sweep gets exactly
-        one."""
+        """The answer with the number of answers that are missing before it, as each sweep gets
+        exactly one."""
         if (
             answer.sweep in self._absent
-        ):  # one that waited for late frames while the next was answered at once
+        ):  # it waited for late frames while the next sweep was answered at once
             self._absent.remove(answer.sweep)
             self.missed -= 1
             return answer
@@ -305,7 +300,8 @@ class Palpate:
         return replace(answer, missed=len(absent))
 
     def _counted_state(self, state: BoxState) -> BoxState:
-        """The state; fewer answers than before mean that the program has begun anew."""
+        """The state. A smaller count of answers than before means that the box's program has
+        started again."""
         if self._answered is not None and state.answered < self._answered:
             self._began_anew(state.answered)
             self.missed += state.answered

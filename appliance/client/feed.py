@@ -1,8 +1,5 @@
-"""Reads the feed of the running box (PROTOCOL.md, part 4), and comes back to it when the box
-restarts.
-
-In: the path of its socket. Out: each line as a dict. numpy is not needed.
-"""
+"""Reads the feed of the running box (PROTOCOL.md, part 4) from its socket, each line as a dict. It
+connects again when the box restarts. numpy is not needed."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from appliance.core.errors import FeedError, FormatError
 
 DEFAULT = str(StoreConfig().feed)
 MOST_LINE = 1 << 20
-"""Bytes of a line; the box sends far shorter ones."""
+"""Longest line in bytes; the box sends far shorter lines."""
 RETRY_NS = 500_000_000
 """Time between two attempts to connect."""
 ENDED = "the box has closed the feed; it is read again when the box is back"
@@ -28,7 +25,7 @@ ENDED = "the box has closed the feed; it is read again when the box is back"
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[dict[str, Any]], bytes]:
     """The lines in `data`, which continues `rest`, and the new unfinished rest. Raises FormatError
-    for what is no line."""
+    for a line that is not of a feed."""
     *lines, rest = (rest + data).split(b"\n")
     if len(rest) > MOST_LINE:
         raise FormatError(
@@ -45,7 +42,7 @@ def _line(text: bytes) -> dict[str, Any]:
             raise TypeError
     except (ValueError, TypeError, KeyError, RecursionError) as e:
         raise FormatError(
-            f"{text[:40]!a} is no line of a feed; is this socket the feed of a palpate?"
+            f"{text[:40]!a} is not a line of a feed; is this socket the feed of a palpate?"
         ) from e
     if line["type"] == "hello" and line.get("schema") != FEED_SCHEMA:
         raise FormatError(
@@ -56,11 +53,11 @@ def _line(text: bytes) -> dict[str, Any]:
 
 
 class Feed:
-    """The feed at `path`. `read` connects where that is needed, so a box that is not there yet is
-    no error.
+    """The feed at `path`. `read` connects if that is needed, so a missing box is not an error.
 
-    frames_hz, sweeps: what is asked for at each connection, see `ask`. trouble: why nothing is read
-    now, "" where the feed is. Usable in one thread; `fileno` is for waiting elsewhere.
+    frames_hz, sweeps: requested at each connection, see `ask`. trouble: the reason why nothing is
+    read now, "" if the feed is there. Only one thread may use it; `fileno` is for waiting
+    elsewhere.
     """
 
     def __init__(
@@ -87,7 +84,7 @@ class Feed:
         self.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Every line, also over restarts of the box. Raises FeedError where none comes for ten
+        """Every line, also after restarts of the box. Raises FeedError if none comes for ten
         seconds."""
         while True:
             line = self.read(10.0)
@@ -107,8 +104,8 @@ class Feed:
         return self._connection.fileno() if self._connection else -1
 
     def ask(self, *, frames_hz: float | None = None, sweeps: bool | None = None) -> None:
-        """Ask for frames at this rate (0 to 20 a second), and for the windows of cut sweeps; None:
-        as before."""
+        """Request frames at this rate (0 to 20 a second), and the windows of sweeps; None: as
+        before."""
         if frames_hz is not None:
             self._asked["frames"] = frames_hz
         if sweeps is not None:
@@ -116,8 +113,8 @@ class Feed:
         self._request()
 
     def read(self, timeout_s: float = 1.0) -> dict[str, Any] | None:
-        """The next line; None where none has come in that time, `trouble` then says why if there is
-        a reason."""
+        """The next line; None if none has come in that time, with a reason in `trouble` if there is
+        one."""
         end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while not self._lines:
             left_ns = end_ns - self._clock.now_ns()
@@ -139,14 +136,14 @@ class Feed:
         self._rest = b""
 
     def lose(self, why: str) -> None:
-        """Close, and connect again after a while. why: `trouble` until then; what the box said last
-        is the better reason."""
+        """Close, and connect again after a while. why: `trouble` until then, unless the box has
+        sent a reason."""
         self.close()
         self.trouble = self.trouble or why
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _connect(self) -> bool:
-        """Connect where it is time to try, and ask again for what was asked for."""
+        """Connect when it is time to try, and repeat the requests."""
         now_ns = self._clock.now_ns()
         if now_ns < self._retry_ns:
             return False
@@ -185,17 +182,23 @@ class Feed:
             self.lose(str(e))
         else:
             for line in lines:
-                if line["type"] == "closed":  # what the box says before it closes
+                if line["type"] == "closed":  # the box gives its reason before it closes
                     self.trouble = str(line.get("why"))
             self._lines += lines
 
 
 def _why(e: OSError) -> str:
-    """Why the feed cannot be read, for a person."""
+    """The reason why the feed cannot be read, for a person."""
     if isinstance(e, PermissionError):
-        return "you may not read the feed; join group palpate (sudo adduser NAME palpate), and log in again"
+        return (
+            "you may not read the feed; join group palpate (sudo adduser NAME palpate), and log "
+            "in again"
+        )
     if isinstance(e, BlockingIOError):
         return "the box has no room for another connection now; it is tried again"
     if isinstance(e, (FileNotFoundError, ConnectionRefusedError)):
-        return "no palpate offers its feed there; start it (systemctl start palpate), or see store.runtime"
+        return (
+            "no palpate offers its feed there: the box is off or restarting; start it (systemctl "
+            "start palpate), or see store.runtime"
+        )
     return f"{str(e.strerror or e).lower()}; see palpate status"

@@ -1,7 +1,7 @@
-"""The robot's end of the serial line: a thread that reads, and opens the port again after it was
-lost.
+"""The robot's end of the serial line: a thread that reads sentences, and opens the port again after
+it was lost.
 
-In: a serial device, a pseudo-terminal or `socket://host:port`. Out: sentences, as they arrive.
+The port is a serial device, a pseudo-terminal or `socket://host:port`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from appliance.core.sentences import Sentence
 RETRY_S = 0.5
 """Time between two attempts to open a port."""
 READ_S = 0.2
-"""Longest wait of one read, so that the thread notices when it is to end."""
+"""Longest wait of one read, so that the thread soon notices when it has to end."""
 WRITE_S = 1.0
-"""Longest wait until the port takes a command."""
+"""Longest wait until the port accepts a command."""
 SILENT_NS = 10_000_000_000
-"""A socket without a byte for this long is opened again: the other computer may be gone without a
-word."""
+"""A socket without a byte for this long is opened again, since the other computer may have
+vanished."""
 
 
 def open_port(url: str, baud: int) -> Any:
@@ -38,11 +38,11 @@ def open_port(url: str, baud: int) -> Any:
 
 
 class Line:
-    """Calls `heard` with each sentence and `changed` when the port was opened or lost, both in its
+    """Calls `heard` with each sentence, and `changed` when the port was opened or lost, both in its
     own thread.
 
-    opener: opens the port; raises OSError or ValueError. name: what errors call it. trouble: why it
-    is not open, "" if it is. losses: how often it was lost.
+    opener: opens the port; raises OSError or ValueError. name: of the port, for errors. trouble:
+    the reason why it is not open, "" if it is. losses: how often it was lost.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Line:
         self._thread.start()
 
     def write(self, line: bytes) -> None:
-        """Send bytes. Raises LinkLost if the port is not open or does not take them."""
+        """Send bytes. Raises LinkLost if the port is not open or does not accept them."""
         with self._writing:
             if self._port is None:
                 raise LinkLost(self.trouble)
@@ -99,7 +99,7 @@ class Line:
                 with (
                     self._writing,
                     contextlib.suppress(OSError),
-                ):  # pyserial fails otherwise if it is closed while it writes
+                ):  # without the lock, pyserial fails if it is closed while it writes
                     port, self._port = self._port, None
                     port.close()
                 self.losses += 1
@@ -108,7 +108,7 @@ class Line:
                 self._port = self._open()
 
     def _read(self, port: Any) -> str:
-        """Read until the port fails or the end is wanted; the reason."""
+        """Read until the port fails or the thread has to end; the reason."""
         rest, last_ns = b"", self._clock.now_ns()
         is_socket = "://" in str(getattr(port, "port", ""))
         try:
@@ -125,6 +125,6 @@ class Line:
         except (
             OSError,
             TypeError,
-        ) as e:  # TypeError: pyserial 3.5 reads from a descriptor that is gone
+        ) as e:  # TypeError: pyserial 3.5 reads from a closed descriptor
             return str(e)
         return "closed"

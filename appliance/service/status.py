@@ -1,8 +1,8 @@
-"""What `palpate status` shows. In: health each turn, verdicts. Out: both as one small JSON file,
-and this file in words.
+"""The content of `palpate status`: writes the state of the box and its last verdicts as a small
+JSON file, and shows this file in words.
 
-The file lies in memory (/run): it is written aside and renamed, so that a reader gets it whole, and
-never synced.
+The file is in memory (/run). It is written aside and renamed, so that a reader always gets a whole
+file, and never synced.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from appliance.core.types import Status, Verdict
 
 SCHEMA = 1
 VERDICTS = 20
-"""How many of the latest verdicts the file holds."""
+"""Number of the latest verdicts in the file."""
 PERIOD_NS = 1_000_000_000
 SOON_NS = 100_000_000
-"""A verdict, or another state of the skin, is written so soon after what was written before it."""
+"""Least time between two writes if there is a new verdict or state of the skin."""
 STALE_NS = 10_000_000_000
-"""A file that has not changed for so long belongs to a program that hangs: it is the unit's
+"""A file that has not changed for this long belongs to a program that hangs; it is the unit's
 watchdog time."""
 MOST_BYTES = 1 << 20
 _START = "systemctl start palpate, then see journalctl -u palpate"
@@ -42,8 +42,8 @@ WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 class Report:
     """The state of the box as an object for JSON, in the status file and in the feed.
 
-    clock: the host's real one, which a reader in another process shares. more: further facts for
-    JSON; a text among them is a line of its own in words, unless it is empty.
+    clock: the real clock of the host, which a reader in another process shares. more: further facts
+    for JSON; `lines` shows each text among them as a line of its own, unless it is empty.
     """
 
     def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
@@ -51,7 +51,6 @@ class Report:
         self._since_ns = clock.now_ns()
 
     def __call__(self, health: Health) -> dict[str, Any]:
-        """The state now."""
         return {
             **self._more(),
             **asdict(health),
@@ -63,8 +62,8 @@ class Report:
 
 
 class StatusFile(Observer):
-    """Writes the state of the box and its latest answers; removed when the program has ended in
-    order.
+    """Writes the state of the box and its latest answers. The file is removed when the program ends
+    in order.
 
     clock, more: as for Report.
     """
@@ -79,12 +78,12 @@ class StatusFile(Observer):
         self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
 
     def answered(self, verdict: Verdict) -> None:
-        """Have a verdict written at the end of the turn."""
+        """Note a verdict; it is written at the end of the turn."""
         self._verdicts.append(verdict.as_dict(arrays=False))
         self._fresh = True
 
     def turn(self, health: Health) -> None:
-        """Write once a second, and soon after a verdict or another state of the skin."""
+        """Write once a second, and soon after a verdict or a new state of the skin."""
         now_ns = self._clock.now_ns()
         if health.skin != self._skin:
             self._skin, self._fresh = health.skin, True
@@ -92,29 +91,28 @@ class StatusFile(Observer):
             return
         self._next_ns, self._fresh = now_ns + PERIOD_NS, False
         report = self._report(health) | {"schema": SCHEMA, "verdicts": list(self._verdicts)}
-        # every user of the box may ask; the file lies in memory (/run), and on a card one sync a
-        # second would wear it
+        # every user of the box may read it; it is in memory (/run), so a card does not wear from a
+        # sync a second
         self._log.attempt(
             lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644)
         )
 
     def stopping(self) -> None:
-        """Remove the file: what it says no longer holds."""
+        """Remove the file, which is not true any more."""
         self._log.attempt(lambda: self._path.unlink(missing_ok=True))
 
 
 def read(path: Path, now_ns: int) -> dict[str, Any]:
-    """The content of the file, with `running`, and `why` where the service does not run. now_ns: of
-    the clock that writes it.
+    """The content of the file, with `running`, and `why` if the service does not run. now_ns: of
+    the writer's clock.
 
-    Raises FormatError where the file is not one of this version, ApplianceError where it may not be
-    read.
+    Raises FormatError for a file of another version, ApplianceError if it may not be read.
     """
     try:
         with path.open("rb") as f:
             report = json.loads(f.read(MOST_BYTES))
         if not isinstance(report, dict) or report.get("schema") != SCHEMA:
-            raise TypeError(f"no object of schema {SCHEMA}")
+            raise TypeError(f"not an object of schema {SCHEMA}")
         pid, age_ns = int(report["pid"]), now_ns - int(report["time_ns"])
         report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
         Health(**{name: report[name] for name in Health.__slots__})
@@ -132,17 +130,20 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     why = ""
     if (
         not _alive(pid) or age_ns < 0
-    ):  # a file of before the last boot can be ahead of this boot's clock
+    ):  # a file from before the last boot can be ahead of this boot's clock
         why = f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
-        why = f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's watchdog restarts it"
+        why = (
+            f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's "
+            "watchdog restarts it"
+        )
     return report | {"running": not why, "why": why}
 
 
 def _alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except PermissionError:  # another user's
+    except PermissionError:  # another user's process
         return True
     except (OSError, OverflowError):
         return False
@@ -150,14 +151,14 @@ def _alive(pid: int) -> bool:
 
 
 def exit_code(report: Mapping[str, Any]) -> int:
-    """0 where all is well; 69 where the skin is away, 1 where it does not run."""
+    """0 if all is well, 69 if the skin is away, 1 if the service does not run."""
     if not report["running"]:
         return NOT_RUNNING
     return WELL if report["streams"] else SKIN_AWAY
 
 
 def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
-    """What `read` gave, in words: first the state and what to do, then the last verdicts, the
+    """The result of `read` in words: first the state and the remedy, then the last verdicts, the
     newest first."""
     if not report["running"]:
         return [f"not running: {report['why']}"]
@@ -197,17 +198,17 @@ def _skin(report: Mapping[str, Any]) -> str:
     if report["overflows"]:
         counted += f", {report['overflows']:,} transfers too large"
     if report["fifo_overflows"]:
-        counted += f", {report['fifo_overflows']:,} times the board's FIFO was full"
+        counted += f", {report['fifo_overflows']:,} times the readout board's FIFO was full"
     if report["enumerations"] > 1:
         counted += f", plugged in {report['enumerations']} times"
     return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"
 
 
 def _trigger(report: Mapping[str, Any]) -> str:
-    """What was wrong with the trigger lines, "" where nothing was."""
+    """The troubles of the trigger's GPIO lines, "" for none."""
     counts = {"glitches": "glitches", "lost_edges": "edges lost", "storms": "storms of edges"}
     found = [f"{report[name]:,} {text}" for name, text in counts.items() if report[name]]
-    return f"{', '.join(found)}; check the trigger lines" if found else ""
+    return f"{', '.join(found)}; check the GPIO lines of the trigger" if found else ""
 
 
 def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
@@ -222,7 +223,7 @@ def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
 
 
 def _span(ns: int) -> str:
-    """A time for a person: its two largest parts of days, hours, minutes, seconds."""
+    """A time for a person: its two largest units of days, hours, minutes, seconds."""
     s = max(0, ns) // 1_000_000_000
     parts = [(s // 86400, "d"), (s // 3600 % 24, "h"), (s // 60 % 60, "min"), (s % 60, "s")]
     first = next((i for i, (n, _) in enumerate(parts) if n), len(parts) - 1)

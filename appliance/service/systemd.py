@@ -1,7 +1,5 @@
-"""The box as a service of systemd. In: health each turn, verdicts. Out: READY, STATUS, WATCHDOG and
-STOPPING as datagrams (sd_notify) to the socket that systemd names in the environment, and a log
-line for each verdict.
-"""
+"""The box as a service of systemd: sends READY, STATUS, WATCHDOG and STOPPING as datagrams
+(sd_notify) to the socket named in the environment, and logs a line for each verdict."""
 
 from __future__ import annotations
 
@@ -24,25 +22,25 @@ the loop."""
 
 
 class Notifier(Observer):
-    """Sends systemd the state of the box. Never waits: what the socket does not accept is sent
-    again next turn.
+    """Sends systemd the state of the box. Never waits: a message that the socket does not accept is
+    sent again in the next turn.
 
-    environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID as systemd sets them. clock: a real one;
-    systemd's watchdog does not wait for a simulated one. Raises ConfigError where WATCHDOG_USEC is
-    no number.
+    environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID, set by systemd. clock: a real clock, as
+    systemd's watchdog does not follow a simulated clock. Raises ConfigError if WATCHDOG_USEC is not
+    a number.
     """
 
     def __init__(self, clock: Clock, environ: Mapping[str, str] = os.environ) -> None:
         self._clock = clock
         self._address = environ.get("NOTIFY_SOCKET", "")
-        if self._address.startswith("@"):  # abstract: it has no place in the file system
+        if self._address.startswith("@"):  # abstract, without a place in the file system
             self._address = "\0" + self._address[1:]
         self._watchdog_us = _watchdog_us(environ)
         self._next_ns = clock.now_ns()
         self._ready, self._status = False, ""
 
     def turn(self, health: Health) -> None:
-        """Feed the watchdog, and send what is new. Once READY, always READY."""
+        """Feed the watchdog, and send changes. Once READY, always READY."""
         ready, status = health.streams, health.text
         now_ns = self._clock.now_ns()
         due = self._watchdog_us > 0 and now_ns >= self._next_ns
@@ -51,12 +49,13 @@ class Notifier(Observer):
         if status != self._status:
             messages.append(
                 "STATUS=" + " ".join(status.splitlines())
-            )  # a line of its own would be another message
+            )  # a line break would begin another message
         if ready and not self._ready:
             messages.append("READY=1")
         if due:
             messages.append("WATCHDOG=1")
-            if not ready:  # the watchdog begins with READY; until then each turn extends the time for the start
+            # the watchdog begins with READY; until then each turn extends the time for the start
+            if not ready:
                 messages.append(f"EXTEND_TIMEOUT_USEC={self._watchdog_us}")
         if messages and self._send(messages):
             self._ready, self._status = ready, status
@@ -64,7 +63,7 @@ class Notifier(Observer):
                 self._next_ns = now_ns + self._watchdog_us * 1000 // FEEDS
 
     def stopping(self) -> None:
-        """Say that the program is about to end."""
+        """Announce that the program is about to end."""
         self._send(["STOPPING=1"])
 
     def _send(self, messages: list[str]) -> bool:
@@ -76,17 +75,18 @@ class Notifier(Observer):
                 manager.sendto("\n".join(messages).encode(errors="replace"), self._address)
         except (
             OSError
-        ):  # gone, or full: a fault of the service manager must not become one of the robot's
+        ):  # gone, or full: a fault of the service manager must not become a fault of the robot
             return False
         return True
 
 
 def _watchdog_us(environ: Mapping[str, str]) -> int:
-    """Microseconds of this process's watchdog, 0 where there is none."""
+    """Microseconds of this process's watchdog, 0 if it has none."""
     text, pid = environ.get("WATCHDOG_USEC", "0"), environ.get("WATCHDOG_PID")
     if not text.isdecimal():
         raise ConfigError(
-            f"WATCHDOG_USEC={text} is no number of microseconds; leave it to systemd, or unset it"
+            f"WATCHDOG_USEC={text} is not a number of microseconds; leave it to systemd, or unset "
+            "it"
         )
     return int(text) if pid in (None, str(os.getpid())) else 0
 
@@ -103,15 +103,18 @@ def words(v: Verdict) -> str:
     fused = f" after {v.fused} sweeps" if v.fused > 1 else ""
     early = f", early at {v.share:.0%} of the window".replace("%", " %") if v.share < 1 else ""
     detail = f"; {v.detail}" if v.detail else ""
-    return f"sweep {v.sweep}: {what}, {100 * v.probability:.1f} %{fused}{early} ({v.latency_ns / 1e6:.1f} ms){detail}"
+    return (
+        f"sweep {v.sweep}: {what}, {100 * v.probability:.1f} %{fused}{early} "
+        f"({v.latency_ns / 1e6:.1f} ms){detail}"
+    )
 
 
 class VerdictLog(Observer):
     """Logs each verdict as one line."""
 
     def answered(self, verdict: Verdict) -> None:
-        """Log it; one without an answer, or of a finger that lies elsewhere than in training, is a
-        warning."""
+        """Log a verdict; as a warning if it has no answer, or shows a displacement of the
+        contact."""
         fine = (
             verdict.status.classified or verdict.status is Status.ABORTED
         ) and not verdict.displacement

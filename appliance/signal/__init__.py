@@ -1,2 +1,2 @@
-"""Computed from the raw counts of a sweep: the paper's features, and the position of the
-contact."""
+"""Functions of the raw counts of a sweep: the paper's features, checks of a window, and the
+position of the contact."""

@@ -1,11 +1,11 @@
-"""Position of the contact on the skin. In: raw counts of a contact. Out: its centre, and its
-distance from the trained one.
+"""Position of the contact on the skin: its centre, and its distance from the trained positions.
+Pure functions of raw counts.
 
-Pure functions. The classifier calls them once per sweep, to detect that the skin has moved;
-`alignment` many times per second, to show it to a person. Taxels measure a contact only where they
-are: if it extends beyond the skin's edge, its centre is computed too close to the skin's middle.
-The distance is then too small but never has the wrong sign, so that a person who follows it and
-measures again arrives. Of a skin with several axes only the normal one counts.
+The classifier calls them once per sweep to detect a displacement of the contact; `alignment` calls
+them many times per second to show it. If the contact extends beyond the skin's edge, no taxel
+measures that part, so the computed centre is too close to the middle of the skin. The distance is
+then too small but never has the wrong sign, so following it and measuring again leads to the right
+position. For a skin with several axes only the normal axis counts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_POSITIONS, MOST_MM = 1000, 1e6
 """Largest number of positions in a bundle, since each sweep is compared with all of them; largest
 length, 1 km."""
 LEAST_PART = 0.25
-"""A direction with a smaller share of the distance is not named: it changes the distance by less
+"""A direction with a smaller share of the distance is left out: it changes the distance by less
 than 3 %."""
 IN_PLACE = "in place"
 
@@ -37,7 +37,7 @@ class ContactPositions:
 
     pitch_mm: distance between taxels. rows_mm, cols_mm: one entry per position, mm from the centre
     of taxel 1.1 (row 1, column 1) towards higher rows and columns. limit_mm: a sweep whose centre
-    is farther than this from the nearest position counts as moved.
+    is farther than this from the nearest position counts as displaced.
     """
 
     pitch_mm: float
@@ -71,8 +71,8 @@ class ContactPositions:
             )
 
     def offset(self, centre: Point) -> Point:
-        """Vector from the nearest trained position to `centre` (in taxels, as from `centre()`): mm
-        along rows, columns."""
+        """Vector from the nearest trained position to `centre` (in taxels, from `centre()`): mm
+        along rows and columns."""
         rows = centre[0] * self.pitch_mm - np.array(self.rows_mm)
         cols = centre[1] * self.pitch_mm - np.array(self.cols_mm)
         nearest = np.hypot(rows, cols).argmin()
@@ -95,9 +95,9 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     counts [R, C] or [R, C, A] of the unloaded skin. contact: counts above the tare from which a
     taxel is loaded (the bundle's threshold). The centre is the mean position of the loaded taxels,
     weighted by their mean load: the centre of pressure of the part that the skin covers. A fit of
-    the contact's shape would have no bias towards the skin's middle, but the gains of taxels differ
-    between attachments, and that causes larger errors in a fit. A saturated taxel counts at full
-    scale.
+    the contact's shape would have no bias towards the middle of the skin, but the gains of taxels
+    differ between attachments, which causes larger errors in a fit. A saturated taxel counts at
+    full scale.
     """
     taxels, tare = normal(taxels, 1), normal(tare, 0)
     series = np.ascontiguousarray(
@@ -113,9 +113,9 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
 
 
 def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`load` [R, C] in counts (0 and less: not loaded) with dead taxels filled in: a silent one
-    between two loaded ones of its row or column gets their mean. A contact has no hole, and a hole
-    would shift its centre."""
+    """`load` [R, C] in counts (0 or less: not loaded) with dead taxels filled in: an unloaded taxel
+    between two loaded taxels of its row or column gets their mean. A contact has no hole, and a
+    hole would shift its centre."""
     if (load > 0).all():
         return load
     padded = np.zeros((load.shape[0] + 2, load.shape[1] + 2))
@@ -133,8 +133,8 @@ def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def advice(offset: Point, shape: Sequence[int]) -> str:
     """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape`
-    [R, C], for example "2.1 mm too far towards row 4". The larger direction comes first; one below
-    LEAST_PART is left out."""
+    [R, C], for example "2.1 mm too far towards row 4". The larger direction comes first; a
+    direction below LEAST_PART is left out."""
     least = LEAST_PART * np.hypot(*offset)
     parts = [
         (abs(mm), f"{name} {n if mm > 0 else 1}")
@@ -150,8 +150,8 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
 def displacement(
     taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions
 ) -> str:
-    """ "" if the contact of a sweep is at a trained position, otherwise for example "moved 2.1 mm
-    too far towards row 4". taxels, tare, contact: as for `centre`."""
+    """The displacement of a sweep's contact from the trained positions, for example "moved 2.1 mm
+    too far towards row 4"; "" if there is none. taxels, tare, contact: as for `centre`."""
     found = centre(taxels, tare, contact)
     if found is None or positions.within(offset := positions.offset(found)):
         return ""

@@ -1,14 +1,14 @@
-"""Features of the paper's classical classifiers, its equations 1 to 5. In: raw counts of one
-window, frame rate. Out: taxel weights [M], L-features [3] and H-features [short windows x bands].
-Pure functions of numpy arrays.
+"""Features of the paper's classical classifiers, its equations 1 to 5: taxel weights [M],
+L-features [3] and H-features [short windows x bands] of the raw counts of a window. Pure functions
+of numpy arrays.
 
-Raw counts are [T, R, C], or [T, R, C, A] where a taxel has several axes: each is then a time series
-of its own, and the taxel's weight comes from its normal axis.
+Raw counts are [T, R, C], or [T, R, C, A] if a taxel has several axes. Each axis is then a time
+series of its own, and the taxel's weight comes from its normal axis.
 
 Any grid, rate and data type is possible. Where the paper's formulas leave a choice, the docstring
-says what was chosen. Two rules hold for every rate. A band ends at the Nyquist frequency if that is
-below its upper edge. A band without any bin of the spectrum gets the first bin above its lower
-edge, or the highest bin.
+states ours. Two rules hold for every rate. A band ends at the Nyquist frequency if that is below
+its upper edge. A band without any bin of the spectrum gets the first bin above its lower edge, or
+the highest bin.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def taxel_weights(taxels: NDArray[Any]) -> Array:
 
     A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so
     that no weight is negative or grows without bound where means cancel. If no mean is positive all
-    weights are 1 / M. Raises FormatError for an array that is no sweep.
+    weights are 1 / M. Raises FormatError if the array is not a sweep.
     """
     return time_series.weights(time_series.of(taxels), axes(taxels))
 
@@ -59,9 +59,9 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
 
     A linear trend is removed from each taxel, so that drift does not leak into the low bands. A
     centroid is the power-weighted mean frequency of each taxel in the band, averaged with the
-    weights of eq. 4. The mean power divides by B - A, as printed. Every bin's power is at least
+    weights of eq. 4. The mean power is divided by B - A, as printed. Every bin's power is at least
     FLOOR, so that a silent skin gives about log(M * FLOOR) and the middle of each band. One frame
-    is enough. Raises FormatError for an array that is no sweep or an invalid rate.
+    is enough. Raises FormatError if the array is not a sweep, or for an invalid rate.
     """
     x = time_series.of(taxels)
     time_series.check_rate(rate_hz)
@@ -97,7 +97,7 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     less. Short window l starts with the first frame at or after l * 0.05 s. The mean of its frames
     is subtracted before the window function is applied. Taxels are added with the weights of eq. 4,
     and each short window is divided by its sum over q: it sums to 1, or is 0 if silent. Raises
-    FormatError as `h_shape`, for an array that is no sweep, and for an unknown window function.
+    FormatError as `h_shape` does, if the array is not a sweep, and for an unknown window function.
     """
     x = time_series.of(taxels)
     frames = x.shape[1]
@@ -157,7 +157,7 @@ def _centroid(
 
 
 def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
-    """(W, K): frames in a short window, and the highest of its bins that is used."""
+    """(W, K): number of frames in a short window, and its highest bin that is used."""
     time_series.check_rate(rate_hz)
     width = round(WINDOW_S * rate_hz)
     if HOP_S * rate_hz < 1:

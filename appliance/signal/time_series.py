@@ -1,7 +1,6 @@
-"""One window as time series, the basis of all features. In: raw counts [T, R, C] or [T, R, C, A].
-Out: float64 [M, T] with M = R * C * A, the axes of a taxel side by side; means, taxel weights,
-detrended series and power spectra. Pure functions of numpy arrays.
-"""
+"""One window as time series, the basis of all features: raw counts become float64 [M, T] with M = R
+* C * A, the axes of a taxel side by side. Means, taxel weights, detrended series and power spectra.
+Pure functions of numpy arrays."""
 
 from __future__ import annotations
 
@@ -25,10 +24,11 @@ means were removed). Means of unsigned counts are this small only in windows of 
 
 def of(taxels: NDArray[Any]) -> Array:
     """Raw counts [T, R, C] or [T, R, C, A] as one time series per taxel and axis, row by row:
-    float64 [M, T]. Raises FormatError for an array that is no sweep or not finite."""
+    float64 [M, T]. Raises FormatError if the array is not a sweep or not finite."""
     if taxels.ndim not in (3, 4) or taxels.size == 0:
         raise FormatError(
-            f"an array of shape {taxels.shape} is no sweep; use frames x rows x columns (x axes), "
+            f"an array of shape {taxels.shape} is not a sweep; use frames x rows x columns (x "
+            "axes), "
             "none of them 0"
         )
     x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)

@@ -1,8 +1,7 @@
-"""What the skin gives without contact, found while it streams. In: frames. Out: an UnloadedSkin,
-and whether it is certain.
+"""Finds the level and the noise of the unloaded skin while it streams.
 
-Nobody has to keep the finger off at a certain moment: an unloaded skin is quiet, and no quiet
-stretch is lower.
+Nobody has to lift the finger at a certain moment: a stretch of the signal without contact is quiet,
+and no other quiet stretch is lower.
 """
 
 from __future__ import annotations
@@ -16,27 +15,27 @@ from numpy.typing import NDArray
 from appliance.core.types import SweepFormat, normal
 
 BLOCK_S, LEAST_FRAMES = 0.1, 8
-"""Length of the stretches that are compared: a finger is lifted for longer than that between two
-sweeps."""
+"""Length of the stretches that are compared. Between two sweeps a finger is lifted for longer."""
 NOISE = 5.0
-"""A mean over time is a load if it differs from the unloaded skin by as many standard deviations of
-one frame."""
+"""A mean over time is a load if it differs from the unloaded skin by this many standard deviations
+of one frame."""
 LEAST_COUNTS = 2.0
-"""The same for whole counts, whose noise may lie below one count."""
+"""The same for whole counts, whose noise may be below one count."""
 QUIET = 2.0
-"""Stretches whose noise differs by no more than this factor are equally quiet."""
+"""Stretches whose noise differs by at most this factor are equally quiet."""
 TOUCH = 5.0
-"""A stretch that differs by as many times what is a load was certainly a touch."""
+"""A stretch that differs by this many times the least load was certainly a touch."""
 
 LEAST_SHARE = 0.1
-"""A stretch is lower than another by at least this share of what is a load; less is noise."""
+"""A stretch counts as lower than another from this share of the least load on; a smaller difference
+is noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnloadedSkin:
     """The skin without contact. level, noise: mean and standard deviation of the counts of each
-    taxel, of the shape of a frame. contact: least difference from `level`, in counts, that is a
-    load."""
+    taxel, of the shape of a frame. contact: least difference from `level` that is a load, in
+    counts."""
 
     level: NDArray[np.float64]
     noise: NDArray[np.float64]
@@ -44,7 +43,7 @@ class UnloadedSkin:
 
     @classmethod
     def measured(cls, taxels: NDArray[Any]) -> UnloadedSkin:
-        """From frames of a skin that nothing touches, raw counts [n, R, C] or [n, R, C, A]."""
+        """From frames of an untouched skin, raw counts [n, R, C] or [n, R, C, A]."""
         return cls.of(
             taxels.mean(axis=0, dtype=np.float64),
             taxels.std(axis=0, dtype=np.float64),
@@ -55,16 +54,16 @@ class UnloadedSkin:
     def of(
         cls, level: NDArray[np.float64], noise: NDArray[np.float64], counts: np.dtype[Any]
     ) -> UnloadedSkin:
-        """From mean and standard deviation of each taxel. counts: the type of the raw counts."""
+        """From mean and standard deviation of each taxel. counts: data type of the raw counts."""
         contact = NOISE * _median(noise)
         return cls(level, noise, contact if counts.kind == "f" else max(contact, LEAST_COUNTS))
 
 
 class UnloadedTracker:
-    """Follows the stream. skin: the quietest, and of the quiet ones the lowest stretch so far; None
-    before the first.
+    """Follows the stream. skin: the lowest of the quiet stretches so far; None before the first.
 
-    certain: whether the skin was also touched since then, so that it was not sliding all the time.
+    certain: whether the skin was also touched since then. If it was not, the finger may have been
+    sliding all the time.
     """
 
     def __init__(self, format: SweepFormat) -> None:
@@ -72,18 +71,18 @@ class UnloadedTracker:
         self.restart()
 
     def restart(self) -> None:
-        """This may be another skin than before."""
+        """Begin again: this may be another skin."""
         self.skin: UnloadedSkin | None = None
         self.certain = self._given = False
         self._waiting: list[NDArray[Any]] = []
         self._frames = 0
 
     def set(self, taxels: NDArray[Any]) -> None:
-        """A person says that nothing touched the skin in these frames [n, R, C]."""
+        """Take these frames [n, R, C] as those of an untouched skin, as a person has said."""
         self.skin, self.certain, self._given = UnloadedSkin.measured(taxels), True, True
 
     def put(self, taxels: NDArray[Any]) -> None:
-        """Frames [n, R, C] that have come."""
+        """Add new frames [n, R, C]."""
         if self._given:
             return
         self._waiting.append(taxels)
@@ -113,6 +112,6 @@ class UnloadedTracker:
 
 
 def _median(noise: NDArray[np.float64]) -> float:
-    """Noise of an ordinary taxel along the normal; one that is broken does not count."""
+    """Median noise of the taxels along the normal, so that a broken taxel does not count."""
     along = normal(noise, 0)
     return float(np.median(along[np.isfinite(along)])) if np.isfinite(along).any() else 0.0

@@ -1,8 +1,7 @@
-"""Checks a window without a model: contact, saturation, stuck and dead taxels. In: raw counts. Out:
-a Finding.
+"""Checks a window without a model: contact, saturation, stuck and dead taxels.
 
-Pure functions. `inspect` has the limits of a bundle; `inspect_bare` finds limits by what the
-unloaded skin gave.
+Pure functions. `inspect` uses the limits of a bundle; `inspect_bare` derives limits from the
+unloaded skin.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ from appliance.core.types import Status, normal
 from appliance.signal.unloaded import QUIET, UnloadedSkin
 
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
-"""Highest counts of usual converters; that of a skin is not announced."""
+"""Highest counts of common converters; a skin does not announce its own."""
 SHARE = 0.1
-"""A loaded taxel has at least this share of the strongest one's load, as in the limits of a bundle
-(train/export/pack)."""
+"""A loaded taxel has at least this share of the load of the strongest taxel, as in the limits of a
+bundle (train/export/pack)."""
 
 
 @dataclass(frozen=True, slots=True)
 class WindowLimits:
     """Limits for a window.
 
-    contact: least mean over time of a loaded taxel, in counts above the tare; None where nothing
-    tells a load from the unloaded skin, so that every taxel counts as loaded. full_scale: the
-    sensor's highest count. saturated: largest accepted share of full-scale counts. dead_taxels:
-    largest accepted number of these.
+    contact: least mean over time of a loaded taxel, in counts above the tare; None if a load cannot
+    be told from the unloaded skin, so that every taxel counts as loaded. full_scale: the sensor's
+    highest count. saturated: largest accepted share of full-scale counts. dead_taxels: largest
+    accepted number of dead taxels.
     """
 
     contact: float | None
@@ -41,16 +40,15 @@ class WindowLimits:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of the check of a window: status ok, or why it is refused, with the taxels in
-    `detail`."""
+    """Result of the check of a window: status ok, or another status with the taxels in `detail`."""
 
     status: Status
     detail: str = ""
 
 
 def _taxels(mask: NDArray[np.bool_]) -> str:
-    """The taxels of a mask [R, C, A], with their axes where only some of several are meant: "taxel
-    1.2 and 2.3 axis 1"."""
+    """The taxels of a mask [R, C, A], with their axes if not all of several are meant: "taxel 1.2
+    and 2.3 axis 1"."""
     named = []
     for r, c in np.argwhere(mask.any(axis=2)):
         axes = (
@@ -72,28 +70,28 @@ def inspect(
     """Check a window before it is classified. taxels: raw counts [T, R, C] or [T, R, C, A]; tare:
     counts [R, C] or [R, C, A] of the unloaded skin.
 
-    A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so that a
-    constant one is stuck. A constant unloaded taxel is dead if all its direct neighbours are
-    loaded; at the edge of the contact it may be unloaded. One that gives no numbers is always dead.
-    Shear has a sign, so that its axes are saturated at both ends. either_way: a load may also lower
+    A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so a constant
+    axis is stuck. A constant unloaded taxel is dead if all its direct neighbours are loaded; at the
+    edge of the contact it may be unloaded. A taxel whose counts are not numbers is always dead.
+    Shear has a sign, so shear axes are saturated at both ends. either_way: a load may also lower
     the counts.
     """
-    form = (*tare.shape, 1)[:3]  # [R, C, A]
+    shape = (*tare.shape, 1)[:3]  # [R, C, A]
     series = np.ascontiguousarray(
         taxels.reshape(len(taxels), -1).T
     )  # [R * C * A, T]: three times as fast to reduce
     highest, lowest = series.max(axis=1), series.min(axis=1)
-    still = (lowest == highest).reshape(form)
-    load = series.mean(axis=1, dtype=np.float64).reshape(form) - tare.reshape(form)
+    still = (lowest == highest).reshape(shape)
+    load = series.mean(axis=1, dtype=np.float64).reshape(shape) - tare.reshape(shape)
     load = np.abs(load) if either_way else load
     if not np.isfinite(
         load
-    ).all():  # possible with float32 counts; no output of the network is an answer then
+    ).all():  # possible with float32 counts; the network's output would then be meaningless
         return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
     loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
     if not loaded.any():
-        return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} digits")
-    full = _at_full_scale(series, highest, lowest, limits.full_scale, form)
+        return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} raw counts")
+    full = _at_full_scale(series, highest, lowest, limits.full_scale, shape)
     stuck = still & loaded & (full < 1)
     if stuck.any():
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
@@ -112,21 +110,21 @@ def _at_full_scale(
     highest: NDArray[Any],
     lowest: NDArray[Any],
     full_scale: float,
-    form: tuple[int, ...],
+    shape: tuple[int, ...],
 ) -> NDArray[np.float64]:
-    """Share of the frames at full scale, as `form` [R, C, A]; on shear axes at its negative,
+    """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative,
     too."""
-    full = np.zeros(form)
+    full = np.zeros(shape)
     if highest.max() >= full_scale:  # seldom; counting takes longer than all the rest
-        full = (series >= full_scale).mean(axis=1).reshape(form)
-    if form[2] > 1 and lowest.reshape(form)[..., :-1].min() <= -full_scale:
-        full[..., :-1] += (series <= -full_scale).mean(axis=1).reshape(form)[..., :-1]
+        full = (series >= full_scale).mean(axis=1).reshape(shape)
+    if shape[2] > 1 and lowest.reshape(shape)[..., :-1].min() <= -full_scale:
+        full[..., :-1] += (series <= -full_scale).mean(axis=1).reshape(shape)[..., :-1]
     return full
 
 
 def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether all direct neighbours of a taxel are loaded, bool [R, C]; what is beyond the skin's
-    edge counts as loaded."""
+    """Whether all direct neighbours of a taxel are loaded, bool [R, C]. Places beyond the skin's
+    edge count as loaded."""
     padded = np.ones((loaded.shape[0] + 2, loaded.shape[1] + 2), bool)
     padded[1:-1, 1:-1] = loaded
     enclosed: NDArray[np.bool_] = (
@@ -136,10 +134,10 @@ def _enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
-    """As `inspect`, for a skin of which no bundle says how strong a contact is, nor which count is
-    the highest.
+    """As `inspect`, for a skin without a bundle, so that the strength of a contact and the highest
+    count are unknown.
 
-    It refuses only what is certain: `no-contact` if no taxel differs from the unloaded skin, in
+    It refuses only certain cases: `no-contact` if no taxel differs from the unloaded skin, in
     either direction, and none vibrates; `saturated` if the highest count is one of FULL_SCALES.
     """
     load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - unloaded.level, 0))
@@ -148,7 +146,7 @@ def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
         strongest < unloaded.contact
         and UnloadedSkin.measured(taxels).contact > QUIET * unloaded.contact
     ):
-        return Finding(Status.OK)  # something slides over it
+        return Finding(Status.OK)  # the skin slides over something
     highest = float(taxels.max())
     full_scale = highest if highest in FULL_SCALES else np.inf
     limits = WindowLimits(max(unloaded.contact, SHARE * strongest), full_scale)

@@ -1,8 +1,5 @@
-"""Simulated devices for the real drivers. In: what the robot does (Acts). Out: SimDevices.
-
-Simulated are the robot, its lines (a double of gpiod) and the readout board (a pyusb backend). The
-drivers are the real ones.
-"""
+"""Simulated devices for the real drivers, built from the acts of the robot: the robot, its GPIO
+lines (a double of gpiod) and the readout board (a pyusb backend)."""
 
 from __future__ import annotations
 
@@ -22,13 +19,14 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotDevices(Devices):
-    """Simulated lines with the robot that acts on them. robot.played: what it did, for scoring."""
+    """Simulated GPIO lines with the robot that acts on them. robot.played: the acts so far, for
+    scoring."""
 
     gpio: gpio.SimGpio
     robot: rig.Robot
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated lines; a trigger without lines stays."""
+        """The settings with the simulated GPIO lines; a trigger without lines stays."""
         wires = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
         trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
         if trigger.by_lines:
@@ -56,7 +54,7 @@ class SimDevices(RobotDevices):
     backend: usb.RigBackend
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated lines and skin."""
+        """The settings with the simulated GPIO lines and skin."""
         ids = {
             "usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}",
             "profile": "palpate",
@@ -70,7 +68,8 @@ class SimDevices(RobotDevices):
 def robot_on_lines(
     acts: Iterable[rig.Act], clock: Clock, *, stops: bool = True, remember: bool = True
 ) -> tuple[rig.Robot, gpio.SimGpio]:
-    """A robot that plays `acts`, and the lines that it drives. stops, remember: see `build`."""
+    """A robot that plays `acts`, and the GPIO lines that it drives. stops, remember: see
+    `build`."""
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
     lines = gpio.SimGpio(
         clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember
@@ -93,8 +92,8 @@ def build(
     stops: bool = True,
     remember: bool = True,
 ) -> SimDevices:
-    """Devices on which a robot plays `acts`. source: the name of the source in sentences. acm: the
-    board is a CDC-ACM device. stops: the robot ends its slide after DECIDED.
+    """Devices on which a robot plays `acts`. source: name of the source in sentences. acm: the
+    readout board is a CDC-ACM device. stops: the robot ends its slide after DECIDED.
 
     remember: keep all acts and all output levels, to examine them later; without it memory does not
     grow.

@@ -1,9 +1,8 @@
 """Simulated GPIO: a double of the module gpiod (libgpiod v2) below the real trigger and output
 drivers.
 
-In: levels of named inputs, each with its time. Out: edge events as the kernel queues and drops
-them, and a list of what was written to outputs. Simulated are chips, lines and requests; enums,
-settings, events and errors are gpiod's.
+It gives edge events as the kernel queues and drops them, and lists the levels written to outputs.
+Chips, lines and requests are simulated; enums, settings, events and errors are gpiod's own.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ RequestConfig = Mapping[Iterable[int], gpiod.LineSettings]  # offsets on a chip 
 
 
 class SimGpio:
-    """Replaces the module gpiod. chips: path (/dev/gpiochip0 and so on) -> its line names, '' for
-    an unnamed line.
+    """Replaces the module gpiod. chips: path (/dev/gpiochip0 and so on) -> names of its lines, ''
+    for an unnamed line.
 
     written: (t_ns, name, level) of each level that was written to an output, in order; empty
     without `remember`. requests: the present line requests. watchers: output line -> function that
@@ -107,7 +106,7 @@ class SimGpio:
         return now_ns
 
     def check(self, path: str) -> None:
-        """Raise OSError if the chip is to refuse."""
+        """Raises OSError if the chip is set to refuse."""
         if path in self.refuse:
             raise OSError(self.refuse[path], os.strerror(self.refuse[path]), path)
 
@@ -134,7 +133,7 @@ class SimRequest:
         self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}
 
     def notice(self, name: str, level: bool, t_ns: int) -> None:
-        """An input has got a level: queue an event if that is an edge of the requested kind."""
+        """An input has a new level: queue an event if that is an edge of the requested kind."""
         for offset in (o for o, n in self.names.items() if n == name and self._levels[o] != level):
             self._levels[offset] = level
             rise = level != self.settings[offset].active_low

@@ -1,8 +1,8 @@
-"""The simulated robot and readout board on one timeline, and clocks that can skip time. In: Acts
-(the frames of one sweep and the positions of its edges). Out: packets as in PROTOCOL.md and edges,
-each at its time.
+"""The simulated robot and readout board on one timeline, and clocks that can skip time. Acts (the
+frames of a sweep and the positions of its edges) become packets as in PROTOCOL.md and edges, each
+at its time.
 
-`usb` presents the board to pyusb, `gpio` the edges to the drivers.
+`usb` presents the readout board to pyusb, `gpio` the edges to the drivers.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from appliance.io import packets
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
 REACTION_NS = 20_000_000
-"""Time that the finger continues to slide after DECIDED has risen."""
+"""Time for which the finger continues to slide after DECIDED has risen."""
 
 
 class VirtualClock:
-    """Time that passes only in `sleep_until`: minutes are simulated in a fraction of a second,
-    reproducibly."""
+    """Time that passes only in `sleep_until`, so that minutes are simulated in a fraction of a
+    second, reproducibly."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
@@ -44,8 +44,8 @@ class VirtualClock:
 
 
 class SkippingClock:
-    """Real time without waiting: computing takes real time, sleeping none. For measuring the box's
-    computing time."""
+    """Real time without waiting: computing takes real time, sleeping takes none. For measuring the
+    computing time of the box."""
 
     def __init__(self) -> None:
         self._skipped_ns = 0
@@ -72,7 +72,7 @@ class Act:
 
 
 class EdgeLines(Protocol):
-    """Takes the robot's edges: SimGpio, or a test's list."""
+    """Receives the robot's edges: SimGpio, or a list of a test."""
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
         """Set the input line `name` to `level` at `t_ns`."""
@@ -87,9 +87,9 @@ class Robot:
     """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their
     frames.
 
-    acts: number that it has begun. played: the acts as they were played; without `remember` only
-    the newest. skipped: frame numbers [from, to) that were omitted because it stopped early; the
-    board leaves them out.
+    acts: number of acts that it has begun. played: the acts as they were played; without `remember`
+    only the newest. skipped: frame numbers [from, to) that were omitted because it stopped early;
+    the readout board leaves them out.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Robot:
 
 
 class Film:
-    """The frames of a robot's acts, one after the other, as a skin of the form `format` sees them."""
+    """The frames of a robot's acts, one after the other, as seen by a skin of this format."""
 
     def __init__(self, format: SweepFormat, robot: Robot) -> None:
         self._robot = robot
@@ -168,11 +168,11 @@ class Film:
         self._base = 0  # number of the first frame in _frames
 
     def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
-        """Frames `first` to `first + n` of the script [n, *shape], asked for in order; after its
+        """Frames `first` to `first + n` of the script [n, *shape], requested in order; after its
         end all counts are 0.
 
-        frame_ns: gives the host time at which a frame is taken; the edges of an act are driven by
-        it.
+        frame_ns: gives the host time at which a frame is taken, and so the times of the edges of an
+        act.
         """
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
@@ -233,7 +233,8 @@ class Board:
         self._origin_ns = clock.now_ns()
         self._first_seq = first_seq
         self._next = 0  # number of the next frame to send
-        self._arrival_ns: int | None = None  # of the packet that begins with this frame, once drawn
+        # arrival of the packet that begins with this frame, once drawn
+        self._arrival_ns: int | None = None
         self._film = Film(format, robot)
 
     def frame_ns(self, i: int) -> int:
@@ -258,7 +259,8 @@ class Board:
         return None
 
     def due_ns(self) -> int | None:
-        """Time at which the next packet will be on the bus; None while the board does not send."""
+        """Time at which the next packet will be on the bus; None while the readout board does not
+        send."""
         if not self.running:
             return None
         if self._arrival_ns is None:
@@ -268,7 +270,7 @@ class Board:
         return self._arrival_ns
 
     def take(self) -> bytes:
-        """The packet that is due; if the FIFO has overflowed, without the oldest frames."""
+        """The packet that is due. If the FIFO has overflowed, the oldest frames are missing."""
         n, fifo = self.skin.packet_frames, self.skin.fifo_frames
         taken = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
         late = max(0, taken - fifo - self._next)

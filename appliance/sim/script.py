@@ -1,6 +1,5 @@
-"""Scripts for the simulated robot. In: the name after `--sim`. Out: Acts: sweeps over simulated
-tubes, a finger at rest, or the sweeps of a recorded set, whose windows are exactly the middle of
-the played sweeps.
+"""Scripts for the simulated robot, by the name after `--sim`: sweeps over simulated tubes, a finger
+at rest, or the sweeps of a recorded set, whose windows are exactly the middle of the played sweeps.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from appliance.sim.rig import Act
 
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14
-"""Time that the finger is off the tube before and after a sweep; drawn for each one, so that edges
-fall anywhere within packets."""
+"""Time for which the finger is off the tube before and after a sweep. It is drawn for each sweep,
+so that edges come anywhere within packets."""
 PAUSE_FRAMES = 12
-"""Least frames for which it is off, so that a slow skin is seen unloaded, too."""
+"""Least number of frames without contact, so that a slow skin is seen unloaded, too."""
 SLIDE_S, REST_S = 3.0, 0.1
 """Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
 it."""
@@ -33,13 +32,13 @@ LEAD_S = 0.5
 """Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and last
 frame are repeated for this time."""
 LIFTED_SET_S = 0.4
-"""Time that the finger is lifted before a sweep of a set, which says nothing of the unloaded skin:
-all counts are 0."""
+"""Time for which the finger is lifted before a sweep of a set. A set does not record the unloaded
+skin, so all counts are 0."""
 RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
-"""Positions of the skin while somebody aligns it, each better than the last: (along the finger,
-across)."""
+"""Positions of the skin while somebody aligns it, each better than the one before: (along the
+finger, across). In mm."""
 RESTS_FOR_S, LIFTED_S = 3.0, 1.0
-"""Time that the finger then rests on the tube, and that it is lifted before."""
+"""Time for which the finger then rests on the tube, and for which it is lifted before."""
 MARGIN = 8
 """Frames before the start edge and after the stop edge."""
 
@@ -62,9 +61,9 @@ def named(
     """The script with this name after `--sim`, the name of the source in sentences, and the format
     of its sweeps.
 
-    format: what the bundle wants, None without one. spread: play the sweeps of a set in an order that
-    is drawn, the materials in turn. seen: the skin on the finger, None for the simulator's own.
-    Raises ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    format: wanted by the bundle, None without a bundle. spread: play the sweeps of a set in a drawn
+    order, the materials in turn. seen: the skin on the finger, None for the simulator's own. Raises
+    ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
@@ -101,12 +100,12 @@ def named(
 
 
 class SeenTubes(Protocol):
-    """What a skin on the finger sees: the module `skin`, or the view of another skin
+    """Tubes as seen by a skin on the finger: the module `skin`, or the view of another skin
     (`skins.sweeps`)."""
 
     @property
     def FORMAT(self) -> SweepFormat:
-        """The form of its frames."""
+        """Format of its sweeps."""
         ...
 
     def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]:
@@ -138,9 +137,9 @@ def tubes(
 ) -> Iterator[Act]:
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
-    sweeps: their number; None for no end. places: positions of the skin, the next one for each
-    round of six tubes; by default one that is drawn from `seed`. seen: through which skin. only:
-    over this tube alone. Raises ConfigError for an unknown one.
+    sweeps: their number; None for no end. places: positions of the skin, the next for each round of
+    six tubes; by default one position drawn from `seed`. seen: the skin on the finger. only: over
+    this tube alone. Raises ConfigError for an unknown tube.
     """
     materials = (world.tube(only).name,) if only else skin.MATERIALS
     return _tubes(
@@ -175,7 +174,7 @@ def _tubes(
 
 
 def rests(seed: int, world: skin.World = skin.WORLD, seen: SeenTubes = skin) -> Iterator[Act]:
-    """A finger that is lifted and put on the wooden tube again, without end; the skin is moved
+    """A finger that is lifted and put on the wooden tube again, without end. The skin is shifted
     between the touches."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)

@@ -1,11 +1,11 @@
-"""Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. In: the name of a
-material, the placement of the skin on the finger, a random generator. Out: raw counts uint8 [n, 4,
-4] at 750 Hz; of a skin that feels shear, too, int16 [n, 4, 4, 3].
+"""Simulated skin: a soft finger with a 4 x 4 tactile skin slides along a tube. Gives raw counts
+uint8 [n, 4, 4] at 750 Hz for a material and a placement of the skin on the finger; for a skin that
+feels shear, too, int16 [n, 4, 4, 3].
 
 The finger's pad is a bed of springs that is pressed on the tube. Each further effect is one
-function, named in `EFFECTS`, with its own random stream, so that `World(off=...)` removes one and
-leaves the others unchanged. Rows are along the direction of sliding (x), columns across the tube
-(y); row 3 leads.
+function, named in `EFFECTS`, with its own random stream, so that `World(off=...)` removes one
+effect and leaves the others unchanged. Rows are along the direction of sliding (x), columns across
+the tube (y); row 3 leads.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
 SHEAR_FORMAT = replace(FORMAT, dtype="int16", axes=3)
-"""Of a skin with three axes: shear along the sliding, shear across it, pressure; counts of 12 bits
-with a sign."""
+"""Format of a skin with three axes: shear along the sliding, shear across it, pressure; counts of
+12 bits with a sign."""
 SHEAR_FULL = 2047
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
 STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
@@ -230,9 +230,9 @@ def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World)
     """Effect: height [n, R, C] in mm under the taxels, averaged over their length. slid: int64 [n],
     path in frames.
 
-    Each column moves over its own track, on which the rows follow one another at the speed of
-    sliding. A skin that extends beyond the pad is not pressed down there: the further forward it
-    is, the more it follows the relief.
+    Each column slides over its own track, on which the rows follow one another at the speed of
+    sliding. A part of the skin that extends beyond the pad is not pressed down: the further forward
+    it is, the more it follows the relief.
     """
     if "texture" in world.off:
         return np.zeros((1, 1, 1))
@@ -275,8 +275,8 @@ def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World)
 
     Pressure is normal to the surface, which is tilted along the rows by the slope of the relief
     (`height` [n, R, C] in mm) and across by y / radius (`y` [R, C] in mm from the tube's crest).
-    While the finger is `moving` [n], friction adds its share of the pressure, vibrations included,
-    against the motion; at rest there is none.
+    While the finger slides (`moving` [n]), friction adds its share of the pressure, vibrations
+    included, against the motion; at rest there is none.
     """
     slope = np.diff(height, axis=0, prepend=height[:1]) / (
         STEP_MM * world.speed
@@ -299,8 +299,8 @@ def gap(x: Array, y: Array | float, world: World) -> Array:
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
-    """Indentation [n] in mm of the pad by `force_n` [n] in N, which the springs of the whole
-    contact area carry."""
+    """Indentation [n] in mm of the pad under `force_n` [n] in N, carried by the springs of the
+    whole contact area."""
     x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
     depth = np.linspace(0, 8, 161)
     pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
@@ -320,8 +320,8 @@ def digitize(signal: Array, world: World) -> Counts:
 def loaded(
     tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags
 ) -> Array:
-    """The readout's signal [n, R, C] or [n, R, C, 3] in counts of a finger in contact, before its
-    noise and its converter.
+    """The readout's signal [n, R, C] or [n, R, C, 3] in counts for a finger in contact, without
+    noise and conversion.
 
     slid: path along the tube in frames [n]. moving: [n].
     """

@@ -1,8 +1,7 @@
-"""A simulated USB bus: a pyusb backend with one readout board. In: a Board, and faults to simulate.
-Out: descriptors, replies, transfers, and the errnos of libusb.
+"""A simulated USB bus: a pyusb backend with one readout board. It gives descriptors, replies,
+transfers and the errnos of libusb, and can simulate faults.
 
-Simulated is libusb with everything below it; usb.core, usb.util and the drivers above are the real
-ones.
+libusb and everything below it is simulated; usb.core, usb.util and the drivers above are real.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ SPEED_FULL = 2
 
 
 class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
-    """A pyusb backend with one board on it.
+    """A pyusb backend with one readout board.
 
     errors: errno that all calls of a kind raise, by name ("claim", "open", "read" and so on).
-    mangle: changes the bytes of a transfer, as a bad cable. halted: the bulk endpoint stalls until
-    it is cleared. kernel_driver: cdc_acm holds the board. dtr: the host has said that it reads
-    (CDC-ACM).
+    mangle: changes the bytes of a transfer, as a bad cable does. halted: the bulk endpoint stalls
+    until it is cleared. kernel_driver: cdc_acm holds the device. dtr: the host has signalled that
+    it reads (CDC-ACM).
     """
 
     def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
@@ -51,7 +50,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         heapq.heappush(self._agenda, (t_ns, len(self._agenda), action))
 
     def unplug(self) -> None:
-        """Unplug the cable; the board loses its power."""
+        """Unplug the cable; the readout board loses its power."""
         self.board.present = self.board.running = False
 
     def plug(self) -> None:
@@ -158,7 +157,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def open_device(self, dev: str) -> str:
-        """pyusb: open the board."""
+        """pyusb: open the device."""
         self._touch("open")
         self._pending = b""
         return "handle"
@@ -172,7 +171,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return 1
 
     def claim_interface(self, handle: str, intf: int) -> None:
-        """pyusb: refuse while the kernel's driver holds the board, as Linux does."""
+        """pyusb: refuse while the kernel's driver holds the device, as Linux does."""
         self._touch("claim")
         if self.kernel_driver:
             raise usb.core.USBError("Resource busy", -6, errno.EBUSY)
@@ -182,11 +181,11 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self._touch()
 
     def is_kernel_driver_active(self, handle: str, intf: int) -> bool:
-        """pyusb: True for a CDC-ACM board that cdc_acm holds."""
+        """pyusb: True for a CDC-ACM device that cdc_acm holds."""
         return self.kernel_driver
 
     def detach_kernel_driver(self, handle: str, intf: int) -> None:
-        """pyusb: take the board from the kernel's driver."""
+        """pyusb: detach the kernel's driver."""
         self.kernel_driver = False
 
     def clear_halt(self, handle: str, ep: int) -> None:
@@ -224,7 +223,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return n
 
     def bulk_write(self, handle: str, ep: int, intf: int, data: array[int], ms: int) -> int:
-        """pyusb: request bytes of a CDC-ACM board."""
+        """pyusb: request bytes of a CDC-ACM device."""
         self._touch("write")
         for request in bytes(data):
             reply = self.board.request(request)
@@ -233,7 +232,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(data)
 
     def bulk_read(self, handle: str, ep: int, intf: int, buff: array[int], ms: int) -> int:
-        """pyusb: one transfer, at the time at which it arrives."""
+        """pyusb: one transfer, at the time of its arrival."""
         deadline_ns = self._clock.now_ns() + ms * 1_000_000
         while True:
             self._touch("read")

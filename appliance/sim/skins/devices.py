@@ -1,5 +1,5 @@
-"""A simulated robot whose skin is one that people own, on a terminal. In: the name of its profile,
-acts. Out: devices."""
+"""A simulated robot whose skin is an emulated skin on a terminal, built from the name of its
+profile and acts."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from appliance.sim.skins.wires import wire
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedDevices(RobotDevices):
-    """Simulated lines, and a skin that is played on a terminal. name: of its profile. folder: where
-    the terminal's link is, removed with this object."""
+    """Simulated GPIO lines, and a skin that is played on a terminal. name: of its profile. folder:
+    where the terminal's link is; removed with this object."""
 
     name: str
     player: Player
     folder: tempfile.TemporaryDirectory[str]
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated lines, and with the terminal as the skin's port."""
+        """The settings with the simulated GPIO lines, and with the terminal as the skin's port."""
         skin_config = replace(settings.skin, profile=self.name, port=str(self.player.path))
         return replace(RobotDevices.wire(self, settings), skin=skin_config)
 
 
 def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:
-    """A frame [R, C] or [R, C, A] as the skin itself sees it, before the profile turns it."""
+    """A frame [R, C] or [R, C, A] in the order of the skin's own grid, before the profile turns
+    it."""
     for turn in reversed(profile.orientation):  # each turn is its own inverse
         taxels = {
             "transpose": taxels.swapaxes(0, 1),
@@ -71,7 +72,7 @@ def build(
     """Devices on which a robot plays `acts`, sweeps of `format`, with the skin of this profile.
     source, remember: see `sim.devices.build`.
 
-    Raises ConfigError for a skin that has no emulator.
+    Raises ConfigError for a skin without an emulator.
     """
     playing = PlayerClock(clock)
     robot, lines = robot_on_lines(acts, playing, remember=remember)

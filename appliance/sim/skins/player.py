@@ -1,8 +1,7 @@
 """A skin on a terminal: plays frames through its wire into a pseudo-terminal, at its own rate or as
 fast as they are read.
 
-In: a wire, frames, a clock. Out: bytes at the near end, whose name is a link that comes and goes
-with the plug.
+A link to the near end stands for the plug: it comes and goes.
 """
 
 from __future__ import annotations
@@ -25,32 +24,32 @@ from appliance.core.clock import Clock, wait_readable
 from appliance.sim.skins.wires import Wire
 
 DRIVER_BYTES = 65_536
-"""What the kernel's driver of a real adapter holds for a slow reader, about; what comes then is
-thrown away."""
+"""Bytes that the kernel's driver of a real adapter keeps for a slow reader, about; further bytes
+are lost."""
 MOST_AT_ONCE = 1000
-"""Frames that one step makes, of those that are due. A computer that is too slow for the skin would
-fall behind more with each step, and its step never end."""
+"""Most frames of one step. A computer that is too slow for the skin would otherwise fall behind
+more with each step, and a step would never end."""
 LOOK_NS = 2_000_000
-"""Time between two looks for commands while nothing is due."""
+"""Time between two checks for commands while nothing is due."""
 
 
 class FrameSource(Protocol):
-    """Where the frames come from, by their number."""
+    """The source of frames, by their numbers."""
 
     def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
-        """Raw counts of frame `i`, asked for in order; numbers may be left out. frame_ns: the time
+        """Raw counts of frame `i`, requested in order; numbers may be left out. frame_ns: the time
         of a frame."""
         ...
 
 
 class Player:
-    """Plays a skin. It is plugged in from the beginning, and sends while some program has the
-    terminal open.
+    """Plays a skin. It is plugged in from the beginning, and sends while a program has the terminal
+    open.
 
     path: the link to the terminal. paced: frames come at the wire's rate by `clock`; else as fast
-    as they are read. collect_ns: the adapter passes on what it has this often (FTDI: 16 ms); 0 at
-    once. mangle: changes what is sent, as a bad cable. paused: the skin sends nothing. frames,
-    sent: number of frames and of bytes sent. thrown: bytes that nobody took.
+    as they are read. collect_ns: interval at which the adapter passes bytes on (FTDI: 16 ms); 0 at
+    once. mangle: changes the bytes, as a bad cable does. paused: the skin sends nothing. frames,
+    sent: number of frames and of bytes sent. thrown: bytes that nobody read in time.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Player:
         self.plug()
 
     def plug(self) -> None:
-        """A new terminal under the same link. Does nothing where it is plugged in."""
+        """A new terminal under the same link. Does nothing if it is plugged in."""
         if self._far >= 0:
             return
         self._far, near = os.openpty()
@@ -85,7 +84,7 @@ class Player:
         os.close(near)  # from now on the far end sees whether a program has it open
 
     def unplug(self) -> None:
-        """The terminal goes, and with it what it held."""
+        """Remove the terminal with all bytes in it."""
         if self._far >= 0:
             self.path.unlink()
             os.close(self._far)
@@ -107,7 +106,7 @@ class Player:
         return self._origin_ns + round((i - self._origin + 1) * self._period_ns)
 
     def due_ns(self) -> int:
-        """When something is to be sent next; commands are looked for at least every LOOK_NS."""
+        """The time of the next bytes; commands are checked at least every LOOK_NS."""
         look = self._clock.now_ns() + LOOK_NS
         if not self.opened or self.paused or not self.wire.streaming:
             return look
@@ -119,7 +118,7 @@ class Player:
         return min(due, look)
 
     def step(self) -> None:
-        """Obey the commands that have come, and send what is due."""
+        """Carry out the commands that have come, and send the bytes that are due."""
         if not self.opened:
             self._waiting = b""
             self._skip()
@@ -157,7 +156,7 @@ class Player:
         return about + (self.frame_ns(about) <= t_ns)
 
     def _skip(self) -> None:
-        """Frames that nobody is sent are gone."""
+        """Drop frames while nobody reads."""
         if self._paced:
             self._next = max(self._next, self._taken())
 
@@ -184,7 +183,7 @@ class Player:
         self.thrown += len(data[room:])
 
     def _obey(self) -> None:
-        with contextlib.suppress(BlockingIOError, OSError):  # nothing said; closed at this moment
+        with contextlib.suppress(BlockingIOError, OSError):  # no bytes; closed at this moment
             self._waiting += self.wire.hear(os.read(self._far, 4096))
 
     def _flush(self) -> None:
@@ -195,17 +194,16 @@ class Player:
 
 
 DELIVERY_S = 0.1
-"""Longest wait for the kernel to pass on what one end of a terminal wrote; it does so in its own
-time."""
+"""Longest wait until the kernel has passed on the bytes that one end of a terminal wrote."""
 SPIN_S = 5e-4
-"""Time for which that is awaited without sleeping."""
+"""Time of this wait without sleeping."""
 PORT_BYTES = 4000
-"""What the near end of a terminal can hold before it is read (4096 less the last line's end)."""
+"""Most bytes in the near end of a terminal before it is read (4096 less the last line's end)."""
 
 
 class PlayerClock:
-    """A clock whose waits play a skin: nothing is missed while the box sleeps, in real time as in
-    simulated time.
+    """A clock whose waits play a skin, so that no bytes are missed while the box sleeps, in real
+    and in simulated time.
 
     player: the skin; set before the box runs.
     """
@@ -215,17 +213,17 @@ class PlayerClock:
         self.player: Player | None = None
 
     def now_ns(self) -> int:
-        """The time of the clock below."""
+        """The time of the underlying clock."""
         return self._clock.now_ns()
 
     def sleep_until(self, t_ns: int) -> None:
-        """Sleep, and let the skin send what was due meanwhile."""
+        """Sleep, and send the bytes of the skin that become due."""
         self._clock.sleep_until(t_ns)
         if self.player:
             self.player.step()
 
     def wait_readable(self, fd: int, timeout_s: float) -> bool:
-        """Devices.wait: let time pass until the skin has sent something, at most `timeout_s`."""
+        """Devices.wait: let time pass until the skin has sent bytes, at most `timeout_s`."""
         assert self.player, "no skin is played"
         until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while True:
@@ -239,8 +237,8 @@ class PlayerClock:
 
 
 def _wait_for_bytes(fd: int, sent: int) -> bool:
-    """Whether something can be read from `fd`, once the kernel has delivered `sent` bytes; at once
-    if there are none."""
+    """Whether bytes can be read from `fd`, once the kernel has delivered `sent` bytes; at once if
+    there are none."""
     if not sent:
         return wait_readable(fd, 0)
     begin = time.monotonic()
@@ -249,7 +247,7 @@ def _wait_for_bytes(fd: int, sent: int) -> bool:
     ):
         if (
             waited > SPIN_S
-        ):  # it usually takes some 10 us; who sleeps on a busy machine is woken much later
+        ):  # it usually takes some 10 us; a sleeping thread on a busy machine wakes much later
             time.sleep(1e-4) if held else wait_readable(fd, DELIVERY_S)
     return wait_readable(fd, 0)
 

@@ -1,9 +1,8 @@
-"""Simulated sweeps as another skin sees them. In: the simulated finger, a skin's form and scale.
-Out: raw counts.
+"""Simulated sweeps as seen by another skin: the simulated finger with another grid, rate and scale.
 
 The finger and the tubes are those of `sim.skin`, whose parameters were fitted to one skin. Scale
-and noise here are round numbers and fitted to nothing: such sweeps show that a skin's way through
-the box works, and say nothing of how well that skin tells materials.
+and noise here are round numbers that were not fitted. Such sweeps test the way of a skin's data
+through the box. They do not show how well that skin distinguishes materials.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from appliance.sim import skin
 from appliance.sim.skin import Array, Placement, World
 
 SPAN_MM = 12.0
-"""From the first taxel to the last, along and across: as far as the simulated skin reaches on the
+"""From the first taxel to the last, along and across: the extent of the simulated skin on the
 finger."""
 
 
@@ -48,12 +47,12 @@ SCALES: Mapping[str, Scale] = {
     "xela-can": Scale(rest=20_000, gain=80, noise=30, most=0xF9FF),
     "robotiq-tsf": Scale(rest=12_000, gain=60, noise=20, most=0xFFFF),
 }
-"""Scales by the name of a profile; another skin counts as the simulated one does."""
+"""Scales by the name of a profile; all other skins have the scale of the simulated skin."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinView:
-    """The simulated finger with a skin of the form `FORMAT` in place of the usual one."""
+    """The simulated finger with a skin of the format `FORMAT` instead of its own."""
 
     FORMAT: SweepFormat
     scale: Scale = field(default_factory=Scale)
@@ -77,8 +76,8 @@ class SkinView:
     ) -> NDArray[Any]:
         """As `skin.sweep`: raw counts [n, R, C] or [n, R, C, A] at this skin's rate.
 
-        A slow skin does not filter before it samples, so what is faster than half its rate is
-        folded, as with real ones.
+        A slow skin does not filter before it samples, so frequencies above half its rate are
+        aliased, as in real skins.
         """
         world = self.world(world)
         slid, moving = skin.slide(rest_s, slide_s, after_s)
@@ -110,7 +109,7 @@ def _at(values: Array, at: Array) -> Array:
 
 
 def view(name: str, format: SweepFormat) -> SkinView:
-    """The simulated finger with the skin of the profile `name`, which has the form `format`.
+    """The simulated finger with the skin of the profile `name`, which has this format.
 
     Raises FormatError for two axes or more than three.
     """

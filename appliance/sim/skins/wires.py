@@ -1,8 +1,8 @@
-"""What skins that people own send, byte by byte. In: frames of raw counts, commands from the box.
-Out: bytes.
+"""The bytes that emulated skins send for frames of raw counts, and their answers to commands of the
+box.
 
-Each class is the skin's side of one line. Sources: the readers and firmware that makers and users
-have published, named at each class. None of the skins was at hand.
+Each class is the skin's side of one serial line. Sources are the readers and firmware published by
+makers and users, named at each class. None of the skins was available.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ Taxels = NDArray[Any]
 
 
 class Wire(Protocol):
-    """The skin's side of its line. period_ns: time between two frames. streaming: whether it sends
-    frames."""
+    """The skin's side of its serial line. period_ns: time between two frames. streaming: whether it
+    sends frames."""
 
     period_ns: float
 
     @property
     def streaming(self) -> bool:
-        """Whether frames are sent; the commands of some skins decide that."""
+        """Whether frames are sent; for some skins commands decide."""
         ...
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
@@ -35,11 +35,11 @@ class Wire(Protocol):
         ...
 
     def hear(self, data: bytes) -> bytes:
-        """Bytes from the box; what the skin answers."""
+        """The skin's answer to bytes from the box."""
         ...
 
     def skip(self, frames: int) -> None:
-        """So many frames are taken and never sent: a skin that counts them goes on counting."""
+        """This many frames are taken and never sent; a skin that counts frames counts them."""
         ...
 
 
@@ -47,7 +47,7 @@ class _Uncounted:
     """A skin whose frames have no number."""
 
     def skip(self, frames: int) -> None:
-        """Nobody can tell."""
+        """Does nothing: the gap is invisible."""
 
 
 class _Deaf(_Uncounted):
@@ -59,12 +59,12 @@ class _Deaf(_Uncounted):
         self.period_ns = 1e9 / rate_hz
 
     def hear(self, data: bytes) -> bytes:
-        """Nothing is listening."""
+        """Does nothing: the skin does not listen."""
         return b""
 
 
 class Marked(_Deaf):
-    """A marker, then all taxels row by row: FlexiTac and most matrices made at home.
+    """A marker, then all taxels row by row: FlexiTac and most self-made matrices.
 
     Source: flexitac 0.3.1, firmware/template.ino (AA 55, R x C uint8).
     """
@@ -113,7 +113,7 @@ class MagneticText(Magnetic):
 
 
 class Rows(_Deaf):
-    """A line of text for each row, and an empty one after the last: 3D-ViTac, and matrices of
+    """A line of text for each row, and an empty line after the last: 3D-ViTac, and matrices of
     sketches for Arduino.
 
     Source: the firmware notes of 3D-ViTac's 16 x 16 matrix (numbers separated by blanks, 16 rows
@@ -162,7 +162,7 @@ class PapillArray:
         return b""
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """A packet with forces, displacements, sums, and blocks that nobody has explained."""
+        """A packet with forces, displacements, sums, and blocks of unknown meaning."""
         force = taxels.reshape(-1, self.PILLARS, 3).astype(np.float64)
         if self._tare_left:
             self._unloaded.append(force)
@@ -249,7 +249,7 @@ class Slcan(_Uncounted):
 
     @property
     def streaming(self) -> bool:
-        """Once the channel is open at the sensors' speed and they were told to start."""
+        """Whether the channel is open at the sensors' speed and the start command was sent."""
         return self._open and self._started
 
     def hear(self, data: bytes) -> bytes:
@@ -276,7 +276,8 @@ class Slcan(_Uncounted):
             case b"O" if line == b"O" and not self._open and self._speed:
                 self._open = True
             case b"C" if line == b"C" and self._open:
-                self._open = False  # the sensors go on; nothing of them comes through
+                # the sensors go on sending, but the closed channel does not pass it on
+                self._open = False
             case b"V" if line == b"V":
                 return b"V1013\r"
             case b"t" if self._open and self._speed == self.BUS_SPEED:
@@ -287,8 +288,8 @@ class Slcan(_Uncounted):
         return self.OK
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """One CAN message for each taxel. invalid: taxels that have no value now; their X begins
-        with FA."""
+        """One CAN message for each taxel. invalid: taxels without a value now; their X begins with
+        FA."""
         words = taxels.reshape(-1, 3).astype(">u2").copy()
         if self.invalid:
             words[list(self.invalid), 0] |= 0xFA00
@@ -303,7 +304,7 @@ class Robotiq(_Uncounted):
     """Robotiq's TSF-85 fingertips. Frames [7 F, 4] uint16: F fingers of 7 x 4 taxels.
 
     Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it:
-    9A, a byte that is no checksum yet, command, length, data; fields begin with type << 4 | finger
+    9A, a byte reserved for a checksum, command, length, data; fields begin with type << 4 | finger
     << 2; numbers are big-endian.
     """
 
@@ -319,7 +320,7 @@ class Robotiq(_Uncounted):
         self._last: NDArray[np.int64] | None = None
 
     def hear(self, data: bytes) -> bytes:
-        """Commands: send on with a period in ms, 0 to stop; the version."""
+        """Commands: start sending with a period in ms, 0 to stop; ask for the version."""
         self._rest += data
         answer = b""
         while (at := self._rest.find(b"\x9a")) >= 0 and len(self._rest) >= at + 4 + (
@@ -370,11 +371,11 @@ WIRES: Mapping[str, Callable[[float], Wire]] = {
     "xela-can": Slcan,
     "robotiq-tsf": Robotiq,
 }
-"""The line of each skin, by the name of its profile, for a rate in frames per second."""
+"""The wire of each skin, by the name of its profile, for a rate in frames per second."""
 
 
 def wire(name: str, rate_hz: float) -> Wire:
-    """The line of the skin with this name. Raises ConfigError for an unknown one."""
+    """The wire of the skin with this name. Raises ConfigError for an unknown skin."""
     if name not in WIRES:
         raise ConfigError(f"no emulator of a skin {name!r}; there are {', '.join(WIRES)}")
     return WIRES[name](rate_hz)

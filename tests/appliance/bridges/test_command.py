@@ -36,7 +36,7 @@ def test_the_settings_of_a_new_box():
     )
     with pytest.raises(
         ConfigError,
-        match=r'serial\.port = "" is no line .* set serial\.port = "/run/palpate-tcp/line"',
+        match=r'serial\.port = "" is not a serial line .* set serial\.port = "/run/palpate-tcp/line"',
     ):
         settled("tcp")
 
@@ -78,6 +78,6 @@ def test_no_way_to_the_box(sets: tuple[str, ...]):
     """Commands without a line, or neither line nor feed: refused, with what to set."""
     with pytest.raises(
         ConfigError,
-        match=r'feed cannot be written to; set serial\.port = "/run/palpate-modbus/line"',
+        match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"',
     ):
         settled("modbus", sets=sets)

@@ -185,7 +185,7 @@ def test_a_goal_that_cannot_be(box: SpeakingBox, node: RosPeer):
     found = swept(node, slide_s=3.0, timeout_s=2.0)
     assert found["state"] == "aborted"
     assert found["message"].startswith(
-        "timeout_s = 2 is no longest time from START to the answer; use more than slide_s = 3"
+        "timeout_s = 2 is not a valid limit from START to the answer; use more than slide_s = 3"
     )
     assert commands(box) == []
 

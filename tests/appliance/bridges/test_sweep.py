@@ -286,15 +286,15 @@ def test_the_feed_begins_nothing(tmp_path: Path):
 @pytest.mark.parametrize(
     ("terms", "text"),
     [
-        ({"slide_s": -1.0}, "slide_s = -1 is no time from START to STOP; use 0 to 3600"),
-        ({"slide_s": float("nan")}, "slide_s = nan is no time"),
-        ({"slide_s": float("inf")}, "slide_s = inf is no time"),
+        ({"slide_s": -1.0}, "slide_s = -1 is not a valid time from START to STOP; use 0 to 3600"),
+        ({"slide_s": float("nan")}, "slide_s = nan is not a valid time"),
+        ({"slide_s": float("inf")}, "slide_s = inf is not a valid time"),
         (
             {"slide_s": 3.0, "timeout_s": 3.0},
-            "timeout_s = 3 is no longest time from START to the answer; use more than",
+            "timeout_s = 3 is not a valid limit from START to the answer; use more than",
         ),
-        ({"timeout_s": float("nan")}, "timeout_s = nan is no longest time"),
-        ({"timeout_s": 3601.0}, "timeout_s = 3601 is no longest time"),
+        ({"timeout_s": float("nan")}, "timeout_s = nan is not a valid limit"),
+        ({"timeout_s": 3601.0}, "timeout_s = 3601 is not a valid limit"),
     ],
 )
 def test_times_that_cannot_be(swept: Swept, terms: dict[str, float], text: str):

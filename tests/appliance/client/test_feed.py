@@ -65,11 +65,11 @@ def test_lines_come_whole_however_they_are_split():
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"SSH-2.0-OpenSSH\r\n", "is no line of a feed"),
-        (b"[1]\n", "is no line of a feed"),
-        (b'{"kind": "hello"}\n', "is no line of a feed"),
-        (b'{"type": 1}\n', "is no line of a feed"),
-        (b"[" * 100_000 + b"\n", "is no line of a feed"),
+        (b"SSH-2.0-OpenSSH\r\n", "is not a line of a feed"),
+        (b"[1]\n", "is not a line of a feed"),
+        (b'{"kind": "hello"}\n', "is not a line of a feed"),
+        (b'{"type": 1}\n', "is not a line of a feed"),
+        (b"[" * 100_000 + b"\n", "is not a line of a feed"),
         (b"x" * (MOST_LINE + 1), "a line of over 1048576 bytes"),
         (
             b'{"type": "hello", "schema": 2}\n',
@@ -117,7 +117,7 @@ def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
     """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with
     it."""
     assert feed.read(0) is None
-    assert "no palpate offers its feed there; start it" in feed.trouble
+    assert "no palpate offers its feed there: the box is off or restarting; start it" in feed.trouble
     FakeFeed(feed.path).listener.close()
     time.sleep(0.6)
     assert feed.read(0.01) is None

@@ -433,7 +433,7 @@ def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.Cap
     assert content(tmp_path / "new") == enrolment.files(toy_bundle.files(), new, None)
     assert output.out.count(",RES,") == 6
     assert "sweep 2 taken: 2 of 5" in output.err
-    assert "sweep 3 not taken: no-contact strongest taxel 0.0 digits" in output.err
+    assert "sweep 3 not taken: no-contact strongest taxel 0.0 raw counts" in output.err
     assert "sweep 6 taken: 5 of 5" in output.err
     assert "toy 1+felt, " in output.err
     assert "warning" not in output.err

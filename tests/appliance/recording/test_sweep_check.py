@@ -56,7 +56,7 @@ def test_good_sweeps_are_recorded(rigged: Callable[..., Rigged]):
 @pytest.mark.parametrize(
     ("frames", "status", "detail"),
     [
-        (skin.idle(3 * RATE, np.random.default_rng(1)), Status.NO_CONTACT, "digits"),
+        (skin.idle(3 * RATE, np.random.default_rng(1)), Status.NO_CONTACT, "raw counts"),
         (slide(77), Status.STUCK_TAXEL, "taxel 2.2"),
         (slide(0), Status.DEAD_TAXEL, "taxel 2.2"),
         (slide(255), Status.SATURATED, "taxel 2.2"),

@@ -274,7 +274,7 @@ def spoiled(fault: str) -> np.ndarray:
         ("saturated", "taxel 2.2"),
         ("stuck-taxel", "taxel 2.3"),
         ("dead-taxel", "taxel 3.2"),
-        ("no-contact", "digits"),
+        ("no-contact", "raw counts"),
     ],
 )
 def test_a_spoiled_skin_is_seen_before_the_network_is_asked(

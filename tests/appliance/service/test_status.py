@@ -350,11 +350,26 @@ def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
             "fifo_overflows",
             14,
             lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
-            "1 times the board's FIFO was full",
+            "1 times the readout board's FIFO was full",
         ),
-        ("glitches", 15, burst(devices.START, 2, 1e-4), "1 glitches; check the trigger lines"),
-        ("lost_edges", 16, burst(devices.STOP, 3000, 1e-6), "edges lost; check the trigger lines"),
-        ("storms", 17, burst(devices.STOP, 60, 1e-4), "1 storms of edges; check the trigger lines"),
+        (
+            "glitches",
+            15,
+            burst(devices.START, 2, 1e-4),
+            "1 glitches; check the GPIO lines of the trigger",
+        ),
+        (
+            "lost_edges",
+            16,
+            burst(devices.STOP, 3000, 1e-6),
+            "edges lost; check the GPIO lines of the trigger",
+        ),
+        (
+            "storms",
+            17,
+            burst(devices.STOP, 60, 1e-4),
+            "1 storms of edges; check the GPIO lines of the trigger",
+        ),
     ],
 )
 def test_what_is_counted_is_shown(

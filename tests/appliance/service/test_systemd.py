@@ -169,7 +169,7 @@ def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path
 
 def test_a_watchdog_that_is_no_number_is_named():
     """Only a person can have set it."""
-    with pytest.raises(ConfigError, match="WATCHDOG_USEC=10s is no number"):
+    with pytest.raises(ConfigError, match="WATCHDOG_USEC=10s is not a number"):
         Notifier(rig.VirtualClock(), {"WATCHDOG_USEC": "10s"})
 
 

@@ -294,8 +294,8 @@ def test_dimensions_and_type_are_those_of_the_paper() -> None:
     ("kind", "shape", "rate_hz", "message"),
     [
         ("MFCC", (80, 4, 4), 750.0, "'MFCC' is unknown; use one of L, H"),
-        ("L", (80, 16), 750.0, r"shape \(80, 16\) is no sweep"),
-        ("L", (0, 4, 4), 750.0, r"shape \(0, 4, 4\) is no sweep"),
+        ("L", (80, 16), 750.0, r"shape \(80, 16\) is not a sweep"),
+        ("L", (0, 4, 4), 750.0, r"shape \(0, 4, 4\) is not a sweep"),
         ("L", (80, 4, 4), 0.0, r"rate of 0.0 Hz"),
         ("H", (80, 4, 4), math.nan, r"rate of nan Hz"),
         ("H", (80, 4, 4), 12.0, "12 Hz is too slow for H-features; use at least 20 Hz"),

@@ -35,7 +35,7 @@ def test_a_sound_window_passes():
 @pytest.mark.parametrize(
     ("place", "value", "status", "detail"),
     [
-        (np.s_[:, :, :], 0, Status.NO_CONTACT, "0.0 digits"),
+        (np.s_[:, :, :], 0, Status.NO_CONTACT, "0.0 raw counts"),
         (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
         (np.s_[:, 1, 2], 0, Status.DEAD_TAXEL, "taxel 2.3"),
         (np.s_[:, 0, 0], 0, Status.DEAD_TAXEL, "taxel 1.1"),
@@ -84,7 +84,7 @@ def sheared() -> np.ndarray:
 @pytest.mark.parametrize(
     ("place", "value", "status", "detail"),
     [
-        (np.s_[:, :, :, 2], 3, Status.NO_CONTACT, "strongest taxel 3.0 digits"),
+        (np.s_[:, :, :, 2], 3, Status.NO_CONTACT, "strongest taxel 3.0 raw counts"),
         (np.s_[:, 1, 2, 0], 7, Status.STUCK_TAXEL, "taxel 2.3 axis 1"),
         (np.s_[:, 1, 2, :2], 7, Status.STUCK_TAXEL, "taxel 2.3 axis 1 2"),
         (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
@@ -165,7 +165,7 @@ UNLOADED = UnloadedSkin.measured(
 @pytest.mark.parametrize(
     ("place", "value", "status", "detail"),
     [
-        (np.s_[:, :, :], 10, Status.NO_CONTACT, "digits"),
+        (np.s_[:, :, :], 10, Status.NO_CONTACT, "raw counts"),
         (np.s_[:, 1, 2], 90, Status.STUCK_TAXEL, "taxel 2.3"),
         (np.s_[:, 1, 2], 10, Status.DEAD_TAXEL, "taxel 2.3"),
         (np.s_[:, 0, 1], 255, Status.SATURATED, "taxel 1.2"),
