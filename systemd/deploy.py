@@ -1,8 +1,8 @@
-"""Delivers a bundle to boxes. In: which boxes, the bundle's folder. Out: a line for each box.
+"""Delivers a bundle to boxes, and prints a line for each box.
 
-A box does not trust what is copied to it: `palpate install` checks signature, manifest, model and
+A box does not trust the copied files: `palpate install` checks signature, manifest, model and
 golden sweeps with the box's runtime, and the bundle runs on trial from the next start on. If the
-delivery is interrupted at any moment, the box has the old bundle or the new one; run the command
+delivery is interrupted at any moment, the box has the old bundle or the new bundle; run the command
 again to finish.
 """
 
@@ -25,15 +25,15 @@ from appliance.deployment import signature
 from appliance.inference.classifier import Classifier
 
 READY_S, STARTS = 60, 5
-"""After three failed starts a box goes back by itself; one that is not READY after five will not
-be."""
+"""Limits for READY, in seconds and in failed starts. After three failed starts a box goes back by
+itself, so after five there is no hope."""
 LIMIT_S = 300
-"""Longest time for all of one box."""
+"""Time limit for each box."""
 
 
 @dataclass(frozen=True)
 class BundleArchive:
-    """A bundle as it is copied to boxes. sha: its name in their stores. name: for a person.
+    """A bundle as it is copied to boxes. sha: its name in their stores. name: for messages.
     archive: a tar of its files."""
 
     sha: str
@@ -46,15 +46,15 @@ def main(argv: list[str] | None = None) -> int:
     parser = options("Delivers a signed bundle to boxes, where it runs on trial.", LIMIT_S)
     parser.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     parser.add_argument(
-        "--signers", type=Path, metavar="FILE", help="check the signature here, too, by this file"
+        "--signers", type=Path, metavar="FILE", help="also check the signature here, with this file"
     )
     parser.add_argument(
-        "--shadow", action="store_true", help="as the candidate, which classifies beside"
+        "--shadow", action="store_true", help="as the candidate, which classifies in the background"
     )
     parser.add_argument(
         "--other-skin",
         action="store_true",
-        help="another skin than the one that streams there comes with it",
+        help="the bundle is for another skin than the box has now, which will be changed with it",
     )
     args = parser.parse_args(argv)
     try:
@@ -67,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def checked(folder: Path, signers: Path | None) -> BundleArchive:
     """The bundle in `folder`, once it has passed its checks and golden sweeps here. Raises
-    ApplianceError where it does not."""
+    ApplianceError if it fails."""
     files = bundle.files(folder)
     loaded = bundle.from_files(files, str(folder))
     Classifier(loaded, SystemClock()).self_test()
@@ -93,7 +93,7 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
         return f"{packed.name} runs already"
     file, incoming = f".palpate-{packed.sha[:16]}.tar", f"{store}/incoming"
     box.put(io.BytesIO(packed.archive), file)
-    # also removes what an interrupted delivery left there
+    # also removes files of an interrupted delivery
     fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{packed.sha}"
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{packed.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
@@ -105,7 +105,7 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
 
 
 def where(box: FleetBox) -> tuple[str, str]:
-    """Paths on the box: the folder of its store and its status file. Raises Failed where it would
+    """Paths on the box: the folder of its store and its status file. Raises Failed if the box would
     not use a delivered bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
     settings = tomllib.loads(
@@ -113,7 +113,7 @@ def where(box: FleetBox) -> tuple[str, str]:
     )
     if own := settings["classifier"]["bundle"]:
         raise Failed(
-            f"its settings name a bundle, classifier.bundle = {own!r}; take that out of them first"
+            f"its settings name a bundle, classifier.bundle = {own!r}; remove this setting first"
         )
     return str(settings["store"]["folder"]), str(settings["store"]["status"])
 
@@ -130,7 +130,7 @@ def _runs(box: FleetBox, packed: BundleArchive, store: str, status: str) -> bool
 
 
 def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) -> str:
-    """What the box does with the bundle now, in words. Raises Failed where it has gone back
+    """The present role of the bundle on the box, in words. Raises Failed if the box has gone back
     already."""
     listed = json.loads(
         box.run("asking for its bundles", f"{PALPATE} bundles --json", user="palpate")
@@ -138,11 +138,11 @@ def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) 
     entry = next((one for one in listed if one["sha"] == packed.sha), None)
     if entry is None or entry["role"] not in ("current", "on trial", "candidate"):
         raise Failed(
-            "the box went back to what it had: "
+            "the box went back to its earlier bundle: "
             f"{entry['detail'] if entry else 'the bundle is gone'}"
         )
     if shadow != (entry["role"] == "candidate"):
-        raise Failed(f"the bundle is {entry['role']} there; somebody else was at work, too")
+        raise Failed(f"the bundle is {entry['role']} there; another delivery ran at the same time")
     role = f"{entry['role']}: {entry['detail']}" if entry["detail"] else entry["role"]
     if not ready and box.result["waits"].startswith("skin mismatch"):
         raise Failed(f"the bundle is {role}, but {box.result['waits']}; palpate rollback goes back")

@@ -1,5 +1,5 @@
-"""The key with which a box signs the labels that it enrols. In: a folder. Out: commands that make
-key and signer there, where they are missing (appliance/deployment/enrolment_key.py)."""
+"""Commands that make the key with which a box signs its enrolled labels, and the file of its
+signer, if they are missing (appliance/deployment/enrolment_key.py)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ FOLDER = "/etc/palpate/enrolment"
 
 
 def make(folder: str = FOLDER, user: str = "palpate", group: str = "palpate") -> str:
-    """Commands for root: `key`, which `user` alone may read, and `signer`, root's, who is believed.
+    """Commands for root that make `key`, readable only by `user`, and `signer`, owned by root.
 
-    Where only the signer is left, no other key is made: the labels that were enrolled before would
-    not be believed any more.
+    If only the signer is left, no other key is made, since the labels enrolled before would become
+    invalid.
     """
     return f"""(
 install -d -m 750 -g {group} {folder}
@@ -23,7 +23,7 @@ if [ ! -s key ] && [ ! -s signer ]; then
   rm key.new.pub
 fi
 if [ -s key ] && [ ! -s signer ]; then
-  public=$(ssh-keygen -y -f key < /dev/null) || {{ echo '{folder}/key is damaged; take it away' >&2; exit 1; }}
+  public=$(ssh-keygen -y -f key < /dev/null) || {{ echo '{folder}/key is damaged; remove it' >&2; exit 1; }}
   printf 'box namespaces="palpate-enrolment" %s\\n' "$(printf %s "$public" | cut -d ' ' -f 1,2)" > signer.new
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi

@@ -1,11 +1,10 @@
-"""Installs or upgrades the runtime on bare Debian boxes. In: which boxes, this checkout. Out: a
-line for each box.
+"""Installs or upgrades the runtime on bare Debian boxes, and prints a line for each box.
 
 A release is one folder, /opt/palpate-<version>-<hash>: virtual environment, unit, users, rules,
 board files, manual. All paths outside lead into it through the link /opt/palpate, which is swapped
 by one rename when the folder is complete and has passed its self-test. So after an interruption at
-any moment a box starts with the old runtime and the old unit, or with the new ones; run the command
-again to finish. The boxes need internet only for missing Debian packages.
+any moment a box starts with the old runtime and the old unit, or with the new runtime and unit; run
+the command again to finish. The boxes need internet only for missing Debian packages.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client", "openssl")
 """Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen), the page's
 certificate."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
-"""Names of an architecture: by Debian, and in Python's wheels."""
+"""Debian's name of an architecture, and its name in Python's wheels."""
 LINK = "/opt/palpate"
-"""Leads to the release that runs."""
+"""The link to the release in use."""
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
     "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
@@ -48,7 +47,7 @@ PATHS = {
 }
 """Files of this checkout, and their paths on a box."""
 SKINS = "firmware_config/skins"
-"""The delivered skin profiles; each is linked by itself, since there may be others beside them."""
+"""The delivered skin profiles. Each has its own link, since the folder may contain others."""
 LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS.items()} | {
     **{
         f"/etc/palpate/skins/{f.name}": f"{LINK}/share/palpate/skins/{f.name}"
@@ -57,7 +56,7 @@ LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS
     "/etc/systemd/system/multi-user.target.wants/palpate.service": "../palpate.service",
     "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
 }
-"""Symlinks on a box, and where each leads to."""
+"""Symlinks on a box, and their targets."""
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
@@ -71,16 +70,16 @@ except errors.ApplianceError as e:
     sys.exit(str(e))
 """
 """Program that a new release must run without an error: reads the settings, and runs the golden
-sweeps of the packaged bundle and of the one in use."""
+sweeps of the packaged bundle and of the bundle in use."""
 PACKAGES_S = BUILD_S = 600
-"""Limits for installing packages and for building the environment, on a slow card."""
+"""Time limits for installing packages and for building the environment, on a slow card."""
 SETUP_S = 120
-"""Limit for keys and certificates to be made and flushed to the disk, and for the self-test, on a
-slow board."""
+"""Time limit for making keys and certificates and flushing them to the disk, and for the self-test,
+on a slow computer."""
 READY_S, STARTS = 40, 2
-"""A release has failed that is not READY after so many seconds, or has ended so often."""
+"""A release has failed if it is not READY after so many seconds, or has ended so often."""
 LIMIT_S = 1800
-"""Longest time for all of one box."""
+"""Time limit for each box."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -90,7 +89,10 @@ def main(argv: list[str] | None = None) -> int:
         "--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5"
     )
     parser.add_argument(
-        "--signers", type=Path, metavar="FILE", help="allowed_signers: whose bundles the box takes"
+        "--signers",
+        type=Path,
+        metavar="FILE",
+        help="allowed_signers: the signers whose bundles the box accepts",
     )
     parser.add_argument(
         "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
@@ -114,7 +116,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def known_board(board: str) -> str:
-    """`board`, "" for none. Raises Failed where no board file of this checkout has that name."""
+    """`board`, "" for none. Raises Failed if no board file of this checkout has that name."""
     known = boards(ROOT / "firmware_config")
     if board and board not in known:
         raise Failed(
@@ -148,7 +150,7 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         )
     box.run(
         "tidying up", "rm -f .palpate-*.tar"
-    )  # of an install that was cut after it had built, too
+    )  # also of an install that was interrupted after it had built
     setup = prepare(release, board, signers)
     said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:
@@ -158,8 +160,8 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
 
 
 def survey(box: FleetBox) -> str:
-    """The box's architecture as wheels name it. Raises Failed where Palpate does not run on such a
-    box."""
+    """The box's architecture, as in names of wheels. Raises Failed if Palpate does not run on such
+    a box."""
     output = box.run(
         "looking at its system",
         '. /etc/os-release; echo "$PRETTY_NAME"; dpkg --print-architecture || true',
@@ -173,7 +175,7 @@ def survey(box: FleetBox) -> str:
     # systemd reads units before it mounts anything, and the unit is in the release
     if box.run("looking at /opt", "stat -c %m /opt") != "/":
         raise Failed(
-            "/opt is a file system of its own there; it must be part of the root file system"
+            "/opt is a separate file system there; it must be part of the root file system"
         )
     if box.run(f"looking at {LINK}", f"test -e {LINK} && test ! -L {LINK} && echo folder || true"):
         raise Failed(
@@ -183,8 +185,7 @@ def survey(box: FleetBox) -> str:
 
 
 def packages(box: FleetBox) -> None:
-    """Install the Debian packages that are missing. Raises Failed where they cannot be
-    installed."""
+    """Install missing Debian packages. Raises Failed if they cannot be installed."""
     status = "dpkg-query -W -f '${db:Status-Status} ${binary:Package}\\n' " + " ".join(PACKAGES)
     output = box.run("looking for packages", f"{status} 2>/dev/null || true")
     present = {
@@ -217,7 +218,7 @@ def build(release: str) -> str:
     """Commands that build a release from the archive on standard input, write it to the disk, and
     stamp it as complete.
 
-    The commands of an earlier install, whose desktop died, may still run: a lock waits for them.
+    The commands of an earlier install, whose desktop died, may still run, so these wait for a lock.
     """
     return f"""set -e; umask 022
 exec 9> /run/palpate-install.lock; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
@@ -232,8 +233,9 @@ sync -f {release}"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
-    """Commands that set up users, folders, settings and links outside the release, and print a line
-    for each file that was there and for a changed board. The old release can run with them, too."""
+    """Commands that set up users, folders, settings and links outside of the release, and print a
+    line for each file that was there and for a changed board. The old release can run with them,
+    too."""
     share = f"{release}/share/palpate"
     lines = [
         "set -e; umask 022",
@@ -247,11 +249,12 @@ def prepare(release: str, board: str, signers: str) -> str:
         lines += [
             f'if [ ! -e {file} ]; then {_put(file, text)}; elif [ "$(cat {file}; echo .)" != '
             f"{text}. ]; then"
-            f" echo '{file} is another one there, and stays; change it on the box' >&2; exit 1; fi"
+            f" echo '{file} differs from this file there, and stays; change it on the box' >&2; "
+            "exit 1; fi"
         ]
     if board:
         file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
-        # what somebody added to the settings stays
+        # all other settings stay
         new = f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; }} > {file}.new"
         lines += [
             f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f "
@@ -304,7 +307,7 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
         ready = _start(box)
     except Failed as e:
         raise Failed(f"{e}{_swap_back(box, release)}") from e
-    # they are of the release before until then; what is off stays off
+    # until then they belong to the earlier release; disabled units stay off
     box.run(
         "restarting page and bridges",
         "systemctl try-restart palpate-watch 'palpate-bridge@*'",
@@ -335,7 +338,7 @@ def _swap_back(box: FleetBox, release: str) -> str:
 
 
 def swap(release: str, before: str) -> str:
-    """Commands that make the link lead to a release, and record the previous one."""
+    """Commands that point the link to a release, and record the previous release."""
     previous = f"ln -sfn {before} {LINK}.previous" if before else "true"
     return f"""set -e; {previous}
 ln -sfn {Path(release).name} {LINK}.new; sync -f /opt

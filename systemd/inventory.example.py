@@ -4,7 +4,8 @@ and change it.
 It is an inventory of pyinfra: Python, in which each list is a group of boxes. A box is a name or an
 address, as ssh knows it (~/.ssh/config is read), alone or with values for this box:
 
-- ssh_hostname, ssh_user, ssh_port, ssh_key (a file): the connection. The user needs sudo without a password.
+- ssh_hostname, ssh_user, ssh_port, ssh_key (a file): the connection. The user needs sudo without a
+password.
 - board: its board file, "rpi4" or "rpi5", for an install on a box that has no settings yet.
 """
 

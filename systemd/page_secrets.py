@@ -1,19 +1,19 @@
-"""What the page of `palpate watch --web` needs on the network. In: a folder. Out: commands that
-make its token and certificate there, where they are missing."""
+"""Commands that make the token and the certificate for the network access of the page of `palpate
+watch --web`, if they are missing."""
 
 from __future__ import annotations
 
 FOLDER = "/etc/palpate/watch"
 DAYS, RENEWED_DAYS = 825, 60
-"""How long a certificate holds: no longer than tablets accept. It is renewed by an install so long
-before."""
+"""Validity of a certificate, no longer than tablets accept; and the remaining days from which on an
+install renews it."""
 
 
 def make(folder: str = FOLDER, group: str = "palpate-watch") -> str:
-    """Commands for root: token, key.pem and certificate.pem, readable by root and `group`.
+    """Commands for root that make token, key.pem and certificate.pem, readable by root and `group`.
 
-    The certificate is for this machine's host name, also as multicast DNS has it, for localhost,
-    and for the addresses that the machine has now. It signs nothing but itself.
+    The certificate is valid for this machine's host name, also in multicast DNS, for localhost, and
+    for the present addresses of the machine. It signs nothing but itself.
     """
     return f"""(
 install -d -m 750 -g {group} {folder}

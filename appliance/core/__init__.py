@@ -1,2 +1,2 @@
-"""What every package shares: types, errors, clock, settings, files. It imports nothing else of the
+"""Shared by all packages: types, errors, clock, settings, files. Imports nothing else of the
 appliance."""

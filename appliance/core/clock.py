@@ -1,7 +1,7 @@
 """The host's monotonic clock as an object that is passed in, and the conversion of device time to
 host time.
 
-In: device time stamps (us) with the host time (ns) at which each packet arrived. Out: the host time
+From device time stamps (us) and the host time (ns) of each packet's arrival follows the host time
 at which each frame was taken.
 """
 
@@ -20,7 +20,7 @@ USB_PPM = 2500
 
 
 class Clock(Protocol):
-    """Where every module gets the time from; the simulator passes a virtual clock."""
+    """The source of time for every module; the simulator passes a virtual clock."""
 
     def now_ns(self) -> int:
         """`CLOCK_MONOTONIC` in nanoseconds, the clock by which the kernel stamps GPIO edges."""
@@ -46,7 +46,7 @@ class SystemClock:
 
 
 def wait_readable(fd: int, timeout_s: float) -> bool:
-    """Wait until something can be read from `fd`, in real time; False where nothing came."""
+    """Wait until `fd` can be read, in real time; False if no bytes came."""
     return bool(select.select([fd], [], [], timeout_s)[0])
 
 
@@ -57,11 +57,11 @@ class DeviceClock:
     is the lower envelope of these points. During the first `settle_s` it is their minimum. After
     that it is the line below all points of the last `span_s` that is closest to them on average:
     the edge of their lower convex hull at the mean time, with its slope bounded by `max_ppm` (two
-    crystals differ by less). The error that remains is the shortest delay itself, about 0.1 ms,
-    which cannot be distinguished from the offset. A line that lies higher than the worst clock on
-    USB can have drifted since the last one is rejected and the last one stays in use: frames that
-    all come late, from a full FIFO, were not taken late. Make a new object after each enumeration,
-    since the device's clock then starts again at 0.
+    crystals differ by less). The remaining error is the shortest delay itself, about 0.1 ms, which
+    cannot be distinguished from the offset. A new line is rejected if it lies higher than the worst
+    clock on USB can have drifted since the last line, which then stays in use: frames that all come
+    late, from a full FIFO, were not taken late. Make a new object after each enumeration, since the
+    device's clock then starts again at 0.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class DeviceClock:
         self._fitted_ns = 0  # device time at which the line was fitted
 
     def unwrap(self, device_us: int) -> int:
-        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the one
+        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the time
         nearest to the last."""
         if self._device_us is None:
             self._device_us = device_us
@@ -117,12 +117,12 @@ class DeviceClock:
         return round(device_ns + _at(self._line, device_ns))
 
     def quality(self) -> dict[str, float] | None:
-        """How well device time is known, for the sidecar of a recorded sweep; None before the first
+        """Accuracy of the conversion, for the sidecar of a recorded sweep; None before the first
         packet.
 
-        seconds: length of the past that the line was fitted to. drift_ppm: how much faster host
-        time runs than device time. late_ms: the fastest packet of each quarter of a second is
-        compared with the fastest of all; this is the largest delay among them.
+        seconds: length of the past in the fit of the line. drift_ppm: how much faster host time
+        runs than device time. late_ms: the fastest packet of each quarter of a second is compared
+        with the fastest of all; this is the largest delay among them.
         """
         if not self._points:
             return None
@@ -144,8 +144,8 @@ class DeviceClock:
         left, right = next((a, b) for a, b in pairwise(hull) if b[0] >= middle)
         slope = (right[1] - left[1]) / (right[0] - left[0])
         slope = max(-self._max_slope, min(self._max_slope, slope))
-        # with a bounded slope the line may intersect the hull: lower it until it touches the hull
-        # from below
+        # with a bounded slope the line may intersect the hull, so lower it until it touches the
+        # hull from below
         x, y = min(hull, key=lambda p: p[1] - slope * p[0])
         return x, y, slope
 
@@ -157,5 +157,5 @@ def _at(line: tuple[int, float, float], device_ns: float) -> float:
 
 
 def _turns_up(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> int:
-    """Positive where b lies below the line from a to c."""
+    """Positive if b lies below the line from a to c."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

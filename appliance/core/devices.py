@@ -1,5 +1,5 @@
-"""Clock, GPIO module and USB backend that the drivers use. Here: the real ones; `sim.devices` has
-simulated ones."""
+"""Clock, GPIO module and USB backend of the drivers. These are the real devices; `sim.devices` has
+simulated devices."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from appliance.core.types import SweepFormat
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """What the drivers use: the real devices, or those of a subclass (`sim.devices.SimDevices`).
+    """The devices of the drivers: real, or of a subclass (`sim.devices.SimDevices`).
 
-    gpio: the module gpiod or its simulated double; None for gpiod, imported where a line is wired.
+    gpio: the module gpiod or its simulated double; None for gpiod, imported if a line is wired.
     backend: a pyusb backend, None for libusb. source: the name of the source in sentences ("usb",
     "sim"). wait: waits until a serial port can be read, at most so many seconds of `clock`. format:
-    of the sweeps that simulated devices play, None where the skin is to be asked.
+    of the sweeps that simulated devices play, None if the skin has to be asked.
     """
 
     clock: Clock
@@ -30,10 +30,10 @@ class Devices:
     format: SweepFormat | None = None
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the lines and ids of these devices; the real ones are wired as
-        configured."""
+        """The settings with the GPIO lines and ids of these devices. The real devices change
+        nothing."""
         return settings
 
     def finished(self, answered: int) -> bool:
-        """True when nothing more will happen after `answered` sweeps; with real devices never."""
+        """Whether nothing more will happen after `answered` sweeps; never with real devices."""
         return False

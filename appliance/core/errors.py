@@ -1,19 +1,18 @@
 """The error tree of the box: each class is one kind of error, with the exit code of the command
 line.
 
-Messages are lower case, name the value that was wrong and say what to try. Exit codes are those of
-sysexits.h.
+Messages are lower case, name the wrong value and the remedy. Exit codes are those of sysexits.h.
 """
 
 EX_DATAERR, EX_UNAVAILABLE, EX_CONFIG = (
     65,
     69,
     78,
-)  # `os` has them on Unix alone, and the client runs elsewhere, too
+)  # `os` has them on Unix only, but the client also runs elsewhere
 
 
 class ApplianceError(Exception):
-    """Base of all expected errors; the command line prints one as a single line and exits with
+    """Base of all expected errors. The command line prints it as a single line and exits with
     `exit_code`."""
 
     exit_code = 1
@@ -26,7 +25,7 @@ class ConfigError(ApplianceError):
 
 
 class BundleError(ApplianceError):
-    """A model bundle is incomplete, altered, or does not do what its manifest says."""
+    """A model bundle is incomplete, altered, or fails its golden sweeps."""
 
     exit_code = EX_CONFIG
 
@@ -92,13 +91,13 @@ class PortError(ApplianceError):
 
 
 class FeedError(ApplianceError):
-    """The feed of the running box cannot be read, or gives nothing."""
+    """The feed of the running box cannot be read, or is silent."""
 
     exit_code = EX_UNAVAILABLE
 
 
 class LinkLost(PortError):
-    """The line to the box is not open, or was lost while something was waited for."""
+    """The line to the box is not open, or was lost during a wait."""
 
 
 class NoAnswer(ApplianceError):
@@ -112,6 +111,6 @@ class CommandRefused(ApplianceError):
 
 
 class FormatError(ApplianceError):
-    """An array, file or sentence does not have the required form."""
+    """An array, file or sentence is invalid."""
 
     exit_code = EX_DATAERR

@@ -1,5 +1,5 @@
-"""How the box is at the end of a turn of its loop: what observers get, and what the STA sentence
-and the status show."""
+"""The state of the box at the end of a turn of its loop, for observers, the STA sentence and the
+status."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 class Health:
     """State of the box at the end of a turn.
 
-    time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: why the skin does not
-    stream, "" where it does. streams: frames are arriving. ready: a sweep can be taken now, as the
-    line READY shows. The counts, since the program started, are those of the STA sentence: of the
-    sensor from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see
+    time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: the reason why the skin does
+    not stream, "" if it does. streams: frames are arriving. ready: a sweep can be taken now, as the
+    GPIO line READY shows. The counts, since the program started, are those of the STA sentence: of
+    the sensor from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see
     SensorCounters), of the serial line `dropped`, of the trigger `glitches`, `lost_edges` and
-    `storms` (see EdgeCounters). loss_known: the skin counts its frames; without that, `lost_frames`
-    holds what can be inferred.
+    `storms` (see EdgeCounters). loss_known: the skin counts its frames; if not, `lost_frames`
+    counts only the losses that can be inferred.
     """
 
     time_ns: int

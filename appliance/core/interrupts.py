@@ -1,7 +1,7 @@
-"""Ctrl-C while a program still imports what it needs. In: SIGINT. Out: one line on standard error,
-exit code 130.
+"""Ctrl-C during the imports of a program: it prints one line and ends with exit code 130.
 
-No exception is raised for it: extension modules that are being imported make other errors of one.
+It raises no exception, since extension modules turn an exception during their import into other
+errors.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTED = 130
-"""Exit code of a program that Ctrl-C has ended, as a shell has it."""
+"""Exit code of a program that Ctrl-C has ended, as in a shell."""
 
 
 @contextmanager
 def during_imports(program: str) -> Iterator[None]:
-    """Within this block, Ctrl-C ends the process. One that is ignored, as after `nohup`, stays
+    """Within this block, Ctrl-C ends the process. An ignored SIGINT, as after `nohup`, stays
     ignored."""
 
     def end(number: int, frame: FrameType | None) -> None:

@@ -1,5 +1,4 @@
-"""What happens in the loop, for whatever watches it: captures, recordings, status, the service
-manager."""
+"""Events of the loop for its observers: captures, recordings, status, the service manager."""
 
 from __future__ import annotations
 
@@ -11,10 +10,10 @@ from appliance.core.types import Edge, Frames, Sweep, Verdict
 
 
 class Observer:
-    """Base of all observers; each overrides what it wants to know.
+    """Base of all observers; each overrides the methods that it needs.
 
-    No method may raise or wait: a full disk costs the record, never the classifying. What takes
-    time belongs into `sweep` or `turn`, where all answers of the turn are out.
+    No method may raise or wait: a full disk may cost the record, but must not stop the classifying.
+    Slow work belongs into `sweep` or `turn`, when all answers of the turn are out.
     """
 
     def frames(self, frames: Frames) -> None:
@@ -27,7 +26,7 @@ class Observer:
         """A command, as it stands in a sentence, is about to be carried out."""
 
     def answered(self, verdict: Verdict) -> None:
-        """The robot has got this verdict on its serial line."""
+        """The robot was sent this verdict on the serial line."""
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """A sweep was answered, and all other answers of the turn are out. circumstances: see
@@ -38,4 +37,4 @@ class Observer:
         out."""
 
     def stopping(self) -> None:
-        """The loop has ended; what is open is being answered."""
+        """The loop has ended; an open sweep will still be answered."""

@@ -1,4 +1,4 @@
-"""Which code produced a result: the commit of this checkout, for result files."""
+"""The commit of this checkout, for result files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def commit() -> str:
-    """The commit of this code, followed by + if files were changed since; "unknown" outside a
+    """The commit of this code, followed by + if files have changed since; "unknown" outside a
     checkout."""
     here = str(Path(__file__).parent)
     command = ["git", "-C", here, "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]

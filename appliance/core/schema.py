@@ -1,9 +1,8 @@
-"""Dataclasses as schemas of files. In: values from TOML or JSON. Out: these values, checked and as
-their fields' types.
+"""Dataclasses as schemas of files: values from TOML or JSON are checked and converted to the types
+of fields.
 
 A field is the only place for a value's type, default and limits. TOML tables are read with `keys`
-and `read_table`, JSON objects with `typed`; `closest` finds the name that a misspelt one probably
-stands for.
+and `read_table`, JSON objects with `typed`. `closest` finds names similar to a misspelt name.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ def gpio_line() -> str:
 
 
 def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
-    """A field with its own reader. allowed: what the file may hold, for messages. read: returns the
-    value to keep, or None if the given one is not allowed. A dict as default is copied for each
+    """A field with its own reader. allowed: the allowed values, for messages. read: returns the
+    converted value, or None if the value is not allowed. A dict as default is copied for each
     object."""
     metadata = {"allowed": allowed, "read": read}
     if isinstance(default, dict):
@@ -71,7 +70,7 @@ class Key:
 
     @property
     def allowed(self) -> str:
-        """What `fit` accepts, for a person."""
+        """The values that `fit` accepts, for a person."""
         if "allowed" in self.limits:
             return str(self.limits["allowed"])
         if get_origin(self.hint) is Literal:
@@ -102,8 +101,8 @@ def read_table(
 ) -> dict[str, Any]:
     """The values of a TOML table as their fields' types, by name.
 
-    Raises the error that `unknown` makes of a name that is not in `known`, and the one that
-    `refused` makes of the text "NAME = VALUE is not allowed; use ...".
+    unknown: makes the error for a name that is not in `known`. refused: makes the error for the
+    text "NAME = VALUE is not allowed; use ...".
     """
     values = {}
     for name, value in table.items():
@@ -138,9 +137,9 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     """A `kind` (a dataclass) from a JSON object. Lists become tuples and objects dataclasses as its
     fields require.
 
-    Only values that can be computed with and printed are accepted: integers for int, finite
-    numbers, printable strings. Raises TypeError naming the field, and whatever the dataclass raises
-    for its values.
+    Accepts only values that can be computed with and printed: integers for int, finite numbers,
+    printable strings. Raises TypeError naming the field, and the errors of the dataclass for its
+    values.
     """
     hints = get_type_hints(kind)
     if not isinstance(table, dict) or not table.keys() <= hints.keys():
@@ -152,7 +151,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
             raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
     made = kind(
         **values
-    )  # first, because what a class says about its values is more specific than their types
+    )  # first, because the error of a class about its values is more specific than their types
     for name, value in values.items():
         if not _fits(value, hints[name]):
             wanted = getattr(hints[name], "__name__", hints[name])

@@ -1,6 +1,5 @@
-"""Sentences of the serial line, in the form of NMEA 0183 (PROTOCOL.md, part 2). In: fields, or
-bytes of the line. Out: sentences, on the box and on the robot's side.
-"""
+"""Writes and parses sentences of the serial line, a dialect of NMEA 0183 (PROTOCOL.md, part 2), for
+both of its ends."""
 
 from __future__ import annotations
 
@@ -11,9 +10,9 @@ from operator import xor
 
 TALKER = "PPLP"
 MAX_LINE = 128
-"""Characters of a sentence or command."""
+"""Longest sentence or command, in characters."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
-"""What no field may hold."""
+"""Characters that no field may contain."""
 _PATTERN = re.compile(
     rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<kind>[A-Za-z]{0,16})(?:[, ](?P<text>[ -#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
 )
@@ -23,8 +22,9 @@ _PATTERN = re.compile(
 class Sentence:
     """A line that was received.
 
-    kind: RES, STA, … or the name of a command. text: what follows it, None for nothing. summed: it
-    had its checksum, and this was right. error: why it is no sentence, "" if it is one.
+    kind: RES, STA, … or the name of a command. text: the text after it, None if there is none.
+    summed: it had a checksum, which was right. error: the reason why it is not a sentence, "" if it
+    is.
     """
 
     kind: str
@@ -45,8 +45,8 @@ def checksum(body: str) -> str:
 
 
 def sentence(kind: str, *fields: object) -> bytes:
-    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces; a line
-    that is too long is cut, but never within a number: last fields that are whole numbers are left
+    """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces. A line
+    that is too long is cut, but never within a number: whole numbers in the last fields are left
     out until the rest fits."""
     body = ",".join([TALKER, kind, *(UNSAFE.sub(" ", str(f)) for f in fields)])
     if len(body) > MAX_LINE - 6:
@@ -60,8 +60,8 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:
     """The sentences in `data`, which continues `rest`, and the new unfinished rest.
 
     Each line gives one Sentence, however it is split. A line of over MAX_LINE characters is
-    reported once; the rest then holds one character more than these, so that the end of the line is
-    not taken for a sentence.
+    reported once. The rest then contains one character more, so that the end of the line is not
+    taken for a sentence.
     """
     reported = len(rest) > MAX_LINE
     *lines, rest = re.split(rb"[\r\n]+", rest + data)
@@ -72,17 +72,18 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:
 
 
 def read(line: bytes) -> Sentence:
-    """One line, with its end or without.
+    """One line, with or without its end.
 
-    A checksum may be missing, and commas be spaces, so that a person can type commands; no checksum
-    may be wrong. A sentence begins at its $: noise or a break may have left bytes before it.
+    A checksum may be missing, and spaces may stand for commas, so that a person can type commands;
+    a wrong checksum is always refused. A sentence begins at its $, since noise or a break may have
+    left bytes before it.
     """
     if len(line) > MAX_LINE:
         return Sentence("", error=f"line of over {MAX_LINE} characters without an end")
-    # the kind holds letters only: of a command it is sent back, and noise could displace the fields
-    # of the answer
+    # the kind has only letters, since it is sent back in the answer to a command, and noise could
+    # displace the fields of the answer
     match = _PATTERN.fullmatch(line.strip())
-    if not match:  # examples are given without what a sentence cannot hold
+    if not match:  # the example has no characters that a sentence cannot contain
         return Sentence("", error=f"not a command; send for example {TALKER} ID")
     kind, body = match["kind"].decode(), match["body"].decode()
     text, given = (

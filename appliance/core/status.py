@@ -1,4 +1,4 @@
-"""The outcomes of a sweep: one Status each, with the reason why there is no label."""
+"""The outcomes of a sweep: a Status for each, with the reason if there is no label."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 
 class Status(StrEnum):
-    """The outcome of a sweep, in sentences, lines and files. PROTOCOL.md explains each; a test
-    compares the lists."""
+    """The outcome of a sweep, in sentences, on GPIO lines and in files. PROTOCOL.md explains each;
+    a test compares the lists."""
 
     OK = "ok"
     UNSURE = "unsure"
@@ -44,21 +44,21 @@ class Status(StrEnum):
 
 REASONS: Mapping[Status, str] = MappingProxyType(
     {
-        Status.UNKNOWN: "it is like no material that was trained or enrolled",
+        Status.UNKNOWN: "it differs from all trained and enrolled materials",
         Status.SHORT: "the stop edge came before a window's length had passed",
         Status.LONG: "no stop edge came in time",
-        Status.GAP: "too many frames in a row are missing; look at the skin's cable",
-        Status.NO_CONTACT: "no taxel is loaded; see that the finger lies on the object",
+        Status.GAP: "too many frames in a row are missing; check the skin's cable",
+        Status.NO_CONTACT: "no taxel is loaded; check that the finger touches the object",
         Status.SATURATED: "too many raw counts at full scale; press less",
-        Status.STUCK_TAXEL: "a loaded taxel does not move; look at the skin",
-        Status.DEAD_TAXEL: "a taxel between loaded ones is silent; look at the skin",
-        Status.SENSOR_LOST: "the skin went away during the sweep; look at its cable",
-        Status.NO_START: "a stop edge without a start; look at the start line",
-        Status.NO_STOP: "a second start edge came; look at the stop line",
+        Status.STUCK_TAXEL: "a loaded taxel shows a constant count; check the skin",
+        Status.DEAD_TAXEL: "a taxel between loaded taxels is dead; check the skin",
+        Status.SENSOR_LOST: "the skin was lost during the sweep; check its cable",
+        Status.NO_START: "a stop edge without a start; check the GPIO line START",
+        Status.NO_STOP: "a second start edge came; check the GPIO line STOP",
         Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
-        Status.EDGES_LOST: "trigger edges were lost; look at the trigger lines",
+        Status.EDGES_LOST: "trigger edges were lost; check the GPIO lines of the trigger",
         Status.ABORTED: "by command, or because the box was stopping",
         Status.RECORDED: "sweeps are recorded, not classified",
     }
 )
-"""Why a sweep has no label, and what to check; PROTOCOL.md has the details."""
+"""The reason why a sweep has no label, and the remedy; PROTOCOL.md has the details."""

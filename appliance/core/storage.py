@@ -1,9 +1,8 @@
-"""Atomic writes: a file or folder is complete or absent, also after a loss of power. In: names and
-bytes. Out: files.
+"""Atomic writes: a file or folder is complete or absent, also after a loss of power.
 
-A file is written under another name, synced and renamed, and its folder synced: at every moment its
-name refers to the old content or to all of the new. Nothing here handles an OSError; the caller
-knows what is lost by it.
+A file is written under another name, synced and renamed, and its folder synced. So its name refers
+to the old content or to all of the new at every moment. Nothing here handles an OSError, since only
+the caller knows the consequences.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PART = ".part"
-"""Suffix of a file that is not finished; after a crash such a file may be removed."""
+"""Suffix of an unfinished file; after a crash such a file may be removed."""
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Constants of the Linux system call renameat2."""
 
@@ -41,9 +40,9 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
     may leave a broken one. mode: permission bits, regardless of the umask; None leaves them to the
     umask. Raises OSError, and then leaves behind no file that did not exist before.
     """
-    # as text: pathlib interns each new name, Python never reuses a place in its table of interned
-    # strings, and where a file is written each second the table would fill and be made anew, half a
-    # MiB larger, in the midst of the work
+    # as text: pathlib interns each new name, and Python never reuses a place in its table of
+    # interned strings. With a file written each second the table would fill and be rebuilt, half a
+    # MiB larger, during the work
     asides = {target: f"{target}{PART}" for target in files}
     taken: list[str] = []
     try:
@@ -64,7 +63,7 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
 
 
 def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file under its own name, synced if `durable`: for a folder that gets its name only
+    """Write one file under its own name, synced if `durable`; for a folder that gets its name only
     when complete."""
     with open(path, "wb") as f:
         if mode is not None:
@@ -77,11 +76,10 @@ def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | No
 
 @contextmanager
 def folder(target: Path) -> Iterator[Path]:
-    """A new folder beside `target`. When the block ends without an exception its files are synced
-    and it takes the name `target` in one step, replacing what was there; otherwise it is removed.
-    Raises OSError.
-    """
-    import tempfile  # costs 1 MB of memory with its imports, needed only where a bundle is written
+    """A new folder beside `target`. If the block ends without an exception, its files are synced
+    and it takes the name `target` in one step, replacing an earlier folder; otherwise it is
+    removed. Raises OSError."""
+    import tempfile  # costs 1 MB of memory with its imports, needed only to write a bundle
 
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as aside:
         new = Path(aside) / "new"
@@ -115,7 +113,7 @@ def link(path: Path, target: str) -> None:
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Swap two names in one step (renameat2), for which Python's os has no function."""
+    """Swap two names in one step (renameat2), which Python's os does not offer."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

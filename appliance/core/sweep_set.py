@@ -1,4 +1,4 @@
-"""Sweep sets, which the simulator plays and `train` learns from. In: a user's .npz. Out: a checked
+"""Sweep sets, which the simulator plays and `train` learns from: a user's .npz as a checked
 SweepSet.
 
 All shapes and types are checked here, so that no other module has to.
@@ -30,8 +30,8 @@ class SweepSet:
     indices into `materials`. rate_hz: frames per second. groups: int [N] each; sweeps with the same
     number in `recording` are parts of one recording. source: the name used in messages. unloaded:
     float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the skin without contact
-    as it was when each sweep was recorded, NaN for a sweep where it is not known; None where it
-    never is. Raises FormatError naming `source` and what is wrong.
+    when each sweep was recorded, NaN for a sweep where it is unknown; None if it is unknown for
+    all. Raises FormatError naming `source` and the fault.
     """
 
     samples: Array
@@ -70,7 +70,7 @@ class SweepSet:
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
 
     def _check_numbers(self) -> None:
-        """The arrays with an entry for each sweep."""
+        """Check the arrays with an entry for each sweep."""
         x = self.samples
         for name, values in {
             "labels": self.labels,
@@ -136,7 +136,7 @@ def read(path: Path, what: str) -> dict[str, Array]:
 
 
 def _typed(z: Any, name: str) -> Array:
-    """One array of an open .npz. Raises ValueError with the remedy where it holds Python
+    """One array of an open .npz. Raises ValueError with the remedy if it contains Python
     objects."""
     try:
         return np.asarray(z[name])
@@ -150,16 +150,15 @@ def _typed(z: Any, name: str) -> Array:
 
 
 def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in the .npz `path`. Raises FormatError naming the file and what is missing or of the
-    wrong form."""
+    """The set in the .npz `path`. Raises FormatError naming the file and the missing or invalid
+    array."""
     return build(
         read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind
     )
 
 
 def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
-    """A set of `arrays`, named as in a file. Raises FormatError naming `source` and what is
-    wrong."""
+    """A set of `arrays`, named as in a file. Raises FormatError naming `source` and the fault."""
     arrays = _numbered(arrays, source)
     missing = {"samples", "labels", "materials", "rate_hz"} - set(arrays)
     if missing:
@@ -191,8 +190,8 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
 
 
 def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
-    """The arrays with labels that are names as indices into `materials`, which may be missing then.
-    Raises FormatError."""
+    """The arrays, with labels that are names converted to indices into `materials`, which may then
+    be missing. Raises FormatError."""
     if "labels" not in arrays or (given := arrays["labels"]).dtype.kind != "U":
         return arrays
     materials = arrays.get("materials", np.unique(given))

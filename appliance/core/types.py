@@ -29,17 +29,17 @@ DATA_TYPES = ("uint8", "int16", "uint16", "float32")
 """Data types of a taxel's raw count; the position in this tuple is its code in packets
 (PROTOCOL.md)."""
 MOST_AXES = 8
-"""Largest number of values that a taxel has."""
+"""Largest number of values of a taxel."""
 
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
-enumerations of the board are never adjacent."""
+enumerations of the skin are never adjacent."""
 SCHEMA = 3
 """Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
 sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
-"""What numpy raises for a broken .npy, beside OSError; MemoryError if its header names an
-impossible size."""
+"""Errors of numpy for a broken .npy, beside OSError; MemoryError if its header gives an impossible
+size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class SweepFormat:
     """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used,
     counts of `dtype`.
 
-    axes: values of each taxel; the last is the one along the skin's normal. It is part of a bundle:
+    axes: values of each taxel; the last is along the skin's normal. The format is part of a bundle:
     another skin needs another bundle, not other code. Raises FormatError for a value out of range.
     """
 
@@ -67,7 +67,7 @@ class SweepFormat:
             raise FormatError(
                 f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way"
             )
-        if not 1e-3 <= self.rate_hz <= 1e6:  # a board sends thousandths of 1 Hz
+        if not 1e-3 <= self.rate_hz <= 1e6:  # a readout board sends thousandths of 1 Hz
             raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
         if self.window < 1:
             raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
@@ -98,7 +98,7 @@ class SweepFormat:
 
     @property
     def skin(self) -> tuple[tuple[int, ...], str]:
-        """What a readout board must have in common with a bundle: shape of a frame, data type."""
+        """The part that a skin and a bundle must share: shape of a frame, data type."""
         return self.shape, self.dtype
 
     def json(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
 
 
 def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
-    """The axis along the skin's normal alone, the last one: [..., R, C] of [..., R, C] or [..., R,
+    """The axis along the skin's normal, which is the last: [..., R, C] of [..., R, C] or [..., R,
     C, A].
 
     before: dimensions before the rows, 0 for one frame, 1 for a window.
@@ -156,8 +156,8 @@ class Frames:
 
 
 class EdgeKind(StrEnum):
-    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that what the robot
-    signalled is unknown."""
+    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that the robot's signals
+    are unknown."""
 
     START = "start"
     STOP = "stop"
@@ -184,13 +184,13 @@ class Sweep:
     """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise
     empty.
 
-    share: 1; less for a sweep that is still going on: the share of a window's frames that has come,
-    counted from half a second after the start edge; `frames` then are these frames. start_ns,
-    stop_ns: trigger edges, host monotonic (equal if one is missing; before the stop edge the last
-    frame). lost: frames of the window that never arrived; if `status` is ok they were interpolated.
-    complete_ns: when the last thing needed (stop edge or frame) had arrived. object: number of NEW
-    OBJECT signals so far; 0 before the first, when sweeps are not fused. material, position,
-    session: labels given while recording, "" for none.
+    share: 1 for a finished sweep. For a sweep that is still going on it is the share of a window's
+    frames that has come, counted from half a second after the start edge; `frames` then are these
+    frames. start_ns, stop_ns: trigger edges, host monotonic (equal if one is missing; before the
+    stop edge the last frame). lost: frames of the window that never arrived; if `status` is ok they
+    were interpolated. complete_ns: arrival of the last stop edge or frame that was needed. object:
+    number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused. material,
+    position, session: labels given while recording, "" for none.
     """
 
     id: int
@@ -212,13 +212,13 @@ class Verdict:
     """The answer to one sweep.
 
     scores: float64 [K] probabilities of the K labels for this sweep, or for all fused sweeps; empty
-    if nothing was classified. margin: probability of the label minus that of the next one. detail:
-    what the status refers to ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as in Sweep.
-    latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share: share of
-    the window that was used, less than 1 in an early answer. own: float64 [K] probabilities of this
-    sweep alone; empty if nothing was classified. displacement: distance of the contact from its
-    positions in training ("moved 2.1 mm too far towards row 4"); "" if it is in place, or if the
-    bundle does not hold the positions.
+    if nothing was classified. margin: probability of the label minus that of the next label.
+    detail: the subject of the status ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as
+    in Sweep. latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share:
+    share of the window that was used, less than 1 in an early answer. own: float64 [K]
+    probabilities of this sweep alone; empty if nothing was classified. displacement: distance of
+    the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
+    in place, or if the bundle does not have the positions.
     """
 
     sweep: int
@@ -308,7 +308,7 @@ def sidecar(path: Path) -> dict[str, Any]:
 
 def load(path: Path) -> tuple[Sweep, SweepFormat]:
     """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another
-    form."""
+    format."""
     content = sidecar(path)
     try:
         data = path.read_bytes()

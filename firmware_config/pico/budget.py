@@ -1,8 +1,8 @@
-"""What a frame may take, and what it takes: `mpremote run budget.py` on a Pico; `micropython
+"""The time of a frame, calculated and measured: `mpremote run budget.py` on a Pico, `micropython
 budget.py` anywhere.
 
-Calculated from data sheets (README.md names them): what is left for MicroPython of the time of one
-reading. Measured where this runs: the part without pins, and on a Pico the reading of a frame.
+Calculated from data sheets (see README.md): the part of a reading's time that is left for
+MicroPython. Measured on this machine: the part without pins, and on a Pico the reading of a frame.
 """
 
 import math
@@ -27,28 +27,27 @@ def settle_us(bits):
 def calculated(rows, cols, rate_hz, dtype):
     """(us a reading, us of them that settling takes, us left for MicroPython, bytes a second, bytes
     of memory)."""
-    form = readout.Form(rows, cols, rate_hz, dtype)
-    reading_us = form.period_us / (rows * cols)
-    settling_us = settle_us(12 if form.item_bytes == 2 else 8)
-    packet = readout.HEADER_BYTES + form.packet_frames * form.frame_bytes + readout.CRC_BYTES
-    rate = packet * 1000000 / (form.period_us * form.packet_frames)
+    format = readout.Format(rows, cols, rate_hz, dtype)
+    reading_us = format.period_us / (rows * cols)
+    settling_us = settle_us(12 if format.item_bytes == 2 else 8)
+    packet = readout.HEADER_BYTES + format.packet_frames * format.frame_bytes + readout.CRC_BYTES
+    rate = packet * 1000000 / (format.period_us * format.packet_frames)
     return (
         reading_us,
         settling_us,
         reading_us - settling_us - CONVERSION_US,
         rate,
-        packet * (form.packets + 2),
+        packet * (format.packets + 2),
     )
 
 
 class Ticks:
-    """A clock that stands until it is told to go on."""
+    """A clock that advances only by hand."""
 
     def __init__(self):
         self.now = 0
 
     def ticks_us(self):
-        """Now."""
         return self.now
 
     def ticks_add(self, ticks, delta):
@@ -60,22 +59,22 @@ class Ticks:
         return later - earlier
 
     def start(self, period_us, callback):
-        """No timer."""
+        """Does nothing: there is no timer."""
 
 
 def pure_us(rows, cols, rate_hz, dtype):
-    """Microseconds a frame takes without its reading: number, time, FIFO, header, CRC; the best of
-    40 times 60 frames."""
-    form, clock = readout.Form(rows, cols, rate_hz, dtype), Ticks()
+    """Microseconds of a frame without its reading: number, time, FIFO, header, CRC; the best of 40
+    times 60 frames."""
+    format, clock = readout.Format(rows, cols, rate_hz, dtype), Ticks()
     board = readout.Readout(
-        form, "", lambda buffer, at: None, lambda: 0, clock, clock, lambda: 0, lambda state: None
+        format, "", lambda buffer, at: None, lambda: 0, clock, clock, lambda: 0, lambda state: None
     )
     board.request(readout.START)
     best = 1000000
     for _ in range(40):
         began = time.ticks_us()
         for _ in range(60):
-            clock.now += form.period_us
+            clock.now += format.period_us
             board.tick()
             board.next()
         best = min(best, time.ticks_diff(time.ticks_us(), began))
@@ -83,20 +82,20 @@ def pure_us(rows, cols, rate_hz, dtype):
 
 
 def reading_us():
-    """Microseconds that one reading takes as settings.py has it; None where there are no pins."""
+    """Microseconds of one reading with settings.py; None without pins."""
     try:
         import main
     except ImportError:
         return None
-    form = readout.Form(settings.ROWS, settings.COLS, settings.RATE_HZ, settings.DTYPE)
+    format = readout.Format(settings.ROWS, settings.COLS, settings.RATE_HZ, settings.DTYPE)
     scanner = main.Scanner(
-        form, settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, settings.SETTLE_US
+        format, settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, settings.SETTLE_US
     )
-    buffer = bytearray(form.frame_bytes)
+    buffer = bytearray(format.frame_bytes)
     began = time.ticks_us()
     for _ in range(100):
         scanner.scan(buffer, 0)
-    return time.ticks_diff(time.ticks_us(), began) / 100 / (form.rows * form.cols)
+    return time.ticks_diff(time.ticks_us(), began) / 100 / (format.rows * format.cols)
 
 
 def table():
@@ -105,7 +104,8 @@ def table():
         reading, settling, left, rate, memory = calculated(*given)
         rows, cols, rate_hz, dtype = given
         yield (
-            f"| {rows}x{cols} at {rate_hz} Hz, {dtype} | {reading:.1f} | {CONVERSION_US} | {settling:.1f} | {left:.1f} "
+            f"| {rows}x{cols} at {rate_hz} Hz, {dtype} | {reading:.1f} | {CONVERSION_US} | "
+            f"{settling:.1f} | {left:.1f} "
             f"| {rate / 1000:.1f} | {memory / 1000:.1f} |"
         )
 
@@ -115,7 +115,8 @@ if __name__ == "__main__":
         print(line)
     for given in FORMS:
         print(
-            f"measured here: {pure_us(*given):.1f} us a frame of {given[0]}x{given[1]} {given[3]} without its reading"
+            f"measured here: {pure_us(*given):.1f} us a frame of {given[0]}x{given[1]} {given[3]} "
+            "without its reading"
         )
     measured = reading_us()
     if measured is None:

@@ -14,12 +14,11 @@ from machine import ADC, Pin, Timer, disable_irq, enable_irq, unique_id
 
 class Scanner:
     """Reads the taxels one by one, in an interrupt, where nothing may be allocated. So it is a
-    class and no closure, which allocates when it is called with more than five names, and assigns
-    at most three names at once, since four make a tuple.
-    """
+    class: a closure allocates when it is called with more than five names. It assigns at most three
+    names at once, since four make a tuple."""
 
-    def __init__(self, form, row_pins, col_pins, adc_pin, settle_us):
-        lines, levels, taxels = readout.reading_order(form.rows, form.cols)
+    def __init__(self, format, row_pins, col_pins, adc_pin, settle_us):
+        lines, levels, taxels = readout.reading_order(format.rows, format.cols)
         self._lines, self._levels, self._taxels = (
             bytearray(lines),
             bytearray(levels),
@@ -28,7 +27,7 @@ class Scanner:
         self._pins = [Pin(number, Pin.OUT, value=0) for number in tuple(row_pins) + tuple(col_pins)]
         self._read, self._settle_us = ADC(Pin(adc_pin)).read_u16, settle_us
         self.scan = (
-            self._scan8 if form.item_bytes == 1 else self._scan16
+            self._scan8 if format.item_bytes == 1 else self._scan16
         )  # (buffer, at): writes a frame there
 
     @micropython.native
@@ -60,11 +59,11 @@ class Scanner:
 
 
 class Ticker:
-    """The timer, as `readout.Readout` uses it."""
+    """The timer for `readout.Readout`."""
 
     def __init__(self, hard):
         self._timer = Timer()
-        self._options = {"hard": True} if hard else {}  # which older versions do not know
+        self._options = {"hard": True} if hard else {}  # older versions do not have this option
 
     def start(self, period_us, callback):
         """Call `callback` once a period."""
@@ -77,16 +76,15 @@ class Ticker:
         )
 
     def stop(self):
-        """Call it no more."""
         self._timer.deinit()
 
 
 def board(config, **counters):
-    """The board that the settings ask for. counters: see `readout.Readout`."""
-    form = readout.Form(
+    """The readout board with these settings. counters: see `readout.Readout`."""
+    format = readout.Format(
         config.ROWS, config.COLS, config.RATE_HZ, config.DTYPE, config.FIFO_S, config.BOARD
     )
-    scan = Scanner(form, config.ROW_PINS, config.COL_PINS, config.ADC_PIN, config.SETTLE_US).scan
+    scan = Scanner(format, config.ROW_PINS, config.COL_PINS, config.ADC_PIN, config.SETTLE_US).scan
     level = (
         (lambda: 0)
         if config.TRIGGER_PIN is None
@@ -96,7 +94,7 @@ def board(config, **counters):
     ticker = Ticker(config.HARD_TIMER)
     try:
         return readout.Readout(
-            form, serial, scan, level, time, ticker, disable_irq, enable_irq, **counters
+            format, serial, scan, level, time, ticker, disable_irq, enable_irq, **counters
         )
     except MemoryError:
         raise ValueError(
@@ -105,13 +103,13 @@ def board(config, **counters):
 
 
 def run(config=settings, **counters):
-    """Serve the port. Ctrl-C is the number of START: it must arrive as a byte."""
+    """Serve the port. Ctrl-C is disabled, since its byte is the number of START."""
     made = board(config, **counters)
     poll = select.poll()
     poll.register(sys.stdin, select.POLLIN)
 
     def readable(ms):
-        for _ in poll.ipoll(ms):  # nothing is allocated
+        for _ in poll.ipoll(ms):  # without allocation
             return True
         return False
 
@@ -126,5 +124,5 @@ def run(config=settings, **counters):
 if __name__ == "__main__" and Pin(settings.SERVICE_PIN, Pin.IN, Pin.PULL_UP).value():
     micropython.alloc_emergency_exception_buf(
         100
-    )  # an interrupt cannot allocate what would tell of its failure
+    )  # an interrupt cannot allocate the message of its failure
     run()

@@ -1,10 +1,10 @@
-"""The readout board without its pins: form, order of reading, FIFO, packets, requests (PROTOCOL.md,
-part 1).
+"""The readout board without its pins: format, order of reading, FIFO, packets, requests
+(PROTOCOL.md, part 1).
 
-In: settings, a scan function, a clock with MicroPython's ticks_us, ticks_add and ticks_diff. Out:
-bytes. `Readout.tick` runs in a timer interrupt. It must not allocate memory, so buffers are made
-beforehand, and counters of 32 bits are kept as two halves: on a Pico, an integer of more than 30
-bits is an object on the heap.
+Settings, a scan function and a clock with MicroPython's ticks_us, ticks_add and ticks_diff are
+passed in. `Readout.tick` runs in a timer interrupt and must not allocate memory. So buffers are
+made beforehand, and counters of 32 bits are kept as two halves: on a Pico, an integer of more than
+30 bits is an object on the heap.
 """
 
 import struct
@@ -19,13 +19,14 @@ MAX_PAYLOAD, MAX_FRAMES, PACKET_US = 4096, 255, 8000
 DATA_TYPES = {"uint8": (0, 1), "uint16": (2, 2)}  # name -> code in packets, bytes
 FRAMES, REPLY = 0, 1
 MOST = 16
-"""Rows and columns that one multiplexer has lines for."""
+"""Most rows and columns of one multiplexer."""
 NO_TAXEL = 0xFFFF
-"""In an order of reading: a line is switched and nothing is read."""
+"""In an order of reading: only a line is switched, and nothing is read."""
 
 
-class Form:
-    """What the board sends. Raises ValueError naming the setting, its value and what is allowed."""
+class Format:
+    """The format of frames. Raises ValueError naming the setting, its value and the allowed
+    values."""
 
     def __init__(self, rows, cols, rate_hz, dtype="uint8", fifo_s=1, board="palpate-pico"):
         for name, value in (("ROWS", rows), ("COLS", cols)):
@@ -46,7 +47,7 @@ class Form:
         self.frame_bytes = rows * cols * self.item_bytes
         self.period_us = int(
             1000000 / rate_hz + 0.5
-        )  # timers count whole microseconds, and the rate is said as it is
+        )  # timers count whole microseconds, and the announced rate must be exact
         self.packet_frames = max(
             1, min(MAX_FRAMES, MAX_PAYLOAD // self.frame_bytes, PACKET_US // self.period_us)
         )
@@ -75,7 +76,7 @@ def reply(request, payload):
 
 
 def seal(packet, length):
-    """Put the CRC behind a payload of so many bytes."""
+    """Write the CRC after a payload of so many bytes."""
     end = HEADER_BYTES + length
     struct.pack_into("<I", packet, end, crc32(memoryview(packet)[:end]))
 
@@ -95,11 +96,12 @@ def gray(count):
 
 
 def reading_order(rows, cols):
-    """How one frame is read with the fewest switches: lists (lines, levels, taxels), item by item.
+    """The order in which one frame is read with the fewest switches: lists (lines, levels, taxels),
+    item by item.
 
     Set select line `lines[i]` (0 to 3: rows, 4 to 7: columns, lowest bit first) to `levels[i]`,
-    then read taxel `taxels[i]`, its place in the frame, row by row; nothing where that is NO_TAXEL.
-    All lines are low at first, and are again after the last item.
+    then read taxel `taxels[i]`, its index in the frame, row by row; read nothing if that is
+    NO_TAXEL. All lines are low at first, and low again after the last item.
     """
     lines, levels, taxels = [], [], []
     at, forwards = 0, gray(cols)
@@ -122,33 +124,33 @@ def reading_order(rows, cols):
 
 
 class Fifo:
-    """A ring of packets. The interrupt fills one frame by frame; the main program takes the oldest
-    one that is full.
+    """A ring of packets. The interrupt fills a packet frame by frame; the main program takes the
+    oldest full packet.
 
-    lock, unlock: `machine.disable_irq` and `enable_irq`; they guard the few statements that must
-    not be torn apart. Raises MemoryError if it does not fit the memory.
+    lock, unlock: `machine.disable_irq` and `enable_irq`, around the few statements that must not be
+    interrupted. Raises MemoryError if the memory is too small.
     """
 
-    def __init__(self, form, lock, unlock):
-        self._form, self._lock, self._unlock = form, lock, unlock
+    def __init__(self, format, lock, unlock):
+        self._format, self._lock, self._unlock = format, lock, unlock
         self._slots = [
-            self._blank() for _ in range(form.packets + 1)
-        ]  # one more: the one being filled
-        self._counts = bytearray(form.packets + 1)
+            self._blank() for _ in range(format.packets + 1)
+        ]  # one more for the packet that is being filled
+        self._counts = bytearray(format.packets + 1)
         self._spare = self._blank()
         self._oldest = self._full = self._filled = 0
         self._overflowed = False
         self.filling = self._slots[0]
 
     def _blank(self):
-        form = self._form
-        packet = bytearray(HEADER_BYTES + form.packet_frames * form.frame_bytes + CRC_BYTES)
+        format = self._format
+        packet = bytearray(HEADER_BYTES + format.packet_frames * format.frame_bytes + CRC_BYTES)
         packet[:4] = bytes((0x50, 0xC1, VERSION, FRAMES))
-        packet[8:11] = bytes((form.rows, form.cols, form.code))
+        packet[8:11] = bytes((format.rows, format.cols, format.code))
         return packet
 
     def clear(self):
-        """Forget all frames."""
+        """Drop all frames."""
         state = self._lock()
         self._full = self._filled = 0
         self._overflowed = False
@@ -156,23 +158,23 @@ class Fifo:
         self._unlock(state)
 
     def room(self, seq_low, seq_high, t_low, t_high, level):
-        """In the interrupt: where in `filling` the next frame goes. The others tell of it: number,
-        time, trigger line."""
+        """In the interrupt: the offset of the next frame in `filling`. The other arguments describe
+        it: number, time, trigger line."""
         if self._filled == 0:
             put32(self.filling, 12, seq_low, seq_high)
             put32(self.filling, 16, t_low, t_high)
             self.filling[6] = TRIGGER if level else 0
-        return HEADER_BYTES + self._filled * self._form.frame_bytes
+        return HEADER_BYTES + self._filled * self._format.frame_bytes
 
     def filled(self):
-        """In the interrupt: the frame is there."""
+        """In the interrupt: the frame is complete."""
         self._filled += 1
-        if self._filled == self._form.packet_frames:
+        if self._filled == self._format.packet_frames:
             self.finish()
 
     def finish(self):
-        """In the interrupt: the packet ends here, for it is full or the next number does not
-        follow. Drops the oldest packet if there is no other room."""
+        """In the interrupt: end the packet, since it is full or the next number does not follow.
+        Drops the oldest packet if there is no other room."""
         if self._filled == 0:
             return
         size = len(self._slots)
@@ -186,8 +188,8 @@ class Fifo:
         self.filling = self._slots[(self._oldest + self._full) % size]
 
     def take(self):
-        """The oldest packet, complete with its CRC, and its size; (None, 0) if there is none. It
-        stays as it is until the next call."""
+        """The oldest packet with its CRC, and its size; (None, 0) if there is none. It stays valid
+        until the next call."""
         state = self._lock()
         if self._full == 0:
             self._unlock(state)
@@ -199,7 +201,7 @@ class Fifo:
         self._full -= 1
         overflowed, self._overflowed = self._overflowed, False
         self._unlock(state)
-        length = frames * self._form.frame_bytes
+        length = frames * self._format.frame_bytes
         struct.pack_into(
             "<HBB", packet, 4, length, packet[6] | (OVERFLOW if overflowed else 0), frames
         )
@@ -208,22 +210,22 @@ class Fifo:
 
 
 class Readout:
-    """The board: numbers and times of frames, and what is sent.
+    """The readout board: numbers and times of frames, replies and packets.
 
-    scan: called with a buffer and an offset, writes one frame there. level: the trigger line.
-    clock: `time`. timer: its start(period_us, callback) and stop() let `tick` be called. lock,
-    unlock: as for Fifo. seq, t_us: the first number and time, as (low, high).
+    scan: called with a buffer and an offset, writes one frame there. level: reads the trigger line.
+    clock: `time`. timer: its start(period_us, callback) and stop() control the calls of `tick`.
+    lock, unlock: as for Fifo. seq, t_us: the first number and time, as (low, high).
     """
 
     def __init__(
-        self, form, serial, scan, level, clock, timer, lock, unlock, seq=(0, 0), t_us=(0, 0)
+        self, format, serial, scan, level, clock, timer, lock, unlock, seq=(0, 0), t_us=(0, 0)
     ):
         self._scan, self._level, self._clock, self._timer = scan, level, clock, timer
-        self._period, self._half = form.period_us, form.period_us // 2
-        self._fifo = Fifo(form, lock, unlock)
+        self._period, self._half = format.period_us, format.period_us // 2
+        self._fifo = Fifo(format, lock, unlock)
         self._replies = {
-            IDENTITY: reply(IDENTITY, form.identity_payload(serial)),
-            FORMAT: reply(FORMAT, form.format_payload()),
+            IDENTITY: reply(IDENTITY, format.identity_payload(serial)),
+            FORMAT: reply(FORMAT, format.format_payload()),
         }
         self._reply = None
         self._seq_low, self._seq_high = seq
@@ -234,17 +236,17 @@ class Readout:
     def tick(self, _timer=None):
         """In the interrupt, once a period: take the frame that is due.
 
-        Its number comes from the clock: if the interrupt was late by more than half a period, the
-        frames that were not taken keep their numbers, so that the count and the clock agree and the
-        loss is seen.
+        Its number comes from the clock. If the interrupt was late by more than half a period, the
+        missed frames keep their numbers, so that the count and the clock agree and the loss is
+        visible.
         """
         if not self.running:
-            return  # a soft timer's interrupt that had waited when STOP came
+            return  # an interrupt of a soft timer that was pending at STOP
         clock, period = self._clock, self._period
         now = clock.ticks_us()
         late = clock.ticks_diff(now, self._due) + self._half
         if late < 0:
-            return  # an interrupt that had waited; its frame was taken already
+            return  # a pending interrupt whose frame was taken already
         missed = late // period
         self._due = clock.ticks_add(self._due, (missed + 1) * period)
         passed = clock.ticks_diff(now, self._last)
@@ -267,7 +269,7 @@ class Readout:
         self._seq_high = (self._seq_high + (low >> 16)) & 0xFFFF
 
     def request(self, number):
-        """Do what a request byte asks for. Other bytes are left alone: a modem manager may send
+        """Carry out a request byte. Other bytes are ignored, since a modem manager may send
         anything."""
         if number in self._replies:
             self._reply = self._replies[number]
@@ -284,22 +286,22 @@ class Readout:
 
     @property
     def replying(self):
-        """Whether a reply waits to be sent; no other request is looked at until it is."""
+        """Whether a reply waits to be sent; until then no other request is read."""
         return self._reply is not None
 
     def next(self):
-        """What is sent next, a reply before frames: a buffer and how many of its bytes; (None, 0)
-        for nothing."""
+        """The next bytes to send, a reply before frames: a buffer and the number of its bytes;
+        (None, 0) for nothing."""
         answer, self._reply = self._reply, None
         return (answer, len(answer)) if answer else self._fifo.take()
 
 
 def serve(readout, stdin, stdout, readable):
-    """Answer requests and send packets until `stdin` ends, which on a Pico it never does.
+    """Answer requests and send packets until `stdin` ends, which never happens on a Pico.
 
-    readable: called with milliseconds, whether a byte can be read from `stdin`, after so long a
-    wait at most. `stdout.write` may take a part, or nothing while the host does not read; the rest
-    is sent later.
+    readable: called with milliseconds; whether a byte can be read from `stdin`, after waiting so
+    long at most. `stdout.write` may accept a part, or nothing while the host does not read; the
+    rest is sent later.
     """
     byte = bytearray(1)
     packet, sent, size = None, 0, 0

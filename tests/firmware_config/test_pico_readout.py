@@ -24,11 +24,11 @@ class DrivenBoard:
     def __init__(self, ticks=0, wrap=SMALL, level=0, **settings):
         counters = {name: settings.pop(name) for name in ("seq", "t_us") if name in settings}
         self.ticks, self.wrap, self.level, self.scans = ticks, wrap, level, 0
-        self.form = readout.Form(
+        self.format = readout.Format(
             **{"rows": 2, "cols": 3, "rate_hz": 1000, "fifo_s": 0.25} | settings
         )
         self.board = readout.Readout(
-            self.form,
+            self.format,
             "0123456789abcdef",
             self.scan,
             lambda: self.level,
@@ -42,7 +42,7 @@ class DrivenBoard:
 
     def scan(self, buffer, at):
         """The firmware's scan function."""
-        for k in range(self.form.frame_bytes):
+        for k in range(self.format.frame_bytes):
             buffer[at + k] = self.scans % 256
         self.scans += 1
 
@@ -61,7 +61,7 @@ class DrivenBoard:
 
     def start(self, period_us, callback):
         """The timer starts."""
-        assert period_us == self.form.period_us
+        assert period_us == self.format.period_us
         self.callback = callback
 
     def stop(self):
@@ -76,7 +76,7 @@ class DrivenBoard:
     def tick(self, times=1, us=None):
         """Let time pass by a period, or `us`, and interrupt; so many times."""
         for _ in range(times):
-            self.ticks = (self.ticks + (self.form.period_us if us is None else us)) % self.wrap
+            self.ticks = (self.ticks + (self.format.period_us if us is None else us)) % self.wrap
             self.board.tick()
             held = [
                 v
@@ -123,7 +123,7 @@ def test_a_setting_that_cannot_be_is_named(settings, named):
 
 
 @pytest.mark.parametrize(
-    ("settings", "form"),
+    ("settings", "format"),
     [
         ({"rows": 4, "cols": 4, "rate_hz": 750, "fifo_s": 1}, (4, 4, "uint8", 750.188, 756, 6)),
         (
@@ -136,7 +136,7 @@ def test_a_setting_that_cannot_be_is_named(settings, named):
         ),
     ],
 )
-def test_replies_are_those_of_the_protocol(settings, form):
+def test_replies_are_those_of_the_protocol(settings, format):
     """Byte by byte what the box's encoder makes; the FIFO is not shorter than asked, the rate is
     the timer's."""
     made = DrivenBoard(**settings)
@@ -144,7 +144,7 @@ def test_replies_are_those_of_the_protocol(settings, form):
     who = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-pico", "0123456789abcdef")
     assert made.sent() == packets.pack_reply(packets.Request.IDENTITY, packets.pack_identity(who))
     made.ask(readout.FORMAT)
-    said = packets.SkinFormat(*form)
+    said = packets.SkinFormat(*format)
     assert made.sent() == packets.pack_reply(packets.Request.FORMAT, packets.pack_format(said))
     assert said.fifo_frames >= 0.25 * said.rate_hz - 1
 
@@ -157,7 +157,7 @@ def test_packets_are_those_of_the_protocol(dtype, level):
     made = DrivenBoard(dtype=dtype, level=level, seq=(65534, 7))
     made.ask(readout.START)
     made.tick(8)
-    numbers = np.arange(8, dtype=np.uint8).repeat(made.form.frame_bytes)
+    numbers = np.arange(8, dtype=np.uint8).repeat(made.format.frame_bytes)
     taxels = numbers.view("<u2" if dtype == "uint16" else "u1").reshape(8, 2, 3)
     assert made.sent() == packets.pack(7 << 16 | 65534, 1000, taxels, level * packets.Flag.TRIGGER)
 
@@ -237,7 +237,7 @@ def test_a_full_fifo_drops_the_oldest_and_says_so_once():
     not."""
     made = DrivenBoard()
     made.ask(readout.START)
-    depth = made.form.packets * made.form.packet_frames
+    depth = made.format.packets * made.format.packet_frames
     assert depth >= 250
     made.tick(depth + 24)
     got = made.packets()
@@ -256,7 +256,7 @@ def test_what_is_being_sent_is_not_overwritten():
     made.tick(8)
     packet, size = made.board.next()
     before = bytes(packet[:size])
-    made.tick(2 * made.form.packets * made.form.packet_frames)
+    made.tick(2 * made.format.packets * made.format.packet_frames)
     assert bytes(packet[:size]) == before
 
 

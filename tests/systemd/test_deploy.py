@@ -198,7 +198,7 @@ def test_signers_are_never_overwritten(
     done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
     assert done.returncode == 1
     assert (
-        "FAILED: users, folders and settings: /etc/palpate/allowed_signers is another one there"
+        "FAILED: users, folders and settings: /etc/palpate/allowed_signers differs from this file there"
         in done.stdout
     )
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
@@ -707,7 +707,7 @@ for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at
     assert run_here(code).splitlines() == [
         "its system is Alpine Linux v3.19, not Debian; Palpate needs Debian 12 for arm64 or amd64",
         "its system is Raspbian 11, armhf; Palpate needs Debian 12 for arm64 or amd64",
-        "/opt is a file system of its own there; it must be part of the root file system",
+        "/opt is a separate file system there; it must be part of the root file system",
         "its Python is 3.9.2; Palpate needs 3.11 or later, which Debian 12 has",
     ]
 

@@ -74,7 +74,7 @@ def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
     assert fault["level"] == ERROR
     assert (
         fault["message"]
-        == "stuck-taxel: a loaded taxel does not move; look at the skin (taxel 2.3)"
+        == "stuck-taxel: a loaded taxel shows a constant count; check the skin (taxel 2.3)"
     )
     assert verdict(box, node, result(5, share="0.40"))["values"]["early"] == "true"
 

@@ -126,7 +126,7 @@ def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
         "",
         0,
     )
-    assert stuck["message"] == "a loaded taxel does not move; look at the skin (taxel 2.3)"
+    assert stuck["message"] == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
 
 
 def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):

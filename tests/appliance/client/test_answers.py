@@ -65,7 +65,7 @@ def test_each_status_is_one_kind(status: Status):
 def test_the_detail_stands_with_the_advice():
     """What the box adds is not lost."""
     answer = Answer.read(result(verdict(Status.STUCK_TAXEL, "taxel 2.3"), "usb").decode())
-    assert answer.what_to_do == "a loaded taxel does not move; look at the skin (taxel 2.3)"
+    assert answer.what_to_do == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
 
 
 def test_an_early_answer_says_so():

@@ -154,7 +154,7 @@ def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
     cut(key)
     with pytest.raises(subprocess.CalledProcessError) as e:
         install_scripts.enrolment_key(key.folder)
-    assert b"key is damaged; take it away" in e.value.stderr
+    assert b"key is damaged; remove it" in e.value.stderr
 
 
 def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest.MonkeyPatch):

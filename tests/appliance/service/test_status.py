@@ -293,7 +293,7 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
         ),
         (
             replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
-            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel does not move; look at the skin; "
+            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel shows a constant count; check the skin; "
             "taxel 2.3",
         ),
         (

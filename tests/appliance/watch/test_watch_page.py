@@ -149,7 +149,7 @@ def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
     seen = opened(browser, shown)
     shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
     until(lambda: seen.text("#status") == "sensor-lost")
-    assert "the skin went away during the sweep" in seen.text("#label")
+    assert "the skin was lost during the sweep" in seen.text("#label")
     assert seen.text("#sure") == ""
     assert seen.page.locator("#scores li").count() == 0
 
