@@ -246,7 +246,8 @@ def _explain(e: usb.core.USBError) -> SensorError:
     """The SensorError that explains an errno of libusb."""
     if e.errno == errno.EOVERFLOW:
         return SensorOverflow(
-            "a USB transfer was larger than a read (errno 75) and is lost; let the firmware send less"
+            "a USB transfer was larger than a read (errno 75) and is lost; let the firmware send "
+            "less"
             " in one transfer"
         )
     if e.errno == errno.EACCES:

@@ -117,7 +117,9 @@ def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
     """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with
     it."""
     assert feed.read(0) is None
-    assert "no palpate offers its feed there: the box is off or restarting; start it" in feed.trouble
+    assert (
+        "no palpate offers its feed there: the box is off or restarting; start it" in feed.trouble
+    )
     FakeFeed(feed.path).listener.close()
     time.sleep(0.6)
     assert feed.read(0.01) is None
