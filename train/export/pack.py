@@ -68,7 +68,7 @@ class Content:
     model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need. input:
     as in the manifest. train, held_out: the training sweeps and the others, split by the group
     `held_out_by`. about: description of the training; figures: its results; both for the manifest.
-    early, known, moved: for the manifest. means: the file means.npz if there is `known`. reference:
+    early, known, moved: for the manifest. classes: of the embedding, if there is `known`. reference:
     the float model of an int8 model. contacts: of the training sweeps; None to find them.
     """
 
@@ -82,7 +82,7 @@ class Content:
     early: bundle.Early | None = None
     known: bundle.Known | None = None
     moved: bundle.DisplacementRule | None = None
-    means: bytes = b""
+    classes: bundle.Classes | None = None
     reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
 
@@ -140,7 +140,14 @@ def _files(content: Content) -> dict[str, bytes]:
     golden = golden_sweeps(content.train, logits, of_means)
     files = {bundle.MODEL: slim(content.model).SerializeToString()}
     files |= {bundle.GOLDEN: golden_file(content, golden)}
-    return files | ({bundle.MEANS: content.means} if content.known else {})
+    return files | ({bundle.MEANS: means_file(content.classes)} if content.classes else {})
+
+
+def means_file(classes: bundle.Classes) -> bytes:
+    """The file means.npz."""
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **classes.arrays())
+    return packed.getvalue()
 
 
 def _made(content: Content, commit: str, contact_unknown_because: str) -> dict[str, Any]:
@@ -194,22 +201,19 @@ def pack_to_measure(
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:
     """Logits [N, K] that the box computes from class means once a label is enrolled, before
     temperature scaling."""
-    with np.load(io.BytesIO(content.means)) as means:
-        logits: Array = _embedded(content, sweeps) @ means["means"].T + means["bias"]
+    assert content.classes
+    logits: Array = _embedded(content, sweeps) @ content.classes.means.T + content.classes.bias
     return logits
 
 
 def _unknown(content: Content, sweeps: Dataset) -> Array:
     """bool [N], the sweeps that the box calls unknown; none if the bundle has no limit of known
     materials."""
-    if not content.known:
+    if not (content.known and content.classes):
         return np.zeros(len(sweeps), bool)
-    with np.load(io.BytesIO(content.means)) as means:
-        away = _embedded(content, sweeps)[:, None] - means["means"].astype(np.float64)
-        beyond: Array = (
-            shaped_distances(away, means["shapes"].astype(np.float64)).min(axis=1)
-            > content.known.limit
-        )
+    means, shapes = (a.astype(np.float64) for a in (content.classes.means, content.classes.shapes))
+    distances = shaped_distances(_embedded(content, sweeps)[:, None] - means, shapes)
+    beyond: Array = distances.min(axis=1) > content.known.limit
     return beyond
 
 

@@ -103,7 +103,7 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         early=rule.early,
         known=calibration.known(),
         moved=calibration.displacement_rule(),
-        means=calibration.means(),
+        classes=calibration.classes(),
         about=content.about | {"early": early},
         figures=content.figures | figures,
     )
@@ -121,7 +121,7 @@ def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
         raise ExportRefused(
             f"the float graph differs from pytorch by {difference:.3g} in a logit (limit "
             f"{MOST_TORCH_DIFFERENCE}); "
-            "fit again; if it stays, compare train/models/recipe/graph.py with network.py"
+            "fit again; if it stays, compare train/models/recipe/graph.py with stages.py"
         )
     return difference
 
@@ -233,7 +233,7 @@ def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.
     """
     from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
-    from train.models.recipe.network import Compact  # here, as what follows: it imports PyTorch
+    from train.models.recipe.stages import Compact  # here, as what follows: it imports PyTorch
 
     rng, format, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     counts = rng.integers(0, 256, (4, format.window, *format.shape), np.uint8)

@@ -21,7 +21,7 @@ REST = 20_000
 
 
 def trained(*places: tuple[float, float], group: str = "position", each: int = 2) -> Dataset:
-    """A set with `each` sweeps at each of these places, in taxels."""
+    """A set with `each` sweeps at each of these positions, in taxels."""
     samples = np.stack([np.stack([patch(*at)] * 3) for at in places for _ in range(each)]).astype(
         np.float32
     )
@@ -39,8 +39,8 @@ def positions_of(
 
 
 def test_the_places_of_a_training_set():
-    """One entry per position, in mm; without numbered positions per recording; without both per
-    sweep."""
+    """There is one centre per position, in mm; without numbered positions per recording; without
+    both per sweep."""
     at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
     for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
         found = positions_of(trained(*at, group=group, each=each), LOADS, pitch_mm=2.0)
@@ -62,7 +62,7 @@ def test_the_limit_leaves_each_position_out():
 
 
 def test_many_positions_are_thinned():
-    """A bundle has at most a thousand; of more, evenly spaced ones."""
+    """A bundle has at most a thousand positions, evenly spaced among more."""
     found = positions_of(
         trained(*[(1.5, 1 + i / 1100) for i in range(1100)], each=1), LOADS, pitch_mm=4.0
     )
@@ -73,7 +73,7 @@ def test_many_positions_are_thinned():
 
 
 def test_sets_without_positions():
-    """Without a pitch, or without contact, there are none; simulated sets have theirs."""
+    """Without a pitch, or without contact, positions are None; simulated sets have a pitch."""
     assert positions_of(trained((1.5, 1.5)), LOADS) is None
     assert positions_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0) is None
     both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
@@ -105,8 +105,8 @@ def known(drift: float = 0.0, load: float = 1000.0) -> Dataset:
 
 
 def test_a_load_is_above_the_unloaded_skin():
-    """A tenth of the weakest contact; at least what the unloaded skin differs by, between
-    recordings and by its noise. Sweeps of which it is not known do not count."""
+    """The limit is a tenth of the weakest contact, and at least the drift of the unloaded skin
+    between recordings plus its noise. Sweeps without an unloaded skin do not count."""
     found = find_limit(known())
     assert found.contact == pytest.approx(100, abs=1)
     assert found.tare.tolist() == np.full((2, 2), REST).tolist()
@@ -122,8 +122,8 @@ def test_a_load_is_above_the_unloaded_skin():
     "how", [{"load": 12.0}, {"drift": 400.0}, {"load": -1000.0}], ids=["weak", "drift", "falling"]
 )
 def test_what_does_not_separate_is_said(how: dict[str, float]):
-    """Contacts as weak as noise, a rest that moves by more than a contact, counts that fall: no
-    threshold, and why."""
+    """Contacts as weak as noise, a drift larger than a contact, and falling counts give no limit,
+    but a reason."""
     found = find_limit(known(**how))
     assert found.contact is None
     assert not found.tare.any()
@@ -134,8 +134,8 @@ def test_what_does_not_separate_is_said(how: dict[str, float]):
 
 
 def test_a_baseline_of_which_nothing_is_known_is_said():
-    """Where counts can be loads they are taken for them, as ever; where no taxel is ever near 0
-    nothing is guessed. One taxel alone has none to compare it with."""
+    """If counts can be loads they are taken as loads; if no taxel is ever near 0, the limit is
+    None. A single taxel cannot be compared with others."""
     high = replace(known(), unloaded=None)
     found = find_limit(high)
     assert found.contact is None

@@ -1,5 +1,5 @@
-"""Sweeps of a moved skin, on Gaussians: what copies vary in makes nothing unknown, the rest does;
-certainty is limited."""
+"""Displaced sweeps on Gaussians: variation like that of copies is known, other variation unknown,
+and certainty is limited."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ MEANS = 8 * np.eye(4)[:3]
 
 
 def sweeps(n: int, seed: int, spread: float = 0.0):
-    """n sweeps of each of three materials at each of eight positions, features [N, 4], of which the
-    last two are untrained; the third varies by `spread` more."""
+    """n sweeps of each of three materials at each of eight positions, features [N, 4]; the last two
+    are untrained, and the third varies by `spread` more."""
     rng = np.random.default_rng(seed)
     labels, groups = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
     x = MEANS[labels] + rng.standard_normal((len(labels), 4))
@@ -22,8 +22,8 @@ def sweeps(n: int, seed: int, spread: float = 0.0):
 
 
 def made(n: int = 20, wrong: float = 0.0):
-    """A DisplacementFit; of the held-out copies the share `wrong` is named wrongly, less surely than the
-    others are rightly."""
+    """A DisplacementFit. The share `wrong` of the held-out copies is named wrongly, with lower
+    probability than the others."""
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
     copies, copied_labels, copied_groups = sweeps(n, 1, spread=10)
@@ -36,8 +36,8 @@ def made(n: int = 20, wrong: float = 0.0):
 
 
 def test_what_the_copies_vary_in_makes_nothing_unknown():
-    """Far in the copies' direction: beyond the limit in place, within that of moved sweeps; in
-    another direction beyond both."""
+    """Sweeps far in the direction of the copies are beyond the limit in place, but within that of
+    displaced sweeps; in another direction they are beyond both."""
     z, fit, _ = made()
     assert fit
     x = sweeps(50, 5, spread=10)[0]
@@ -49,7 +49,7 @@ def test_what_the_copies_vary_in_makes_nothing_unknown():
 
 
 def test_the_box_measures_the_same_distances():
-    """turn, means and shapes of means.npz against the embedding they come from."""
+    """turn, means and shapes of means.npz give the distances of their embedding."""
     z, fit, _ = made()
     assert fit
     classes = fit.classes(z.classes())
@@ -63,8 +63,8 @@ def test_the_box_measures_the_same_distances():
 
 
 def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
-    """Ten in a hundred wrong with a probability of .62: more is asked for; where all are right, no
-    more than for any sweep."""
+    """If ten in a hundred copies are wrong with a probability of .62, more is required; if all are
+    right, no more than for any sweep."""
     _, fit, _ = made()
     assert fit
     assert (fit.rule.unsure, fit.rule.temperature) == (displacement.UNSURE[0], 1)
@@ -76,7 +76,7 @@ def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
 
 
 def test_copies_that_are_surely_wrong_leave_no_sure_answer():
-    """Half of the copies named wrongly with certainty: no probability is enough."""
+    """If half of the copies are certain and wrong, no probability is enough."""
     x, labels, groups = sweeps(10, 0)
     copied = AugmentedCopies(x, labels, groups, groups >= 6)
     truth = labels[groups >= 6]
@@ -88,8 +88,8 @@ def test_copies_that_are_surely_wrong_leave_no_sure_answer():
 
 
 def test_without_copies_that_judge_there_is_no_rule():
-    """No copies of held-out sweeps; a material without copies; a material that only held-out sweeps
-    have."""
+    """The rule is None without copies of held-out sweeps, with a material without copies, or with a
+    material that only held-out sweeps have."""
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])

@@ -1,5 +1,5 @@
-"""Early decisions on the desktop: the rule on constructed tenths, heads, and the graph against what
-the box computes."""
+"""Early answers on the desktop: the rule on constructed prefixes, heads, and the graph against the
+box."""
 
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ from tests.factories.trunk import FORM, trunk
 from train.calibration import early_exit
 from train.evaluation import uncertainty
 from train.export.bundle_graph import bundle_graph
+from train.export.pack import means_file
 from train.models.recipe import calibrate
 from train.onnx_tools.graph_builder import run
 
@@ -47,8 +48,8 @@ def certain(labels, when, wrong=()):
 
 
 def test_the_rule_decides_when_the_steps_are_certain():
-    """All sweeps are clear from the third tenth on: decided there with one step, and nothing is
-    lost."""
+    """All sweeps are clear from the third tenth on: the rule answers there with one step, and loses
+    nothing."""
     labels = np.arange(300) % 3
     found = early_exit.find_rule(certain(labels, np.full(300, 2)), labels)
     assert found.early
@@ -57,8 +58,8 @@ def test_the_rule_decides_when_the_steps_are_certain():
 
 
 def test_a_rule_asks_for_agreement_where_one_step_deceives():
-    """A tenth that is certain and wrong for 2 % of the sweeps, once: two steps that agree are not
-    deceived."""
+    """For 2 % of the sweeps one tenth is certain and wrong; two steps that agree are never
+    wrong."""
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
@@ -80,7 +81,8 @@ def test_half_a_point_and_no_more(wrong: int, off: bool):
 
 
 def test_no_rule_without_data_or_gain():
-    """Few sweeps, or sweeps that are clear only at the end: off, and why."""
+    """For few sweeps, or sweeps that are clear only at the end, there is a reason instead of a
+    rule."""
     labels = np.arange(30) % 3
     assert "30 sweeps" in early_exit.find_rule(certain(labels, np.full(30, 2)), labels).why
     labels = np.arange(300) % 3
@@ -88,7 +90,7 @@ def test_no_rule_without_data_or_gain():
 
 
 def test_no_looser_level_after_one_that_lost():
-    """Levels are tried from the strictest: luck further down does not count."""
+    """Levels are tried from the strictest on; luck at a looser level does not count."""
     labels = np.arange(200) % 3
     p = certain(labels, np.full(200, 9))
     p[:, 4] = 0.05
@@ -103,7 +105,7 @@ def test_no_looser_level_after_one_that_lost():
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
 def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
-    """early.decide against the appliance's inference.early_exit on random probabilities, some
+    """early.decide equals the appliance's inference.early_exit on random probabilities, with some
     levels above 1."""
     rng = np.random.default_rng(agree)
     p = classifier.softmax(2 * rng.standard_normal((200, 10, 3)))
@@ -116,7 +118,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 
 @pytest.mark.slow
 def test_temperatures_calibrate_each_step():
-    """Cross-fitted over positions, the mean of the highest probability is the accuracy, at every
+    """Cross-fitted over positions, the mean of the highest probability is the accuracy at every
     step."""
     x, y, at = prefixes(40)
     done = calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool)))
@@ -129,7 +131,7 @@ def test_temperatures_calibrate_each_step():
 
 @pytest.mark.slow
 def test_each_step_has_its_own_temperature():
-    """The last temperature is the whole sweep's, each other one its own step's."""
+    """The last temperature is that of the whole window, the others are those of their own steps."""
     x, y, at = prefixes(10, places=3, seed=3)
     # the sweeps of a material at one position lie together: the heads are too sure of other
     # positions
@@ -148,7 +150,7 @@ def test_each_step_has_its_own_temperature():
 
 @pytest.mark.slow
 def test_a_material_of_one_place_and_two_materials():
-    """A material that only one place has is still learned; of two materials, too: nothing is
+    """A material at only one position is still learned, and so are only two materials; nothing is
     NaN."""
     x, y, at = prefixes(20)
     keep = (y != 2) | (at == 0)
@@ -163,8 +165,8 @@ def test_a_material_of_one_place_and_two_materials():
 
 @pytest.fixture(scope="module")
 def made():
-    """A bundle's parts on the toy trunk, one of whose features is untrained: Calibration, features, raw
-    counts, labels, Bundle."""
+    """The parts of a bundle on the toy trunk, which has one untrained feature: Calibration,
+    features, raw counts, labels, Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
@@ -179,7 +181,7 @@ def made():
     )
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
     model = bundle_graph(done, trunk(FORM), trunks)
-    files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: done.means()}
+    files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: means_file(done.classes())}
     manifest = Manifest(
         "toy",
         "1",
@@ -203,8 +205,7 @@ def made():
 
 
 def test_the_graph_gives_what_training_computed(made):
-    """Logits, embedding and the heads of all tenths in the box's classifier are those of
-    Calibration."""
+    """Logits, embedding and early heads in the box's classifier are those of Calibration."""
     done, x, counts, _, whole = made
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()
@@ -215,7 +216,7 @@ def test_the_graph_gives_what_training_computed(made):
 
 
 def test_a_graph_without_tenths_has_no_early_heads(made):
-    """Without tenths: logits and embedding alone; without a rule none either."""
+    """Without prefixes or without a rule there are only logits and embedding."""
     done, x, counts, _, _ = made
     for model in (
         bundle_graph(done, trunk(FORM)),
@@ -232,7 +233,7 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
 
 
 def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
-    """What is left without `early` is, byte for byte, the model that was never given tenths."""
+    """Without `early` the rest is, byte for byte, the model that was made without prefixes."""
     done, _, _, _, whole = made
     assert (
         prune(whole.model, {"logits", "embedding"})
@@ -242,7 +243,7 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
-    """enrolled_logits against appliance.inference.enrolment on the same sweeps, up to a term that
+    """enrolled_logits equals appliance.inference.enrolment on the same sweeps, up to a term that
     all labels share."""
     done, x, counts, labels, whole = made
     drawn = np.flatnonzero(labels == 1)[:3]

@@ -1,5 +1,5 @@
-"""The discriminant: against scikit-learn's covariance, with more features than sweeps and with
-fewer, and too few sweeps."""
+"""The discriminant: against scikit-learn's covariance, with more and with fewer features than
+sweeps, and with too few sweeps."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from train.calibration import heads
 
 
 def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Correlated features [n, size] of materials whose means differ, and labels, of which each
-    occurs."""
+    """Correlated features [n, size] of materials whose means differ, and labels that all occur."""
     rng = np.random.default_rng(n + size)
     labels = rng.permutation(np.arange(n) % classes)
     x = (
@@ -25,7 +24,7 @@ def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("n", "size"), [(60, 10), (60, 59), (60, 60), (40, 200)])
 def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
-    """Solved among sweeps or among features: the weights are those of the covariance itself."""
+    """Solved among sweeps or among features, the weights are those of the covariance itself."""
     x, labels = drawn(n, size)
     means = np.stack([x[labels == k].mean(axis=0) for k in range(4)])
     scatter = x - means[labels]
@@ -54,7 +53,7 @@ def test_a_material_without_sweeps_is_never_named():
 
 
 def test_constant_and_equal_features_change_nothing_but_themselves():
-    """A silent feature and a copy of another leave finite weights, and the same answers."""
+    """With a silent feature and a copy of another, weights are finite and answers the same."""
     x, labels = drawn(60, 6)
     weight, bias = heads.fit_discriminant(np.hstack([x, x[:, :1], np.ones((60, 1))]), labels, 4)
     assert np.isfinite(weight).all()
@@ -65,7 +64,7 @@ def test_constant_and_equal_features_change_nothing_but_themselves():
 
 
 def test_features_without_any_scatter_are_compared_by_their_means():
-    """All sweeps of a material alike: the nearest mean is named."""
+    """If all sweeps of a material are equal, the nearest mean is named."""
     labels = np.repeat([0, 1], 3)
     x = np.repeat([[0.0, 1.0], [2.0, 1.0]], 3, axis=0)
     weight, bias = heads.fit_discriminant(x, labels, 2)

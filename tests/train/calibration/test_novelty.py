@@ -1,5 +1,5 @@
-"""Novelty on Gaussians whose truth is known: the embedding is LDA, the limit keeps the share that
-it states."""
+"""Novelty on Gaussians with known truth: the embedding is LDA, and the limit keeps its stated
+share."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def gaussians(n: int, means, seed: int = 0, mix=None):
 
 @pytest.mark.parametrize("fixed", [0, 3])
 def test_the_embedding_is_lda(fixed: int):
-    """Logits from distances are those of shrinkage LDA with equal priors but for a common term; the
+    """Logits from distances are those of shrinkage LDA with equal priors up to a common term; the
     covariance is 1."""
     mix = np.random.default_rng(1).standard_normal((7, 7))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
@@ -53,8 +53,8 @@ def test_untrained_features_are_kept_completely():
 
 
 def test_each_material_has_its_own_shape_in_untrained_features():
-    """Of a material whose sweeps hardly vary, one that others' sweeps reach is unlike it; of few
-    sweeps the shape is common."""
+    """A sweep is far from a material whose own sweeps hardly vary, even if sweeps of other
+    materials reach it; for few sweeps the shape is the common one."""
     x, y = gaussians(400, [[0, 0, 0], [60, 0, 0]])
     x[y == 0, 2] *= 0.1
     one = novelty.embed(x, y, 1)
@@ -72,7 +72,7 @@ def test_each_material_has_its_own_shape_in_untrained_features():
 
 
 def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
-    """K = 2, one class of two sweeps, a feature that never changes: no NaN."""
+    """K = 2, one class of two sweeps, a constant feature: no NaN."""
     x, y = gaussians(2, [[0, 0, 0], [5, 0, 0]])
     x[:, 2] = 1.0
     more, labels = gaussians(30, [[5, 0, 1]], seed=3)
@@ -88,13 +88,13 @@ def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
     [([0, 0, 0], "one material"), ([0, 2, 2, 0], "label 1"), ([0, 1], "record more")],
 )
 def test_what_cannot_be_embedded_is_refused(labels, why: str):
-    """One material, a label without sweeps, one sweep each."""
+    """One material, a label without sweeps, and one sweep of each material are refused."""
     with pytest.raises(FormatError, match=why):
         novelty.embed(np.random.default_rng(0).standard_normal((len(labels), 2)), np.array(labels))
 
 
 def test_the_limit_keeps_what_it_promises():
-    """Over many draws a limit of 99 sweeps keeps what is asked for of new ones; with few sweeps it
+    """Over many draws a limit of 99 sweeps keeps the stated share of new sweeps; with few sweeps it
     is the largest."""
     rng = np.random.default_rng(0)
     for asked in (0.95, novelty.KEPT):
@@ -109,8 +109,8 @@ def test_the_limit_keeps_what_it_promises():
 
 
 def test_the_limit_knows_positions_that_were_not_seen():
-    """Places that shift all sweeps: judged across groups the limit keeps 95 % at new places, within
-    them it does not."""
+    """Positions shift all their sweeps: across groups the limit keeps 95 % at new positions, within
+    groups it does not."""
 
     def drawn(places, seed):
         x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)
@@ -142,7 +142,7 @@ def test_the_limit_knows_positions_that_were_not_seen():
 
 
 def test_each_judge_judges_once_and_never_its_own_group():
-    """parts: every judged sweep is in one part, and no group is on both sides."""
+    """Every judged sweep is in exactly one part, and no group is on both sides."""
     groups = np.random.default_rng(0).integers(0, 25, 200)
     judged = groups % 3 > 0
     seen = []
@@ -163,9 +163,9 @@ def test_auroc_of_a_known_separation():
 
 
 def test_untrained_features_are_selected_and_not_multiplied():
-    """Where there are more features than directions the projection is that of all features, from a
-    matrix for the trained ones alone: the covariance of z is 1, and the last features decide by
-    themselves in their own span."""
+    """If there are more features than directions, the projection is that of all features, from a
+    matrix for the trained ones alone: the covariance of z is 1, and the last features alone decide
+    in their own span."""
     mix = np.random.default_rng(1).standard_normal((20, 20))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)) @ mix, mix=mix)
     one = novelty.embed(x, y, 5)

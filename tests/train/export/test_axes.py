@@ -1,5 +1,5 @@
-"""A skin with three axes from a set to the box: fit, export, the same answers there and in a replay
-of what it received."""
+"""A skin with three axes from a set to the box: fit, export, and the same answers there and in a
+replay."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def test_from_a_set_to_the_answers_of_the_box(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
-    """fit and export by command; unseen sweeps over the wire get the labels that the bundle gives
-    on the desktop, and again when they are replayed; the bundle knows positions by the normal
+    """After fit and export by command, unseen sweeps over the wire get the labels that the bundle
+    gives on the desktop, and again when they are replayed; positions are those of the normal
     axis."""
     sheared().save(tmp_path / "set.npz")
     fit, out = str(tmp_path / "fit.npz"), tmp_path / "bundle"

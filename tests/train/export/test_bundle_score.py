@@ -1,5 +1,4 @@
-"""Scoring a bundle: a set through the box's classifier, what it named, with interval and
-confusions."""
+"""Scoring a bundle: a set through the box's classifier, with interval and confusions."""
 
 from __future__ import annotations
 
@@ -41,12 +40,12 @@ def sweeps(
 
 @pytest.fixture
 def classifier(tmp_path: Path) -> Classifier:
-    """The toy's."""
+    """The classifier of the toy bundle."""
     return Classifier(toy_bundle.load(tmp_path / "toy"), SystemClock())
 
 
 def test_what_is_named_is_counted(classifier: Classifier):
-    """Right, taken for another, unsure and unknown, by material; the interval resamples
+    """Right, wrong, unsure and unknown answers are counted by material; the interval resamples
     positions."""
     s = sweeps(
         (0, 0),
@@ -83,7 +82,8 @@ def test_what_is_named_is_counted(classifier: Classifier):
 
 
 def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):
-    """The same names in another order; one that the bundle has not is listed with its answers."""
+    """The same names may be in another order; a material that the bundle lacks is listed with its
+    answers."""
     s = sweeps(*HERE, (0, 6), labels=[1, 0, 2, 2], materials="bax")
     found = bundle_score.score(classifier, s)
     assert found.right.tolist() == [True, True]
@@ -92,8 +92,8 @@ def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier)
 
 
 def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
-    """The last answer to each recording; without several windows there are no recordings to tell
-    of."""
+    """The last answer to each recording counts; without several windows in a recording that figure
+    is left out."""
     s = sweeps((0, 0), (3, 0), (6, 0), (6, 0), labels=[0, 0, 1, 1], recording=[0, 0, 1, 1])
     found = bundle_score.score(classifier, s)
     assert found.recordings is not None
@@ -104,7 +104,7 @@ def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
 
 
 def test_a_set_of_another_form_is_refused(classifier: Classifier):
-    """Both forms are named; so are the materials where none is the same."""
+    """Both formats are named; so are the materials if none is the same."""
     s = sweeps(*HERE, labels=[0, 1, 2])
     with pytest.raises(
         FormatError,
@@ -120,7 +120,7 @@ def test_a_set_of_another_form_is_refused(classifier: Classifier):
 def test_the_command_prints_and_writes_what_it_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """`palpate-train score`, with --json and --rename; a bundle that is none is one line."""
+    """`palpate-train score`, with --json and --rename; a broken bundle is one line."""
     toy_bundle.load(tmp_path / "toy")
     sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
     args = ["score", str(tmp_path / "toy"), "--set", str(tmp_path / "s.npz")]
@@ -138,7 +138,7 @@ def test_the_command_prints_and_writes_what_it_found(
         in capsys.readouterr().out
     )
     assert main([*args, "--rename", "Q=a"]) == FormatError.exit_code
-    assert "no material is called 'Q'" in capsys.readouterr().err
+    assert "there is no material 'Q'" in capsys.readouterr().err
     assert main(["score", str(tmp_path / "none"), *args[2:]]) != 0
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -146,8 +146,8 @@ def test_the_command_prints_and_writes_what_it_found(
 def test_sweeps_outside_the_trained_positions_are_told(
     classifier: Classifier, monkeypatch: pytest.MonkeyPatch
 ):
-    """How many the box calls moved, the most frequent of its words for them, and what to do;
-    nothing where there are none."""
+    """The number of displaced sweeps, their most frequent description, and the remedy; nothing if
+    there are none."""
     s = sweeps(*HERE, (0, 0), labels=[0, 1, 2, 0])
     assert "trained positions" not in bundle_score.score(classifier, s).text()
     given = bundle_score.verdicts
@@ -166,5 +166,8 @@ def test_sweeps_outside_the_trained_positions_are_told(
     )
     found = bundle_score.score(classifier, s)
     assert found.json()["moved"] == 3
-    told = "outside the trained positions: 3 sweeps, most often moved 2.1 mm too far towards row 6; record there, too, or align the skin"
+    told = (
+        "outside the trained positions: 3 sweeps, most often moved 2.1 mm too far towards row 6; "
+        "record there, too, or align the skin"
+    )
     assert told in found.text().splitlines()

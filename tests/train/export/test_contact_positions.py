@@ -1,4 +1,4 @@
-"""Contact positions of a training set, and how a skin that was moved is marked."""
+"""Answers to sweeps of a displaced skin, and their page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def model(default_bundle: Bundle) -> Bundle:
 
 @pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """A skin in place is not flagged, one that is a row forward always is; figures, picture and
+    """A skin in place is not flagged, a skin that is a row forward always is; figures, picture and
     lines agree."""
     monkeypatch.setattr(contact_positions, "OFF_MM", (8.0,))
     wide = replace(
@@ -85,13 +85,13 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
 
 
 def committed() -> dict:
-    """What the page in docs/alignment was made of."""
+    """The figures of the page in docs/alignment."""
     return json.loads((ROOT / "docs" / "alignment" / "place.json").read_text())
 
 
 def test_the_headline_says_what_was_missed():
-    """In place, false marks, marks where accuracy is lost, wrong answers a row off, the worst
-    distance: from the figures."""
+    """It names false marks in place, marks where accuracy is lost, wrong answers a row off, and the
+    worst distance, from the figures."""
     figures = committed()
     figures["moved"]["rows"][3]["wrong_unflagged"] = 77
     figures["other positions"]["moved"] = [5 / 432, 0.0, 0.1]
@@ -124,8 +124,8 @@ def test_the_headline_says_what_was_missed():
 def test_the_page_is_drawn_again_without_measuring(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Tables between their markers, the picture; what is missing or another file is named, with
-    what to do."""
+    """Tables between their markers, and the picture. A missing or wrong file is named, with a
+    remedy."""
     folder = ROOT / "docs" / "alignment"
     page = (folder / "README.md").read_text()
     cleared = re.sub(r"(?s)(<!-- (in short|alignment) -->).*?(?=<!-- /)", r"\1\n", page)

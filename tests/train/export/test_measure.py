@@ -1,4 +1,4 @@
-"""Packing all forms of a method, and the one way to time, size and weigh a model."""
+"""Packing all precisions of a method, and the only way to time, size and weigh a model."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ KEYS = (
     "touch_s",
     "runs_on_box",
 )
-"""What chart.json has of each model, beside `accuracy`."""
+"""The keys of each model in chart.json, beside `accuracy`."""
 
 
 def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
@@ -60,7 +60,7 @@ def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
 
 
 def test_all_take_turns():
-    """Every round begins with another model; each one's first sweep of a turn is not counted."""
+    """Every round begins with another model; the first sweep of each turn is not counted."""
     order: list[str] = []
     calls = {name: (lambda counts, name=name: order.append(name)) for name in "abc"}
     took = measure.timed(calls, np.zeros((5, 1)), rounds=3, block=2)
@@ -117,8 +117,7 @@ def test_torch_runs_what_was_trained(tmp_path: Path):
 
 @pytest.mark.slow
 def test_aeon_runs_what_was_trained(tmp_path: Path):
-    """aeon's transform with the head that was trained on our graph of it gives the graph's
-    logits."""
+    """aeon's transform with the head that was trained on our graph gives the graph's logits."""
     pytest.importorskip("aeon")
     known = sweeps()
     state = np.random.get_state()[1].copy()

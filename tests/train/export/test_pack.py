@@ -28,8 +28,8 @@ ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box
 
 @pytest.mark.parametrize("name", ON_THE_BOX)
 def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
-    """Trained, packed, loaded, checked by its golden sweeps; each held-out sweep gets the label
-    that training saw."""
+    """The bundle passes its golden sweeps; each held-out sweep gets the label that the model
+    gives."""
     content = pack.trained(METHODS[name], tones(), 1)
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
     assert manifest.input == METHODS[name].input
@@ -45,7 +45,8 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - ON_THE_BOX))
 def test_what_the_box_cannot_run_is_refused(name: str):
-    """Before anything is trained, with the method and its features or its library named."""
+    """It is refused before anything is trained, with the name of the method and its features or
+    library."""
     method = METHODS[name]
     why = f"looks at the features '{method.input}' of prior work"
     if method.library:
@@ -86,8 +87,8 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_golden_sweeps_are_rounded():
-    """To steps of at most COARSEST usual changes; they take less room, and their logits are those
-    of the rounded sweeps, whose probabilities are near those of the exact ones."""
+    """Steps are at most COARSEST usual changes. The file is smaller, its logits are those of the
+    rounded sweeps, and their probabilities are near those of the exact ones."""
     content = pack.trained(METHODS["L-gauss"], tones(), 1)
     rng = np.random.default_rng(1)
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
@@ -112,8 +113,8 @@ def test_golden_sweeps_are_rounded():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 def test_rounded_sweeps_keep_their_type(dtype: str):
-    """Each coarser than the next, none beyond what the type holds, whole numbers in steps of 2 or
-    more; constant ones stay."""
+    """Each is coarser than the next, none leaves the range of the type, whole numbers go in steps
+    of 2 or more; constant sweeps are not rounded."""
     rng = np.random.default_rng(1)
     top = 255 if dtype == "float32" else np.iinfo(dtype).max
     samples = (top - rng.integers(0, 40, (2, 50, 3, 3))).astype(dtype)
@@ -126,7 +127,7 @@ def test_rounded_sweeps_keep_their_type(dtype: str):
 
 
 def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
-    """Nothing is left behind."""
+    """It is refused, and nothing is left behind."""
     noise = tones(noise=0.0)
     content = pack.trained(METHODS["L-gauss"], noise, 1)
     content.train.samples[content.train.labels == 0] = 0

@@ -1,5 +1,4 @@
-"""Export: the content of the graphs, the checks that a bundle must pass, what is refused and
-why."""
+"""Export: the graphs, the checks that a bundle must pass, and its refusals with their reasons."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ from train.models.peers import paper_cnn
 from train.models.recipe import stages
 from train.models.recipe.architectures import ARCHITECTURES
 from train.models.recipe.fitted import Fit, finished
-from train.models.recipe.network import Compact
-from train.models.recipe.stages import FitRecipe
+from train.models.recipe.stages import Compact, FitRecipe
 from train.onnx_tools import cost, graph_builder, parity
 from train.onnx_tools.parity import Layer
 from train.studies.command import main as study
@@ -58,20 +56,20 @@ def fitted() -> Fit:
 
 @pytest.fixture(scope="module")
 def tight() -> Fit:
-    """A fit on a set that takes all int8 has."""
+    """A fit on a set that needs the whole resolution of int8."""
     return stages.fit_network(close(), 1, FitRecipe(steps=60), architecture=ARCHITECTURES["20k"])
 
 
 @pytest.fixture(scope="module")
 def packed(fitted: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its bundle."""
+    """The bundle of `fitted`."""
     target = tmp_path_factory.mktemp("export") / "bundle"
     quantized_bundle.export(fitted, target, "easy", "1", "0123abcd")
     return target
 
 
 def box(folder: Path) -> Classifier:
-    """The classifier as the box makes it."""
+    """The classifier of the box for a bundle."""
     return Classifier(bundle.load(folder), SystemClock())
 
 
@@ -85,14 +83,14 @@ def shapes(model: onnx.ModelProto) -> list[list[int]]:
 
 
 def negated(fitted: Fit) -> Fit:
-    """A fit whose head says the opposite."""
+    """A fit whose float head gives the opposite logits."""
     return replace(fitted, weights=fitted.weights | {"head.weight": -fitted.weights["head.weight"]})
 
 
 @pytest.mark.parametrize("dtype", graph_builder.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
-    """For each type of raw counts: PyTorch's logits, fixed shapes, the sensor's own counts as
-    input."""
+    """For each type of raw counts it has PyTorch's logits, fixed shapes, and the sensor's own
+    counts as input."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = Compact(form, 3, 0.1, norm=False).eval()
@@ -108,8 +106,8 @@ def test_the_float_graph_is_the_network(dtype: str):
 
 
 def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: Path):
-    """Weights of seven bits, one scale a channel; every convolution between quantizers; 1 x K out,
-    and where it lies."""
+    """Weights have seven bits and one scale for each channel; every convolution is between
+    quantizers; the output is 1 x K."""
     model = onnx.load(packed / bundle.MODEL)
     maker = {name: n for n in model.graph.node for name in n.output}
     values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
@@ -135,7 +133,7 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
 
 
 def test_quantizing_leaves_its_model_alone(fitted: Fit):
-    """onnxruntime empties the model that it is given; ours still runs."""
+    """onnxruntime empties the model that it gets; ours still runs."""
     trunk = fitted.trunk(int8=False)
     before = trunk.SerializeToString()
     quantized_bundle.quantize(trunk, fitted.train.samples[:4])
@@ -143,8 +141,8 @@ def test_quantizing_leaves_its_model_alone(fitted: Fit):
 
 
 def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
-    """Golden sweeps of two materials, figures of what was held out, thresholds from training, all
-    files small."""
+    """It has golden sweeps of two materials, figures of held-out sweeps, thresholds from training,
+    and small files."""
     it = box(packed)
     assert it.self_test() < 1e-6
     manifest = it.bundle.manifest
@@ -173,8 +171,8 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 
 
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
-    """With the distance of the taxels the bundle says where the contact was, and how moved sweeps
-    are judged; without it the box could not tell, and the file has no arrays for it."""
+    """With the distance of the taxels the bundle has contact positions and a rule for displaced
+    sweeps; without it the box could not recognise these, and the file has no arrays for them."""
     quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
     assert placed.manifest.contact
@@ -187,8 +185,8 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
 
 
 def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
-    """Held-out sweeps with other labels than they have: heads fitted to them would name these,
-    heads of the others do not."""
+    """Held-out sweeps get wrong labels: heads fitted to them would give these labels, heads of the
+    others do not."""
     wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
     spoilt = replace(fitted, held=wrong)
     honest, misled = (
@@ -202,8 +200,8 @@ def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
 def test_the_same_fit_gives_the_same_bytes(
     fitted: Fit, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Every file, the zip of golden sweeps included; also from the file of the fit, which keeps the
-    calibration and the contacts, so that export finds neither again."""
+    """Every file is the same, the zip of golden sweeps included; also from the file of the fit,
+    which keeps calibration and contacts, so that export finds neither again."""
     fitted.save(tmp_path / "fit.npz")
     monkeypatch.setattr(quantized_bundle, "finished", None)
     for made in (fitted, Fit.load(tmp_path / "fit.npz")):
@@ -216,8 +214,8 @@ def test_the_same_fit_gives_the_same_bytes(
 
 
 def test_scores_are_fused_by_recording(packed: Path):
-    """Each window gets the label of its recording's product, also where the last one differs; -1
-    what the box refuses."""
+    """Each window gets the label of its recording's product, even if its own label differs; refused
+    windows get -1."""
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
@@ -232,7 +230,7 @@ def test_scores_are_fused_by_recording(packed: Path):
 
 def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
     """int8 with its refitted head disagrees with a spoilt float head: the bundle holds the float
-    form, and says why."""
+    model, with the reason."""
     made = quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
     why = made.made["float_because"]
     assert re.match(
@@ -261,13 +259,13 @@ def without_numbers(fitted: Fit) -> dict[str, np.ndarray]:
 
 
 def judged(fitted: Fit) -> None:
-    """What export finds of its two forms."""
+    """Compare both precisions as export does."""
     reference, int8 = quantized_bundle.graphs(fitted)
     quantized_bundle.check(parity.measure(int8, fitted.held.samples, fitted.held.labels, reference))
 
 
 def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
-    """A fit whose stages reach so far in int8, its head refitted."""
+    """A fit with these ranges of its stages in int8, its head refitted."""
     other = replace(fitted, ranges=replace(fitted.ranges, responses=tuple(responses)))
     seen, unseen = (
         graph_builder.run(other.trunk(), s.samples) for s in (fitted.train, fitted.held)
@@ -277,8 +275,8 @@ def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
 
 
 def test_a_range_for_one_outlier_is_refused(tight: Fit):
-    """Ranges from smallest to largest value, with one sweep a thousandfold among them: nothing is
-    left for all others."""
+    """Ranges reach from the smallest to the largest value, and one sweep is a thousandfold: too
+    little is left for all others."""
     wild = tight.train.samples[:1].astype(np.float32)
     wild = wild.mean(axis=1, keepdims=True) + 1000 * (wild - wild.mean(axis=1, keepdims=True))
     network = tight.network()
@@ -292,8 +290,8 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """The first stage reaches a twentieth of what it should: no head can compensate; the share that
-    is cut off is reported."""
+    """The first stage reaches a twentieth of its range: no head can compensate, and the clipped
+    share is reported."""
     first, *others = tight.ranges.responses
     with pytest.raises(
         ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"
@@ -302,8 +300,8 @@ def test_a_layer_that_saturates_is_refused(tight: Fit):
 
 
 def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
-    """The float head on features of an int8 trunk that saturates: only a head of its own copes with
-    them."""
+    """With an int8 trunk that saturates, the float head fails; only a head of its own copes with
+    the features."""
     *before, last = tight.ranges.responses
     refitted = ranged(tight, (*before, 0.25 * last))
     judged(refitted)
@@ -313,8 +311,8 @@ def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
 
 
 def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
-    """A Parity of `n` sweeps, of which int8 loses and wins some; all else as good as can be unless
-    it is named."""
+    """A Parity of `n` sweeps, of which int8 loses and wins some; all else is perfect unless it is
+    named."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
     difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
@@ -358,7 +356,8 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
     ],
 )
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
-    """On this side it passes, beyond it is named with its number, its limit and what to try."""
+    """Within a limit the comparison passes; beyond it the message names number, limit and
+    remedy."""
     quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
         quantized_bundle.check(found(**bad))
@@ -368,8 +367,8 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
 
 
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
-    """A full scale that the sweeps pass: they count as saturated, which export reports before a
-    robot meets it."""
+    """Sweeps beyond the full scale count as saturated, which export reports before a robot meets
+    it."""
     refused = r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: \d+ saturated\. .* --full-scale$"
     with pytest.raises(ExportRefused, match=refused):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
@@ -378,7 +377,7 @@ def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path:
 def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
     fitted: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """With how many, the limit, and the distance beyond which a sweep is unknown, as a number."""
+    """The message has their number, the limit, and the distance beyond which a sweep is unknown."""
     monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
     told = r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance \d[\d.]*\); record more positions"
     with pytest.raises(ExportRefused, match=told):
@@ -386,7 +385,8 @@ def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
 
 
 def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
-    """Other labels from the box than from the int8 model are refused, with how many."""
+    """If the labels of the box and of the int8 model differ, the message has the number of such
+    sweeps."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
     assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
@@ -395,14 +395,14 @@ def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
-    """There is no golden sweep of it."""
+    """It has no golden sweep."""
     logits = np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1))
     with pytest.raises(ExportRefused, match="no training sweep of 'high' is recognised"):
         pack.golden_sweeps(fitted.train, logits, logits)
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
-    """A refused export leaves the old bundle; a good one takes its place, stray files gone; other
+    """A refused export leaves the old bundle; a good one replaces it, stray files included; other
     folders are safe."""
     target = tmp_path / "bundle"
     quantized_bundle.export(fitted, target, "old", "1", "")
@@ -425,14 +425,14 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
 
 
 def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
-    """A file where a folder should be."""
+    """The target is in a file instead of a folder."""
     (tmp_path / "file").write_text("")
     with pytest.raises(ExportRefused, match="the bundle cannot be written to"):
         quantized_bundle.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
 
 
 def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
-    """The manifest's own check speaks before anything is written."""
+    """The check of the manifest fails before anything is written."""
     named = replace(
         fitted,
         **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")},
@@ -443,8 +443,8 @@ def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
 
 
 def test_the_default_bundle_is_what_the_box_needs():
-    """The skin's format and tubes, at most 128 KB, golden sweeps as exported, placements that it
-    never saw."""
+    """It has the skin's format and tubes, at most 128 KB, golden sweeps as exported, and names
+    unseen placements."""
     it = box(bundle.DEFAULT)
     assert it.self_test() <= bundle.GOLDEN_TOLERANCE
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
@@ -457,7 +457,8 @@ def test_the_default_bundle_is_what_the_box_needs():
 @pytest.mark.filterwarnings("error")
 def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give
-    six logits. No library speaks while they are made, of a bias that stays in float, say."""
+    six logits. No library logs anything while they are made, about a bias that stays in float, for
+    instance."""
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
     assert study(["references", "--out", str(tmp_path / "new")]) == 0
@@ -487,8 +488,8 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
 def test_the_command_exports_what_fit_wrote(
     fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """One line a figure, then the size, at the end the command that scores it; a fit that is none
-    has a FormatError's exit code."""
+    """It prints one line for each figure, then the size, at last the command to score it; another
+    file has the exit code of FormatError."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
@@ -511,8 +512,8 @@ def test_the_command_exports_what_fit_wrote(
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
-    """Nothing in it is int8: both forms are the same, the box's labels are its network's, no tensor
-    is reported; what another head says is told here as well."""
+    """Nothing in it is int8: both precisions are equal, the labels of box and network agree, and no
+    tensor is reported. A spoilt head is reported here as well."""
     made = stages.fit_network(easy(), 1, FitRecipe(), architecture=ARCHITECTURES["bands"])
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
@@ -534,8 +535,8 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
 
 
 def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch):
-    """An int8 method's figures come into its content; beyond a limit it is refused; one without
-    float form passes."""
+    """The figures of an int8 method are in its content; beyond a limit it is refused; without a
+    float model nothing is compared."""
     (method,) = methods.find(["compact-1k"], methods.Effort(0.02))
     train, held, by = hold_out(easy(), 1)
     model = method.train(train, train.samples, 1)
@@ -556,9 +557,9 @@ def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch
     "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
 )
 def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) by the same commands; unseen sweeps over
-    the USB wire into sentences, materials in turn, so that nearly each is another object: as many
-    right as the classifier by itself has."""
+    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) with the same commands. Unseen sweeps go
+    over the USB wire into sentences, with materials in turn, so that nearly each is another object;
+    as many are right as by the classifier itself."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
     args = [
         "--set",
@@ -626,8 +627,8 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
-    """Materials that differ in nothing but their offset: distinguished by a head that sees means,
-    hidden from one that does not."""
+    """Materials that differ only in their offset are distinguished by a head that sees means, and
+    by no other."""
     whole = easy(seed=3)
     rng = np.random.default_rng(4)
     labels = rng.permutation(whole.labels)

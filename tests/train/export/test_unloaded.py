@@ -1,4 +1,4 @@
-"""A skin that reads thousands without contact, from its recording to the box: what nothing touches
+"""A skin that reads thousands without contact, from its recording to the box: an untouched window
 is `no-contact`."""
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def act(
     material: str, place: skin.Placement | None, rng: np.random.Generator, more: int = 0
 ) -> rig.Act:
     """A sweep of three seconds between half seconds without contact; without a place nothing is
-    touched. more: counts that the skin reads above its usual rest."""
+    touched. more: counts above the skin's usual rest."""
     off = SEEN.idle(50, rng, skin.WORLD)
     on = SEEN.idle(320, rng, skin.WORLD)
     if place:
@@ -81,9 +81,8 @@ def test_the_whole_way(
     rigged: Callable[..., Rigged], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """record, fit, export, box: an untouched window is `no-contact`, a touched one has its label
-    and is in place. A skin that rests elsewhere today is so after TARE. Without what the recordings
-    know of the unloaded skin, export says that `no-contact` cannot be told, and the box never
-    does."""
+    and is in place. A skin with another rest works after TARE. Without an unloaded skin in the
+    recordings, export says that `no-contact` cannot be recognised, and the box never answers it."""
     model = exported(folder, tmp_path / "known")
     assert "no-contact cannot be told" not in capsys.readouterr().out
     m = model.manifest

@@ -1,5 +1,5 @@
-"""Every method on a skin with three axes: it trains, and its graph takes [1, T, R, C, A] and gives
-what the desktop gives."""
+"""Every method on a skin with three axes: it trains, and its graph takes [1, T, R, C, A] and
+answers as the desktop does."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sweeps() -> Dataset:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", methods.every())
 def test_a_method_takes_three_axes(name: str, sweeps: Dataset):
-    """Logits are finite; the graph, where there is one, has them, too; other shear gives other
+    """Logits are finite, also those of the graph if there is one; other shear gives other
     logits."""
     (method,) = methods.find([name], BRIEF)
     if method.extra:

@@ -1,4 +1,5 @@
-"""An interrupted training gives the same bits as an uninterrupted one, whatever file it finds."""
+"""An interrupted training gives the same bits as an uninterrupted one, for any file that it
+finds."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ EVERYTHING = TrainingRecipe(steps=9, batch=8, noise=0.1, gain=0.1, ema=0.5, drop
 
 
 class Interrupted(Exception):
-    """Stands for a loss of power."""
+    """An exception instead of a power failure."""
 
 
 def fit(
@@ -56,8 +57,8 @@ def check_same(
 def test_an_interrupted_training_gives_the_same_bits(
     recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Interrupted twice; dropout, noise, gains, batch norms, the rate and the moving average go on
-    where they were."""
+    """After two interruptions dropout, noise, gains, batch norms, the rate and the moving average
+    continue unchanged."""
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     path = tmp_path / "deeper" / "half.pt"
     for stop in (3, 7):
@@ -71,7 +72,7 @@ def test_an_interrupted_training_gives_the_same_bits(
 
 
 def counted(calls: list[str]):
-    """training.backward, which notes each call."""
+    """training.backward, which records each call."""
     plain = training.backward
 
     def backward(*args):
@@ -85,7 +86,7 @@ def counted(calls: list[str]):
 def test_a_file_that_cannot_be_read_counts_as_none(
     broken: bytes | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Empty, other bytes, or cut off: the training begins anew."""
+    """If the file is empty, truncated or of other bytes, the training begins anew."""
     path = tmp_path / "half.pt"
     if broken is None:
         monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
@@ -97,7 +98,7 @@ def test_a_file_that_cannot_be_read_counts_as_none(
 
 
 def test_it_is_written_from_time_to_time(tmp_path: Path):
-    """Not in a training of a second."""
+    """A training of a second writes no file."""
     fit(RECIPE, tmp_path / "half.pt")
     assert not list(tmp_path.iterdir())
 
@@ -106,7 +107,7 @@ def test_it_is_written_from_time_to_time(tmp_path: Path):
 def test_an_interrupted_fold_of_the_paper_s_cnn_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Its file lies beside the folds, and is removed when the fold is kept."""
+    """Its file lies beside the folds, and is removed once the fold is kept."""
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
     plan = Plan(("paper-cnn",), ("split:session=0->1",), effort=Effort(paper_steps=4))
     where, steps = Where(jobs=1, cache=tmp_path), []

@@ -1,5 +1,5 @@
-"""Neural methods: the paper's CNN as printed, graphs that give what PyTorch gives, small trainings
-with calibrated results."""
+"""Neural methods: the paper's CNN as printed, graphs against PyTorch, small trainings with
+calibrated results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from train.models import methods, training
 from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
-from train.models.recipe import network, stages
+from train.models.recipe import stages
 from train.models.recipe.stages import FitRecipe
 from train.onnx_tools import graph_builder
 
@@ -38,7 +38,7 @@ NETS = (
 )
 NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
-"""Two to eight iterations: enough for what is not about accuracy."""
+"""Two to eight iterations, for tests that are not about accuracy."""
 
 
 def method(name: str, effort: Effort = BRIEF) -> Method:
@@ -49,7 +49,8 @@ def method(name: str, effort: Effort = BRIEF) -> Method:
 def made(
     shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0
 ) -> Dataset:
-    """Sweeps [N, T, R, C] of noise, the class in its strength; two sweeps to a recording."""
+    """Sweeps [N, T, R, C] of noise, whose strength depends on the class; two sweeps to a
+    recording."""
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
@@ -64,7 +65,7 @@ def made(
 
 
 def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> training.NetworkModel:
-    """Train the method on everything."""
+    """Train the method on all sweeps."""
     return method(name, effort).train(s, s.samples, seed)
 
 
@@ -78,11 +79,8 @@ def check_agrees(model: training.NetworkModel, samples: np.ndarray) -> None:
 
 
 def test_the_paper_s_cnn_is_the_paper_s():
-    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and what it becomes in
-    PyTorch.
-
-    TactNet-II has about the 1.84 M that are known of it.
-    """
+    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and in PyTorch's terms.
+    TactNet-II has about its published 1.84 M."""
     net = paper_cnn.build_paper_cnn(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
     assert sum(p.numel() for p in net.parameters()) == 15_891_910
     assert [tuple(c.weight.shape) for c in net.convs] == [(32, 1, 15, 5), (64, 32, 15, 5)]
@@ -99,7 +97,7 @@ def test_the_paper_s_cnn_is_the_paper_s():
     ("window", "steps"), [(1500, (150, 15)), (128, (13, 2)), (101, (11, 2)), (5, (1, 1))]
 )
 def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
-    """Zero padding handles over-flow: what is left at the end makes one step more, and is seen."""
+    """With zero padding the rest at the end makes one more step, and changes the output."""
     net = paper_cnn.ImageNetwork(
         SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER
     )
@@ -113,8 +111,8 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
 
 @pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
-    """Against PyTorch's Adam, step by step: batches in sequence from a shuffled set, shuffled again
-    after each round."""
+    """Step by step it equals PyTorch's Adam: batches in sequence from a shuffled set, shuffled
+    again after each round."""
     s, r = (
         made((6, 12, 2, 1), "float32", 2),
         replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0),
@@ -140,8 +138,8 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
 
 
 def test_adversarial_training_sees_the_worse_sweep():
-    """The gradient is that of the sweep and of the one moved against it by the fast gradient sign,
-    together."""
+    """The gradient is the sum of that of the sweep and that of the sweep moved by the fast gradient
+    sign."""
     s = made((6, 20, 2, 2), "float32", 2)
     net = paper_cnn.ImageNetwork(
         s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8)
@@ -168,7 +166,8 @@ def test_adversarial_training_sees_the_worse_sweep():
     [((12, 64, 3, 3), "int16", 2), ((12, 21, 1, 1), "uint16", 3), ((12, 128, 16, 1), "float32", 3)],
 )
 def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str, classes: int):
-    """Odd grids, windows and digit types: trained, finite, and the box's session gives the same."""
+    """Odd grids, windows and data types are trained, give finite logits, and the box's session
+    gives the same."""
     s = made(shape, dtype, classes)
     model = train(name, s)
     assert model.logits(s.samples[:5]).shape == (5, classes)
@@ -179,7 +178,7 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
-    """Real sizes with random weights, or the smallest training: 1500 x 4 x 4 of uint8."""
+    """Real sizes, 1500 x 4 x 4 of uint8, with random weights or the smallest training."""
     build = {
         "paper-cnn": paper_cnn.build_paper_cnn,
         "paper-cnn-centred": paper_cnn.build_centred,
@@ -192,7 +191,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        form, plain = skin.FORMAT, network.Compact(skin.FORMAT, 6, 0.1, norm=False)
+        form, plain = skin.FORMAT, stages.Compact(skin.FORMAT, 6, 0.1, norm=False)
         net = build(form, 6, counts) if build else plain
     check_agrees(training.NetworkModel(net.eval(), ""), counts)
 
@@ -200,7 +199,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_easy_is_learnt(name: str):
-    """Three tones on sweeps of another seed; the cost falls; what was run is reported."""
+    """Three tones are named on sweeps of another seed; the cost falls; the run is reported."""
     model = train(name, easy(), Effort(share=0.25, paper_steps=40))
     other = easy(seed=9)
     p = softmax(model.logits(other.samples))
@@ -217,8 +216,8 @@ def test_what_is_easy_is_learnt(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_again_for_the_same_seed(name: str):
-    """Bit for bit, whatever the state outside, which stays as it was; another seed gives another
-    network."""
+    """It has the same bits for any random state outside, which does not change; another seed gives
+    another network."""
     s = easy(8)
     first = train(name, s).logits(s.samples)
     torch.manual_seed(99)
@@ -245,7 +244,7 @@ def test_a_material_that_never_came_is_never_given(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_small_sets_are_trained_whole(name: str):
-    """Two recordings of one sweep each cannot be parted; one position alone does not forbid parting
+    """Two recordings of one sweep each cannot be split; one position alone does not prevent a split
     by recording."""
     tiny = easy(2)
     check_agrees(train(name, tiny), tiny.samples)
@@ -258,8 +257,8 @@ def test_small_sets_are_trained_whole(name: str):
 
 @pytest.mark.slow
 def test_one_sweep_of_each_is_too_little_for_a_discriminant():
-    """Refused with a message of ours; augmented copies, or heads trained by gradient, work with
-    what there is."""
+    """It is refused with a message; augmented copies, or heads trained by gradient descent,
+    work."""
     one, labels = np.eye(3), np.arange(3)
     with pytest.raises(
         FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"
@@ -271,8 +270,7 @@ def test_one_sweep_of_each_is_too_little_for_a_discriminant():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_silence_is_no_trouble(name: str):
-    """A training set without any signal, and constant sweeps afterwards: logits are finite, and
-    equal for all."""
+    """After training without any signal, logits of constant sweeps are finite and equal for all."""
     s = easy(6)
     dumb = replace(s, samples=np.full_like(s.samples, 7))
     model = train(name, dumb)
@@ -284,8 +282,7 @@ def test_silence_is_no_trouble(name: str):
 
 @pytest.mark.slow
 def test_probabilities_come_from_what_was_held_out():
-    """Labels drawn by lot: a network that learns its training sweeps by heart is made unsure by
-    those it never saw."""
+    """With random labels a network overfits, and held-out sweeps lower its probabilities."""
     s = easy(40)
     lot = replace(s, labels=np.random.default_rng(1).permutation(s.labels))
     model = train("tactnet2", lot, Effort(share=0.5))
@@ -295,7 +292,7 @@ def test_probabilities_come_from_what_was_held_out():
 
 @pytest.mark.slow
 def test_compact_is_what_palpate_train_fits():
-    """The same network and int8 head as `fit` gives, float logits moved; on a grid and along a
+    """The same network and int8 head as by `fit`, with shifted float logits, on a grid and along a
     line."""
     s = easy(12)
     line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
@@ -313,7 +310,7 @@ def test_compact_is_what_palpate_train_fits():
 
 @pytest.mark.slow
 def test_a_window_too_short_is_named():
-    """The compact network needs 16 frames; the others take what there is."""
+    """The compact network needs 16 frames; the other networks take any window."""
     s = made((12, 7, 2, 2), "int16")
     with pytest.raises(FormatError, match="a window of 7 frames is too short"):
         train("compact", s)
@@ -323,8 +320,8 @@ def test_a_window_too_short_is_named():
 
 @pytest.mark.slow
 def test_bfloat16_is_used_where_it_is_asked_for_and_there():
-    """It is reported, its answers stay float32 and close, and its absence on a processor is
-    reported too."""
+    """It is reported, its answers stay float32 and close; a processor without it is reported
+    too."""
     s = easy(8)
     exact = train("paper-cnn", s, Effort(paper_steps=4))
     rough = train("paper-cnn", s, Effort(paper_steps=4, bfloat16=True))
@@ -362,7 +359,7 @@ def test_effort_is_kept():
 
 @pytest.mark.parametrize("name", ["paper-cnn", "paper-cnn-centred"])
 def test_the_paper_s_cnn_has_an_int8_form(name: str):
-    """A quarter of the size, the same labels but for what quantization costs; centred, an offset
+    """It has a quarter of the size and the same labels up to quantization; centred, an offset
     changes nothing."""
     s = easy(8)
     model = train(name, s)
@@ -376,7 +373,7 @@ def test_the_paper_s_cnn_has_an_int8_form(name: str):
 
 
 def test_forms_are_kept_and_counted(tmp_path: Path):
-    """Logits of the other precision come back from the file as they were, and evaluate reports them
+    """Logits of the other precision are read from the file unchanged, and evaluate reports them
     beside the others."""
     s = easy(12)
     order = np.arange(len(s))

@@ -8,7 +8,6 @@ their group.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, TypeVar
@@ -16,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle.bundle import DisplacementRule, Early, Known
+from appliance.bundle.bundle import Classes, DisplacementRule, Early, Known
 from appliance.bundle.manifest import UNSURE
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.calibration import early_exit, novelty
@@ -104,12 +103,11 @@ class Calibration:
         """The entry `moved` of a manifest."""
         return self.displacement.rule if self.displacement else None
 
-    def means(self) -> bytes:
-        """The file means.npz of a bundle."""
-        packed, classes = io.BytesIO(), self.embedding.classes()
-        classes = self.displacement.classes(classes) if self.displacement else classes
-        np.savez_compressed(packed, allow_pickle=False, **classes.arrays())
-        return packed.getvalue()
+    def classes(self) -> Classes:
+        """The means and shapes of the materials, and of displaced contacts, as a bundle holds
+        them."""
+        classes = self.embedding.classes()
+        return self.displacement.classes(classes) if self.displacement else classes
 
     def arrays(self) -> dict[str, Array]:
         """The arrays that the file of a fit keeps."""

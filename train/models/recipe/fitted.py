@@ -33,7 +33,7 @@ from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_ca
 from train.onnx_tools.graph_builder import run, with_head
 
 if TYPE_CHECKING:
-    from train.models.recipe.network import Compact
+    from train.models.recipe.stages import Compact
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -104,7 +104,7 @@ class Fit:
         """The network in PyTorch, ready to run; of a fit without a filter bank."""
         import torch  # here: a fit without stages is made and packed without PyTorch
 
-        from train.models.recipe.network import Compact
+        from train.models.recipe.stages import Compact
 
         with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and overwritten
             format, classes = self.train.format, len(self.train.materials)

@@ -1,5 +1,4 @@
-"""MultiRocket-Hydra and QUANT: aeon's answers, small windows, what is left as it was, what cannot
-be trained."""
+"""MultiRocket-Hydra and QUANT: aeon's answers, small windows, random states, and refusals."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ names = pytest.mark.parametrize("name", NAMES)
 
 
 def train(name: str, sweeps: Dataset, seed: int = 1) -> aeon_peers.AeonModel:
-    """The method trained on everything."""
+    """The method trained on all sweeps."""
     return methods.find([name])[0].train(sweeps, sweeps.samples, seed)
 
 
 def hard(n: int = 12) -> Dataset:
-    """Sweeps under noise, so that answers differ."""
+    """Noisy sweeps, so that answers differ."""
     sweeps = easy(n)
     noise = np.random.default_rng(1).normal(0, 25, sweeps.samples.shape)
     return replace(sweeps, samples=(sweeps.samples + noise).astype(np.float32))
@@ -37,8 +36,8 @@ def hard(n: int = 12) -> Dataset:
 @pytest.mark.parametrize("materials", [3, 2])
 @names
 def test_the_labels_are_aeons(name: str, materials: int):
-    """As its classifier gives them with default settings and this seed, also for sweeps that are
-    hard to separate."""
+    """The labels are those of aeon's classifier with default settings and this seed, also for
+    sweeps that are hard to separate."""
     rockets = pytest.importorskip("aeon.classification.convolution_based")
     from aeon.classification.interval_based import QUANTClassifier
 
@@ -58,7 +57,8 @@ def test_the_labels_are_aeons(name: str, materials: int):
 @pytest.mark.parametrize(("frames", "taxels"), [(80, 16), (128, 1), (24, 1), (10, 1)])
 @names
 def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
-    """float32 sweeps of any window from ten frames on: finite, one by one as all at once."""
+    """float32 sweeps of any window from ten frames on: logits are finite, and equal one by one and
+    all at once."""
     pytest.importorskip("aeon")
     rng, labels = np.random.default_rng(0), np.arange(12) % 3
     samples = (
@@ -75,8 +75,8 @@ def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
 @pytest.mark.slow
 @names
 def test_silence_and_single_sweeps_are_no_trouble(name: str):
-    """A training set without any signal, a taxel without one, one sweep of each material: logits
-    are finite."""
+    """Logits are finite for a training set without any signal, a taxel without a signal, and one
+    sweep of each material."""
     pytest.importorskip("aeon")
     sweeps = easy(4)
     silent = replace(sweeps, samples=np.full_like(sweeps.samples, 7))
@@ -88,8 +88,8 @@ def test_silence_and_single_sweeps_are_no_trouble(name: str):
 @pytest.mark.slow
 @names
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
-    """The same logits for the same seed, others for another; numpy's and PyTorch's streams go
-    on."""
+    """The same seed gives the same logits, another seed others; the random streams of numpy and
+    PyTorch go on."""
     pytest.importorskip("aeon")
     sweeps, other = hard(20).split("recording", 0.3, 0)
     np.random.seed(4)
@@ -105,7 +105,7 @@ def test_a_seed_gives_one_model_and_random_states_stay(name: str):
 @pytest.mark.slow
 @names
 def test_a_material_not_trained_on_is_never_said(name: str):
-    """Its logit is there, far below; the others keep their places."""
+    """Its logit is far below the others, which keep their places."""
     pytest.importorskip("aeon")
     sweeps = easy(8)
     logits = train(name, sweeps.take(sweeps.labels != 1)).logits(sweeps.samples)
@@ -115,7 +115,7 @@ def test_a_material_not_trained_on_is_never_said(name: str):
 
 @names
 def test_what_cannot_be_trained_is_named(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Too short a window, one material, no aeon; a graph is refused."""
+    """A window that is too short, one material, and a missing aeon are refused; so is a graph."""
     sweeps = easy(4)
     short = replace(sweeps, samples=sweeps.samples[:, :9])
     with pytest.raises(

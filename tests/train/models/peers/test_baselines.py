@@ -1,5 +1,5 @@
-"""Every method on features, the paper's and its neighbours': what it learns, that its graph is the
-estimator, its bundle."""
+"""Every method on features, the paper's and its neighbours': learning, graph against estimator,
+bundle."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ by_name = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 
 
 class HeldOutSet:
-    """A set, its features by kind, and which of its sweeps are held out."""
+    """A set, its features by kind, and the held-out sweeps."""
 
     def __init__(self, sweeps: Dataset, held: np.ndarray) -> None:
         self.sweeps, self.held, self.kinds = sweeps, held, {}
@@ -45,14 +45,14 @@ class HeldOutSet:
         return self.kinds[kind]
 
     def model(self, method: Method) -> FeatureModel:
-        """The method trained on what is not held out."""
+        """The method trained on the other sweeps."""
         if method.name not in self.models:
             train = self.sweeps.take(~self.held)
             self.models[method.name] = method.train(train, self.given(method.input)[~self.held], 0)
         return self.models[method.name]
 
     def accuracy(self, method: Method) -> float:
-        """Share of held-out sweeps that get their label; all logits must be finite."""
+        """Accuracy on held-out sweeps; all logits must be finite."""
         logits = self.model(method).logits(self.given(method.input)[self.held])
         assert logits.dtype == np.float32
         assert logits.shape == (self.held.sum(), len(self.sweeps.materials))
@@ -62,7 +62,7 @@ class HeldOutSet:
 
 @pytest.fixture(scope="module")
 def tubes() -> HeldOutSet:
-    """Two sweeps of each tube at each of nine positions, three of which are held out."""
+    """Two sweeps of each tube at each of nine positions; three positions are held out."""
     sweeps = sets.load("sim:T-REAL:1001:2")
     return HeldOutSet(
         sweeps, np.isin(sweeps.groups["position"], np.unique(sweeps.groups["position"])[::3])
@@ -70,7 +70,7 @@ def tubes() -> HeldOutSet:
 
 
 def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> Dataset:
-    """Three materials of another skin: ripples of another frequency, strength and level each, in
+    """Three materials of another skin: ripples that differ in frequency, strength and level, in
     noise; 24 sweeps."""
     rng, labels = np.random.default_rng(5), np.arange(24) % 3
     t = np.arange(frames)[:, None, None] / rate_hz
@@ -87,7 +87,7 @@ def ripples(frames: int, rows: int, cols: int, rate_hz: float, dtype: str) -> Da
 
 @by_name
 def test_every_method_learns(method: Method, tubes: HeldOutSet):
-    """Positions that were never seen: far above the chance of one in six."""
+    """At unseen positions the accuracy is far above the chance of one in six."""
     assert tubes.accuracy(method) > 0.4
 
 
@@ -117,7 +117,7 @@ def test_broken_readings_get_finite_logits(method: Method, tubes: HeldOutSet):
 
 @by_name
 def test_training_twice_gives_the_same_bytes(method: Method, tubes: HeldOutSet):
-    """The same arguments, the same model; another seed changes nothing, since nothing is random."""
+    """The same arguments give the same model; so does another seed, because nothing is random."""
     train = tubes.sweeps.take(~tubes.held)
     given = tubes.given(method.input)[~tubes.held]
     again = method.train(train, given.copy(), 1).graph()
@@ -162,8 +162,8 @@ ESTIMATORS = {
 @pytest.mark.parametrize("present", [(0, 1), (1, 3), (0, 2, 4), (0, 1, 2, 3, 4, 5)])
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
-    """scikit-learn's scores over the temperature, as log probabilities; a class without a sweep has
-    ABSENT."""
+    """The graph gives scikit-learn's scores over the temperature, as log probabilities; a class
+    without a sweep has ABSENT."""
     rng = np.random.default_rng(3)
     y = np.array(present)[rng.integers(0, len(present), 90)]
     x = (
@@ -190,7 +190,7 @@ def test_gauss_is_a_normal_distribution():
     """Log likelihoods are scipy's, with one pseudo-sweep of the whole set's spread; `independent`
     drops covariances.
 
-    `first` features by themselves give what they give with the others there.
+    With `first`, features after the first ones change nothing.
     """
     rng = np.random.default_rng(1)
     y = np.repeat([0, 1, 2], 20)
@@ -214,8 +214,8 @@ def test_gauss_is_a_normal_distribution():
 
 
 def test_gauss_bears_little_and_collinear():
-    """One sweep a class, a copy of a feature, a constant one: the nearest mean wins and everything
-    is finite."""
+    """With one sweep of a class, a copy of a feature and a constant feature, the nearest mean wins
+    and everything is finite."""
     x = np.array([[0.0, 0, 7], [1, 1, 7], [5, 5, 7]])
     gauss = Gauss().fit(x, np.arange(3))
     assert gauss.predict(x + 0.1).tolist() == [0, 1, 2]
@@ -223,8 +223,8 @@ def test_gauss_bears_little_and_collinear():
 
 
 def test_a_material_that_training_lacks_is_never_named(tubes: HeldOutSet):
-    """Five of six materials in training: the sixth has a column, finite and lowest, and its sweeps
-    get another label."""
+    """Five of six materials in training: the sixth has the lowest finite logit, and its sweeps get
+    another label."""
     known, given = np.flatnonzero(tubes.sweeps.labels != 2), tubes.given("L")
     for make in (Gauss, knn, svm):
         logits = baselines.learn(make, tubes.sweeps.take(known), given[known], 0).logits(given)
@@ -234,18 +234,15 @@ def test_a_material_that_training_lacks_is_never_named(tubes: HeldOutSet):
 
 
 def folds_of(sweeps: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What the temperature is found on; a warning is an error."""
+    """The folds that the temperature is found on; a warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return list(baselines._folds(sweeps))
 
 
 def test_the_temperature_sees_whole_positions_or_recordings(tubes: HeldOutSet):
-    """Every sweep is held out once, with its position; where each material has its own position,
-    with its recording.
-
-    A material of two sweeps is no trouble.
-    """
+    """Every sweep is held out once, with its position; if each material has its own position, with
+    its recording. A material of two sweeps works as well."""
     sweeps = tubes.sweeps
     own = replace(
         sweeps, groups={"position": sweeps.labels, "recording": np.arange(len(sweeps)) // 2}
@@ -262,7 +259,8 @@ def test_the_temperature_sees_whole_positions_or_recordings(tubes: HeldOutSet):
 
 
 def test_without_anything_to_hold_out_the_temperature_is_one(tubes: HeldOutSet):
-    """One recording a material: no folds, and the model's logits are the plain estimator's."""
+    """With one recording of each material there are no folds, and the model's logits are those of
+    the plain estimator."""
     sweeps = replace(tubes.sweeps, groups={"recording": tubes.sweeps.labels})
     assert not folds_of(sweeps)
     given = tubes.given("L")
@@ -276,8 +274,8 @@ def test_without_anything_to_hold_out_the_temperature_is_one(tubes: HeldOutSet):
 def test_probabilities_are_honest(
     make: Callable[[], baselines.Estimator], strength: float, most: float
 ):
-    """New sweeps of two materials, which are equal, overlap or are far apart: the mean probability
-    of the label given is its accuracy, to a tenth."""
+    """For two materials that are equal, overlap or are far apart, the mean probability of the label
+    is its accuracy within a tenth."""
     rng = np.random.default_rng(2)
     labels, truth = np.arange(80) % 2, np.arange(2000) % 2
     some = Dataset(np.zeros((80, 1, 1, 1), np.uint8), labels, ("a", "b"), 1.0)
@@ -296,6 +294,6 @@ def test_probabilities_are_honest(
     ("index", "hint"), [([0, 0, 0, 0], "only one class"), ([0, -1], "2 sweeps are too few")]
 )
 def test_too_little_to_learn_from_is_refused(tubes: HeldOutSet, index: list[int], hint: str):
-    """One material, and fewer sweeps than neighbours."""
+    """One material, and fewer sweeps than neighbours, are refused."""
     with pytest.raises(FormatError, match=hint):
         METHODS[0].train(tubes.sweeps.take(np.array(index)), tubes.given("L")[index], 0)

@@ -1,5 +1,5 @@
-"""DS-CNN and the recipe of the edge tools: their layers, their features against the definition, the
-int8 form."""
+"""DS-CNN and the recipe of the edge tools: their layers, their features against the definition, and
+int8."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from train.onnx_tools.quantize import quantize
     [(1500, 30, 60), (128, 2, 10), (80, 1, 10), (24, 1, 10), (7, 1, 7)],
 )
 def test_the_first_convolution_leaves_about_fifty_steps(window: int, stride: int, kernel: int):
-    """Ten frames, or two strides of a long window; a window shorter than that is one step."""
+    """Its kernel has ten frames, or two strides of a long window; a shorter window is one step."""
     net = ds_cnn.DepthwiseSeparable(SweepFormat(2, 2, 100.0, window, "float32"), 3, 1.0)
     assert (net.stride, tuple(net.convs[0].weight.shape)) == (stride, (64, 4, kernel))
     assert net.eval().features(torch.zeros(1, 4, window)).shape == (1, 64)
@@ -42,7 +42,7 @@ def test_its_weights_and_work_are_those_of_depthwise_separable_layers():
 
 @pytest.mark.slow
 def test_ds_cnn_has_an_int8_form():
-    """Smaller, with integer weights, and close to its float form."""
+    """The int8 model is smaller, has integer weights, and answers nearly as the float model."""
     s = easy(12)
     (method,) = methods.find(["ds-cnn"], methods.Effort(0.1))
     model = method.train(s, s.samples, 1)
@@ -73,7 +73,7 @@ def test_the_box_reads_its_int8_form(classes: int):
     [(1500, 256), (600, 256), (427, 128), (128, 64), (80, 64), (24, 64), (1, 64)],
 )
 def test_the_transform_is_as_long_as_the_window_allows(window: int, length: int):
-    """A power of two within half the window, from 64 to 256."""
+    """Its length is a power of two within half the window, from 64 to 256."""
     assert edge_spectral.transform_length(window) == length
 
 
@@ -100,7 +100,7 @@ def test_the_features_are_the_definition(window: int):
 
 
 def test_features_are_standardised_on_the_training_sweeps():
-    """Mean 0 and deviation 1 over what `build` was given; a feature that is constant there stays
+    """They have mean 0 and deviation 1 over the sweeps that `build` got; a constant feature stays
     finite."""
     s = easy(10)
     net = edge_spectral.build(s.format, 3, s.samples)

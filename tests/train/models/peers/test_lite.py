@@ -1,4 +1,5 @@
-"""LITE: its weights and filters are the published ones, and its graph answers as it does."""
+"""LITE: its weights and filters are the published ones, and its graph answers as the network
+does."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ def test_it_has_as_many_weights_as_published():
 
 
 def test_the_detectors_find_what_they_are_named_after():
-    """Two rises for each length, one the other's negative; a peak's weights sum to zero around its
-    hump."""
+    """There are two rises for each length, which are negatives of each other; the weights of a peak
+    sum to zero around its hump."""
     np.testing.assert_array_equal(lite.rise_and_fall(4), [[-1, 1, -1, 1], [1, -1, 1, -1]])
     np.testing.assert_allclose(
         lite.peak(8), [[-0.25, -1, -1, -0.25, 0.5, 2, 2, 0.5, -0.25, -1, -1, -0.25]]
@@ -36,7 +37,7 @@ def test_the_detectors_find_what_they_are_named_after():
     ("steps", "stride", "taps", "dilation"), [(20, 1, 6, 2), (23, 4, 5, 1), (7, 1, 64, 1)]
 )
 def test_a_same_convolution_keeps_the_steps(steps: int, stride: int, taps: int, dilation: int):
-    """However long its kernel is; one step in each stride is left."""
+    """For any kernel length, one step in each stride is left."""
     conv = lite.SameConv(1, 1, taps, stride, dilation)
     assert conv(torch.zeros(1, 1, steps)).shape == (1, 1, -(-steps // stride))
     before, after = conv.ends(steps)
@@ -63,7 +64,8 @@ def test_the_graph_answers_as_the_network(rows: int, window: int):
 
 @pytest.mark.slow
 def test_lite_has_an_int8_form_that_the_box_reads():
-    """Integer weights, close to the float form, trained on what it can learn."""
+    """The int8 model has integer weights and answers nearly as the float model, trained on an easy
+    set."""
     s = easy(12)
     (method,) = methods.find(["lite"], methods.Effort(0.05))
     model = method.train(s, s.samples, 1)

@@ -1,5 +1,4 @@
-"""MiniRocket: its graph against the definition, against aeon, and what the head makes of its
-features."""
+"""MiniRocket: its graph against the definition and against aeon, and its head."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32
 
 
 def raw_counts(dtype: str, n: int = 3) -> np.ndarray:
-    """Random walks [n, T, R, C] of the grid and length that KINDS has for the type; float32 less
+    """Random walks [n, T, R, C] with the grid and length of the type in KINDS; float32 without
     their means."""
     rows, cols, window = KINDS[dtype]
     rng = np.random.default_rng(7)
@@ -79,7 +78,7 @@ def test_the_graph_is_the_definition(dtype: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
-    """Every share, in aeon's order: integer counts exactly, others except where a frame equals a
+    """The shares are aeon's, in its order: exactly for integer counts, else unless a frame equals a
     bias within rounding."""
     aeon = pytest.importorskip("aeon.transformations.collection.convolution_based")
     monkeypatch.setattr(minirocket, "FEATURES", 1000)
@@ -99,7 +98,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
 
 @pytest.mark.slow
 def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
-    """The whole method answers as aeon's own classifier does, also for sweeps that are hard to
+    """The whole method answers as aeon's own classifier, also for sweeps that are hard to
     separate."""
     aeon = pytest.importorskip("aeon.classification.convolution_based")
     monkeypatch.setattr(minirocket, "FEATURES", 500)
@@ -128,8 +127,8 @@ def head(sweeps: Dataset) -> linear_head.LinearHeadModel:
 
 
 def test_the_box_gives_the_logits():
-    """The graph in the box's session: an easy set is recognised, surely, and finite stays what is
-    constant."""
+    """The graph in the box's session names an easy set with high probability, and is finite for
+    constant sweeps."""
     sweeps, other = easy(20), easy(20, seed=1)
     model = head(sweeps)
     run = session(model.graph().SerializeToString())
@@ -141,8 +140,8 @@ def test_the_box_gives_the_logits():
 
 
 def test_a_material_not_trained_on_is_never_said():
-    """Its logit is there, far below; the two others are separated, for which scikit-learn gives one
-    row."""
+    """Its logit is far below the others. The two trained materials are separated, although
+    scikit-learn gives one row for them."""
     sweeps = easy(20)
     two = sweeps.take(sweeps.labels != 1)
     logits = head(two).logits(sweeps.samples)
@@ -176,8 +175,8 @@ def test_the_temperature_comes_from_held_out_groups():
 
 @pytest.mark.slow
 def test_a_seed_gives_one_model_and_leaves_numpy_alone(monkeypatch: pytest.MonkeyPatch):
-    """The same bytes for the same seed, others for another; numpy's global stream goes on as if
-    nothing had been."""
+    """The same seed gives the same bytes, another seed others; numpy's global stream goes on
+    unchanged."""
     pytest.importorskip("aeon")
     monkeypatch.setattr(minirocket, "FEATURES", 168)
     sweeps = easy(8)
@@ -193,7 +192,7 @@ def test_a_seed_gives_one_model_and_leaves_numpy_alone(monkeypatch: pytest.Monke
 
 
 def test_what_cannot_be_trained_is_named(monkeypatch: pytest.MonkeyPatch):
-    """Too short a window, no aeon, one material."""
+    """A window that is too short, a missing aeon, and one material are refused."""
     sweeps = easy(8)
     short = replace(sweeps, samples=sweeps.samples[:, :8])
     with pytest.raises(FormatError, match="a window of 8 frames is too short for minirocket"):

@@ -1,5 +1,5 @@
-"""MiniRocket with augmented copies: what the copies are, and that none of them leaks into what is
-held out."""
+"""MiniRocket with augmented copies: the copies, and that none of them is a copy of a held-out
+sweep."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from train.models.recipe.augment import SLOW, copies, default_augmentation
 
 
 def test_copies_are_augmented_as_in_our_own_training():
-    """As many of them, augmented as for the format; a window that our networks cannot take is that
-    of a slow sensor."""
+    """They are as many, and augmented as for the format. A window that our networks cannot take
+    counts as that of a slow sensor."""
     assert minirocket_augmented.COPIES == stages.COPIES
     for window in (64, 1500):
         assert minirocket_augmented.augmentation(window) == default_augmentation(
@@ -32,7 +32,7 @@ def test_copies_are_augmented_as_in_our_own_training():
 def test_copies_keep_label_and_recording_of_their_sweep(
     dtype: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """Twice as many beside the sweeps themselves, which come first; no two copies are equal."""
+    """There are two copies of each sweep, after the sweeps themselves; no two copies are equal."""
     seen: list[tuple[Dataset, np.ndarray]] = []
     monkeypatch.setattr(
         minirocket, "train", lambda sweeps, inputs, seed: seen.append((sweeps, inputs))
@@ -56,8 +56,8 @@ def test_copies_keep_label_and_recording_of_their_sweep(
 
 @pytest.mark.slow
 def test_what_is_easy_is_learnt_and_a_seed_gives_one_model(monkeypatch: pytest.MonkeyPatch):
-    """Sweeps of another seed are named; the same bytes again, others for another seed; errors are
-    those of minirocket."""
+    """Sweeps of another seed are named rightly; the same seed gives the same bytes, another seed
+    others; errors are those of minirocket."""
     pytest.importorskip("aeon")
     monkeypatch.setattr(minirocket, "FEATURES", 500)
     sweeps, other = easy(12), easy(12, seed=1)

@@ -1,4 +1,4 @@
-"""ST-HMP: codes against scikit-learn's pursuit, pooling against plain loops, what comes of sets."""
+"""ST-HMP: codes against scikit-learn's pursuit, pooling against plain loops, training on sets."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def test_the_codes_are_those_of_orthogonal_matching_pursuit():
 
 
 def test_a_patch_of_fewer_atoms_stays_so():
-    """Nothing, one atom, or a dictionary of one: what is left over is nothing, and no number
-    grows."""
+    """For an empty patch, a patch of one atom and a dictionary of one atom the residual is zero and
+    no number grows."""
     d = atoms(9)
     codes = sthmp.encode(np.stack([0 * d[0], -3 * d[4]]), d)
     np.testing.assert_allclose(
@@ -100,8 +100,8 @@ def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", SETS)
 def test_the_features_are_largest_codes_of_each_cell(dtype: str):
-    """Whole grid and quarters, window, halves and quarters, signs apart, each cell's length taken
-    out: any grid."""
+    """The cells are the grid and its quarters, over the window, its halves and its quarters; signs
+    are separate, and the length of each cell is divided out; for any grid."""
     rows, cols, window = SETS[dtype]
     sweep = (120 + 9 * np.random.default_rng(2).standard_normal((window, rows, cols))).astype(dtype)
     d = atoms(7, min(rows, 2), min(cols, 2))
@@ -112,8 +112,8 @@ def test_the_features_are_largest_codes_of_each_cell(dtype: str):
 
 
 def test_a_patch_holds_all_axes_of_its_taxels():
-    """The codes are those of the taxels one by one, each with its axes beside each other; never
-    half of one taxel."""
+    """The codes are those of the taxels one by one, each with its axes beside each other; a patch
+    never holds part of a taxel."""
     sweep = np.random.default_rng(2).standard_normal((64, 3, 2, 3)).astype(np.float32)
     d = atoms(7, 2, 6)
     graph = sthmp.pooled(SweepFormat(3, 2, 50.0, 64, "float32", 3), d, 0.1)
@@ -137,7 +137,7 @@ def test_a_patch_holds_all_axes_of_its_taxels():
 
 
 def test_an_offset_changes_nothing():
-    """What rests on a taxel is not its texture."""
+    """A constant load on a taxel does not change the codes."""
     rng = np.random.default_rng(3)
     sweeps = rng.integers(0, 100, (2, 64, 4, 4)).astype(np.int16)
     graph = sthmp.pooled(SweepFormat(4, 4, 50.0, 64, "int16"), atoms(7), 0.03)
@@ -152,8 +152,8 @@ def test_an_offset_changes_nothing():
 
 
 def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.MonkeyPatch):
-    """Patches of two out of twenty atoms: most of these are found again, and little is left
-    unexplained."""
+    """Of patches that consist of two out of twenty atoms most atoms are found again, and the
+    residual is small."""
     monkeypatch.setattr(sthmp, "ACTIVE", 2)
     monkeypatch.setattr(sthmp, "ROUNDS", 15)
     rng, truth = np.random.default_rng(5), atoms(20).astype(np.float64)
@@ -173,8 +173,8 @@ def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.Monke
 
 
 def test_the_box_gives_the_logits():
-    """The graph in the box's session: an easy set is recognised, surely; silence and saturation
-    have finite logits."""
+    """The graph in the box's session names an easy set with high probability; logits are finite for
+    silence and saturation."""
     sweeps, other = easy(20), easy(20, seed=1)
     model = sthmp.train(sweeps, sweeps.samples, 0)
     run = session(model.graph().SerializeToString())
@@ -187,7 +187,7 @@ def test_the_box_gives_the_logits():
 
 
 def test_a_material_not_trained_on_is_never_said():
-    """Its logit is there, far below, and the others are separated."""
+    """Its logit is far below the others, and the others are separated."""
     sweeps = easy(20)
     two = sweeps.take(sweeps.labels != 1)
     logits = sthmp.train(two, two.samples, 0).logits(sweeps.samples)
@@ -198,8 +198,8 @@ def test_a_material_not_trained_on_is_never_said():
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", SETS)
 def test_any_set_can_be_trained_on(dtype: str):
-    """Any grid, length and data type, even a silent skin: finite logits, the same for the same
-    seed."""
+    """Logits are finite for any grid, length and data type, even for a silent skin, and the same
+    for the same seed."""
     rows, cols, window = SETS[dtype]
     labels = np.arange(12) % 2
     silent = np.full((12, window, rows, cols), 7, dtype)
@@ -212,7 +212,7 @@ def test_any_set_can_be_trained_on(dtype: str):
 
 
 def test_what_cannot_be_trained_is_named():
-    """Too short a window, one material."""
+    """A window that is too short, and one material, are refused."""
     sweeps = easy(8)
     short = replace(sweeps, samples=sweeps.samples[:, :7])
     with pytest.raises(

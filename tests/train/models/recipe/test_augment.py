@@ -1,4 +1,4 @@
-"""Augmentation: what each parameter changes, and what it leaves alone."""
+"""Augmentation: the effect of each parameter, and everything that it must not change."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMES = (
 
 
 def sweeps(n: int = 16, taxels: int = 16, frames: int = 300, seed: int = 1) -> np.ndarray:
-    """White sweeps [n, taxels, frames] of deviation 1, each taxel's mean away."""
+    """White sweeps [n, taxels, frames] of deviation 1, without the mean of each taxel."""
     x = np.random.default_rng(seed).standard_normal((n, taxels, frames), np.float32)
     return x - x.mean(axis=2, keepdims=True)
 
@@ -44,7 +44,7 @@ def band(x: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def test_nothing_varies_at_zero_and_nothing_is_drawn():
-    """All settings at 0: the sweeps as they are, the generator where it was."""
+    """With all settings at 0 the sweeps and the generator are unchanged."""
     x, rng = sweeps(), np.random.default_rng(3)
     np.testing.assert_array_equal(augment(x, 4, OFF, rng), x)
     assert rng.bit_generator.state == np.random.default_rng(3).bit_generator.state
@@ -59,8 +59,8 @@ def test_nothing_varies_at_zero_and_nothing_is_drawn():
     ],
 )
 def test_every_parameter_changes_sweeps_each_otherwise_and_leaves_its_input(settings: Augmentation):
-    """Same generator, same bits; another one, others; sweeps that were equal differ; the input
-    stays."""
+    """The same generator gives the same bits, another generator gives others. Equal sweeps become
+    different, and the input does not change."""
     x = np.repeat(sweeps(1), 12, axis=0)
     before = x.copy()
     once, again, other = (
@@ -83,8 +83,8 @@ def test_sensors_without_vibrations_get_an_augmentation_of_their_own():
 
 @pytest.mark.slow
 def test_a_shift_reads_between_rows_and_fills_the_edge():
-    """Each row becomes a mixture of two neighbours, the same in all rows; what comes in is part of
-    the edge's row."""
+    """Each row becomes a mixture of two neighbours, with the same shares in all rows; the row that
+    comes in is part of the row at the edge."""
     x = sweeps(200, frames=50)
     now = varied(x, shift=1.0, moved=0.5).reshape(200, 4, 200)
     mixtures = now @ np.linalg.pinv(x.reshape(200, 4, 200))
@@ -104,14 +104,15 @@ def test_a_shift_reads_between_rows_and_fills_the_edge():
 
 @pytest.mark.parametrize("rows", [1, 16])
 def test_a_line_of_taxels_is_not_moved(rows: int):
-    """Where there is one row, or one taxel in each, their distance along the slide is unknown."""
+    """With one row, or one taxel in each row, the distance of the taxels along the slide is
+    unknown."""
     x = sweeps()
     np.testing.assert_array_equal(varied(x, rows, shift=1.0, moved=1.0), x)
 
 
 def test_gains_are_of_all_taxels_or_of_each():
-    """A logarithm of the wanted spread; `gain` the same for all taxels of a sweep, `gains` not; the
-    same at all times."""
+    """The logarithms have the wanted spread; `gain` is the same for all taxels of a sweep, `gains`
+    is not; both are constant over time."""
     x = sweeps(400, frames=20)
     for name, taxels in (("gain", 1), ("gains", 16)):
         ratio = varied(x, **{name: 0.3}) / x
@@ -124,7 +125,7 @@ def test_gains_are_of_all_taxels_or_of_each():
 
 
 def test_silent_taxels_are_zero_and_the_others_as_they_were():
-    """About the wanted share of them."""
+    """About the wanted share of taxels is silent."""
     x = sweeps(200, frames=20)
     now = varied(x, silent=0.2)
     dead = (now == 0).all(axis=2)
@@ -163,7 +164,8 @@ def test_damping_takes_high_rates_and_colour_any():
 
 
 def test_noise_is_white_and_of_another_level_in_every_sweep():
-    """From hardly any to the wanted one, alike on all taxels, and no taxel's noise is another's."""
+    """Its level lies between almost nothing and the maximum, equal for all taxels of a sweep, and
+    the noise of taxels is independent."""
     added = varied(np.zeros((100, 16, 2000), np.float32), noise=0.5)
     level = added.std(axis=2)
     assert level.max() < 0.53
@@ -194,7 +196,7 @@ def test_drift_is_a_line_around_zero():
 
 
 def test_hum_is_one_sine_on_all_taxels():
-    """In a quarter of the sweeps, of any rate, no stronger than asked."""
+    """A quarter of the sweeps have it, with any frequency and an amplitude up to the maximum."""
     hum = varied(np.zeros((400, 4, 500), np.float32), 2, hum=2.0)
     np.testing.assert_array_equal(hum, np.broadcast_to(hum[:, :1], hum.shape))
     assert np.abs(hum).max() <= 2
@@ -210,7 +212,7 @@ def test_hum_is_one_sine_on_all_taxels():
 
 
 def test_what_is_clipped_is_cut_off_above():
-    """About the wanted share of the taxels; what lies below the cut is as it was."""
+    """About the wanted share of the taxels is clipped; values below the cut are unchanged."""
     x = sweeps(200, frames=100)
     now = varied(x, clipped=0.3)
     cut = (now != x).any(axis=2)
@@ -236,8 +238,7 @@ def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames
 
 
 def test_copies_that_judge_are_moved_and_nothing_else():
-    """The skin's place, its contact and its gains change; what the sensor adds or loses does
-    not."""
+    """Position, contact and gains of the skin change; noise and failures of the sensor are off."""
     usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
     judging = usual.displaced()
     assert (

@@ -1,5 +1,5 @@
-"""The filter bank: its graph against the definition, float against int8, what it cannot see,
-windows too short for it."""
+"""The filter bank: its graph against the definition, float against int8, offsets, and windows that
+are too short."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
 
 
 def small(format: SweepFormat, architecture: Architecture = BANK) -> Bank:
-    """Twenty filters of the kinds that `form` allows, fitted to the random walks."""
+    """Twenty filters of the kinds for `format`, fitted to the random walks."""
     rng, kinds = (
         np.random.default_rng(3),
         (False,) if architecture.zero_sum(format.window) else (False, True),
@@ -69,8 +69,8 @@ def trunk(
 
 @forms
 def test_the_graph_is_the_definition(format: SweepFormat):
-    """Each response tap by tap; log of its mean magnitude in deviations, share above its
-    threshold."""
+    """Each response is computed tap by tap; features are the log of its mean magnitude in
+    deviations and the share above its threshold."""
     filters, given = small(format), counts(format)
     scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(format, 12))
     for sweep, row in zip(
@@ -98,8 +98,8 @@ def test_the_graph_is_the_definition(format: SweepFormat):
 
 @forms
 def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepFormat):
-    """Magnitudes within a few hundredths of a logarithm, shares within a few responses; in both
-    forms."""
+    """In both precisions, magnitudes agree within a few hundredths of a logarithm, shares within a
+    few responses."""
     filters, given = small(format), counts(format)
     precise, rounded = (run(trunk(format, filters, int8), given) for int8 in (False, True))
     assert np.abs(precise - rounded).mean() < 0.03
@@ -110,8 +110,8 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepForma
 
 
 def test_wide_counts_keep_what_a_byte_would_round_away():
-    """One sweep of eight is ten thousand times as large as the others, which are below a step of 8
-    bits then: the int8 form gives what the float form gives."""
+    """One sweep of eight is ten thousand times as large as the others, which are then below a step
+    of 8 bits: int8 still gives the features of float."""
     format = FORMATS[4]
     given = counts(format, 8)
     given[0] = (given[0] - 1000) * 1e4
@@ -132,7 +132,7 @@ def test_wide_counts_keep_what_a_byte_would_round_away():
 
 @forms
 def test_an_offset_changes_nothing(format: SweepFormat):
-    """Every taxel higher by as much: the same bits in int8, where counts are whole."""
+    """An offset of all taxels changes no bit in int8 if counts are whole."""
     filters, given = small(format), counts(format)
     higher = (given.clip(0, 250) + 5 if format.dtype == "uint8" else given + 1000).astype(
         format.dtype
@@ -148,8 +148,8 @@ def test_an_offset_changes_nothing(format: SweepFormat):
 
 @forms
 def test_filters_fit_the_window(format: SweepFormat):
-    """Unit norm, sums of zero but for free ones; only dilations that fit; some see one taxel alone
-    and some see all."""
+    """Filters have unit norm and sum to zero unless they are free; all dilations fit; some see one
+    taxel and some see all."""
     for free in (False, True):
         drawn = bank.draw(format, np.random.default_rng(0), (free,))
         assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)
@@ -164,7 +164,7 @@ def test_filters_fit_the_window(format: SweepFormat):
 
 
 def test_thresholds_leave_the_shares_that_were_drawn():
-    """Of the responses that they were taken from."""
+    """The shares are those of the responses from which the thresholds were taken."""
     format = FORMATS[0]
     shares = run(trunk(format, small(format), False), counts(format, 12))[:, 40:].mean(axis=0)
     assert 0.05 < shares.min() < 0.25
@@ -172,7 +172,7 @@ def test_thresholds_leave_the_shares_that_were_drawn():
 
 
 def test_a_window_shorter_than_a_filter():
-    """The message says how long it must be."""
+    """The message names the required length."""
     with pytest.raises(
         FormatError, match="a window of 8 frames is too short for a filter; record at least 9"
     ):

@@ -1,4 +1,4 @@
-"""What is fitted after training: what disturbed sweeps are for, and what they must not touch."""
+"""Calibration: the effect of copies with faults, and everything that they must not change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from train.models.recipe.calibrate import fit_calibration
 from train.models.recipe.fitted import ONE_IN, calibration_inputs
 
 NOISE = np.array([0.0, 0.0, 0.0, 12.0])
-"""What disturbs: in the last feature, where no material differs from another."""
+"""The fault: noise in the last feature, in which materials do not differ."""
 
 
 def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -27,8 +27,9 @@ def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_a_disturbed_sweep_of_a_known_material_stays_known():
-    """One in ten of the sweeps is disturbed: then others are no longer unknown. A third material
-    still is, and head, temperature and what judges are as they were."""
+    """One in ten of the sweeps has a copy with the fault; then other sweeps with the fault are
+    known. A third material is still unknown, and head, temperature and judging sweeps are
+    unchanged."""
     x, y, at = world()
     known = y < 2
     one = np.arange(known.sum()) % ONE_IN == 0
@@ -52,7 +53,8 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 
 
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
-    """One in ten of them, changed, of the same materials and groups; none judges."""
+    """One in ten training sweeps has a changed copy of the same material and group; none of the
+    copies judges."""
     fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
     given = calibration_inputs(fit)
     prefixes, labels, groups, judged, faulty = (

@@ -15,8 +15,8 @@ from train.models.recipe import choice
 from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores
 
 GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
-"""Features: that name the material everywhere; that say nothing; that name it in one group and lie
-in the others."""
+"""Features that name the material everywhere; features without information; a feature that names it
+in one group and misleads in the others."""
 
 
 def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
@@ -48,14 +48,14 @@ def candidates(
 
 
 def scores() -> HeldOutScores:
-    """Of `known`."""
+    """The scores of `known`."""
     given, parts = known()
     return HeldOutScores([given] * 3, parts, 3)
 
 
 def test_a_plan_is_the_sum_of_its_discriminants():
-    """As one matrix over all features, each with its factor; copies are seen where they are asked
-    for."""
+    """As one matrix over all features it equals the sum of its discriminants times their factors; a
+    discriminant sees copies only on request."""
     given, _ = known()
     plan = HeadPlan((HeadPart(GOOD, False, factor=2.0), HeadPart((1, 2), True, factor=0.5)))
     weight, bias = plan.fit(given.given(), 3)
@@ -77,7 +77,7 @@ def test_a_plan_is_the_sum_of_its_discriminants():
 
 
 def test_a_part_takes_the_copies_of_its_sweeps_alone():
-    """Each copy stays with the sweep that it was made of."""
+    """Each copy stays with its sweep."""
     given, _ = known()
     kept = np.arange(240) % 2 == 0
     less = given.take(kept)
@@ -87,8 +87,8 @@ def test_a_part_takes_the_copies_of_its_sweeps_alone():
 
 
 def test_what_lies_in_another_group_is_not_chosen():
-    """The feature that names every material within a group is the worst of all for a group that was
-    not seen."""
+    """The feature that names every material within a group is the worst of all for an unseen
+    group."""
     at = scores()
     losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
     assert losses[0] < 0.2 < losses[1]
@@ -101,8 +101,7 @@ def test_what_lies_in_another_group_is_not_chosen():
 
 
 def test_what_is_clearly_better_is_chosen():
-    """Bands that name the materials, beside filters that say nothing; all discriminants see
-    them."""
+    """Bands name the materials and filters do not: all chosen discriminants see the bands."""
     at = scores()
     chosen = choice.choose(at, candidates([[0, 1]], NOISE, TRAP * 2, bands=GOOD), print)
     assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
@@ -110,15 +109,14 @@ def test_what_is_clearly_better_is_chosen():
 
 
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
-    """A discriminant of all magnitudes and one of all features, without copies."""
+    """It is a discriminant of all magnitudes and one of all features, without copies."""
     at = scores()
     chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE), print)
     assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
 
 
 def test_a_factor_from_before_does_not_count():
-    """A part that was judged once is judged the same again, beside others as well: an old factor is
-    of other sweeps."""
+    """A part gets the same score again, alone and beside others, whatever its old factor."""
     given, parts = known()
     for factor in (1.0, 1e-3):
         at = HeldOutScores([given] * 3, parts, 3)
@@ -130,8 +128,8 @@ def test_a_factor_from_before_does_not_count():
 
 
 def test_loss_alone_is_no_reason():
-    """Of two that name the same sweeps rightly, neither is better, however sure one is of what it
-    names wrongly."""
+    """If two candidates name the same sweeps rightly, neither is better, however certain one is of
+    its wrong answers."""
     at = scores()
     one = at.score([HeadPart(GOOD, False)])
     wrong = one.logits.argmax(axis=1) != at.labels
@@ -141,8 +139,8 @@ def test_loss_alone_is_no_reason():
 
 
 def test_fewer_filters_where_held_out_parts_show_no_loss():
-    """A half, a quarter and so on of filters that all say the same; no fewer than `least`, none of
-    what is no filter."""
+    """Of filters that all give the same response, a half, a quarter and so on are kept, but at
+    least `least`; other features stay."""
     given, parts = known(600)
     rng = np.random.default_rng(2)
     same = given.features[:, :1] @ np.ones((1, 16)) + given.features[:, 1:2] @ np.tile(
@@ -165,7 +163,7 @@ def test_fewer_filters_where_held_out_parts_show_no_loss():
 
 
 def test_too_few_sweeps_show_nothing():
-    """A hundred sweeps, all named rightly by fewer filters: that may be luck, so all stay."""
+    """A hundred sweeps, all named rightly by fewer filters, may be luck, so all filters stay."""
     given, parts = known(99)
     at = HeldOutScores([given] * 3, parts, 3)
     sure = at.score([HeadPart(GOOD, False)])
@@ -178,8 +176,7 @@ def test_too_few_sweeps_show_nothing():
 
 
 def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
-    """A head that learns its sweeps by heart has nothing to say of others: far from right where it
-    was not fitted."""
+    """A head that overfits scores far from perfect on held-out sweeps."""
     given, parts = known()
     rng = np.random.default_rng(1)
     own = HeadData(
@@ -194,8 +191,7 @@ def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
 
 
 def test_copies_of_held_out_sweeps_count_as_much_as_these():
-    """Where they are judged, what fails on copies is no longer as good as what does not, and loses
-    to it."""
+    """If copies are scored, a head that fails on copies loses to one that does not."""
     given, parts = known()
     copied = given.copied.copy()
     copied[:, GOOD[0]] = 0
@@ -220,7 +216,7 @@ def test_copies_of_held_out_sweeps_count_as_much_as_these():
 
 
 def test_the_temperature_is_the_best_for_held_out_sweeps():
-    """No other divisor of its logits gives less loss; every group counts the same."""
+    """No other divisor of the logits has a lower loss; every group counts the same."""
     at = scores()
     judged = at.score([HeadPart(GOOD, False), HeadPart(NOISE, True)])
 
@@ -234,8 +230,8 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """The usual one and magnitudes alone; then the best with copies, with the spectrum, and that
-    alone."""
+    """They are the usual one and magnitudes alone; then the best with copies, with the spectrum,
+    and the spectrum alone."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 5
@@ -248,7 +244,7 @@ def test_candidates_are_what_the_features_allow():
 
 
 def test_every_discriminant_sees_copies_where_these_are_wanted():
-    """Fewer candidates: none is there without."""
+    """There are fewer candidates, because all of them see copies."""
     tried: list[str] = []
     heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
     chosen = choice.choose(scores(), heads, tried.append)
@@ -257,8 +253,8 @@ def test_every_discriminant_sees_copies_where_these_are_wanted():
 
 
 def test_the_usual_one_sees_each_kind_three_times():
-    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum: no feature
-    twice in one."""
+    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum. No
+    discriminant has a feature twice."""
     given, parts = known()
     x = np.hstack([given.features[:, [0]]] * 6 + [given.features[:, [1]]] * 6)
     rng = np.random.default_rng(0)

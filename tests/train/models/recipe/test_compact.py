@@ -1,5 +1,5 @@
-"""The family: what each size costs, what int8 keeps exactly, what a tenth knows, that a method is
-its int8 graph."""
+"""The compact networks: the cost of each size, exactness of int8, prefixes, and the method as its
+int8 graph."""
 
 from __future__ import annotations
 
@@ -19,26 +19,25 @@ from appliance.sim import skin
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.methods import Effort
-from train.models.recipe import graph, network, spectrum, stages
+from train.models.recipe import graph, spectrum, stages
 from train.models.recipe import methods as compact_methods
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.recipe.augment import Augmentation
 from train.models.recipe.fitted import Fit
-from train.models.recipe.network import Compact
-from train.models.recipe.stages import FitRecipe
+from train.models.recipe.stages import Compact, FitRecipe
 from train.onnx_tools import cost as graph_cost
 from train.onnx_tools import graph_builder
 
 SMALL = Architecture((6, 8, 8), 8, 2)
 LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}
-"""Multiply-accumulates and kilobytes that are allowed."""
+"""Largest allowed multiply-accumulates and kilobytes."""
 CONVOLUTIONAL = {name: shape for name, shape in ARCHITECTURES.items() if shape.channels}
-"""Those with stages."""
+"""The sizes with stages."""
 
 
 def drawn(format: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: every taxel with an offset of its own, a tone and noise; none is much
-    noisier than others."""
+    """Raw counts of n sweeps: every taxel with its own offset, a tone and noise; all are about
+    equally noisy."""
     rng, t = (
         np.random.default_rng(seed),
         np.arange(format.window).reshape(-1, *(1,) * len(format.shape)),
@@ -70,7 +69,7 @@ def trunks(
 
 
 def seen(model: Compact, counts: np.ndarray) -> np.ndarray:
-    """What PyTorch's head sees of the counts."""
+    """The features that PyTorch's head sees of the counts."""
     with torch.no_grad():
         return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
@@ -94,8 +93,8 @@ def fitted() -> Fit:
     ],
 )
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str, axes: int):
-    """Any data type and window: float up to rounding, int8 close to it; a silent sweep gives the
-    same as one at another level."""
+    """For any data type and window, float agrees up to rounding and int8 closely; a silent sweep
+    gives the same features at any level."""
     format = SweepFormat(rows, cols, 100.0, window, dtype, axes)
     model, plain, int8 = trunks(format)
     counts = drawn(format, seed=1)
@@ -111,8 +110,8 @@ def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: s
 
 
 def test_no_offset_moves_a_bit_of_bytes():
-    """Every kernel's integer taps sum to zero and need no more than seven bits: offsets change
-    nothing at all."""
+    """The integer taps of every kernel sum to zero in at most seven bits, so offsets change nothing
+    at all."""
     format = skin.FORMAT
     _, _, int8 = trunks(format)
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
@@ -127,8 +126,7 @@ def test_no_offset_moves_a_bit_of_bytes():
 
 
 def test_rounding_to_zero_sums_moves_as_little_as_it_can():
-    """Against all ways to round up or down that sum to zero: none is nearer; whole taps stay as
-    they are."""
+    """Of all ways to round up or down to a sum of zero none is nearer; whole taps do not change."""
     rng = np.random.default_rng(0)
     taps = rng.uniform(-60, 60, (40, 3, 6))
     taps -= taps.mean(axis=2, keepdims=True)
@@ -146,8 +144,8 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
 @pytest.mark.parametrize("int8", [False, True])
 @pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (25, "float32")])
 def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
-    """Row d stays to the bit whatever comes after (d + 1) / 10 of the window, and hears what came
-    just before."""
+    """Row d does not depend on any frame after (d + 1) / 10 of the window, to the bit, but on the
+    frames just before."""
     format = SweepFormat(2, 2, 100.0, window, dtype)
     trunk, whole = trunks(format, prefixes=True)[1 + int8], trunks(format)[1 + int8]
     counts, other = drawn(format, 3), drawn(format, 3, seed=7)
@@ -174,8 +172,8 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
 
 @pytest.mark.parametrize("mains_hz", [50, 60])
 def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
-    """Hum of any phase gives nothing, twice its frequency does, in training and after; a kernel
-    shorter than a period hears both."""
+    """They do not respond to hum of any phase, but to twice its frequency, in training and after; a
+    kernel shorter than a period responds to both."""
     at = torch.arange(750) / 750
     hum, tone = (
         torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (mains_hz, 2 * mains_hz)
@@ -197,12 +195,12 @@ def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
 
 
 def test_a_noisy_taxel_is_attenuated():
-    """To three times the fifth of sixteen; the others stay to the bit, and all do where only a few
-    are touched."""
+    """It is attenuated to three times the noise of the fifth of sixteen. The others are unchanged
+    to the bit, and all are if only a few are touched."""
     x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
     loud = x.clone()
     loud[0, 3] *= 40
-    have = network.limit_noise(loud)
+    have = stages.limit_noise(loud)
     noise = (have[:, :, 1::10] - have[:, :, :-1:10]).abs().mean(2)
     assert noise[0, 3] == pytest.approx(
         3 * noise[0].sort(descending=True).values[4].item(), rel=1e-5
@@ -211,13 +209,13 @@ def test_a_noisy_taxel_is_attenuated():
     assert torch.equal(have[:, others], x[:, others])
     assert torch.equal(have[1], x[1])
     loud[:, 4:] = 0
-    assert torch.equal(network.limit_noise(loud), loud)
-    assert torch.equal(network.limit_noise(loud[:, 3:4]), loud[:, 3:4])
+    assert torch.equal(stages.limit_noise(loud), loud)
+    assert torch.equal(stages.limit_noise(loud[:, 3:4]), loud[:, 3:4])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_int8_attenuates_as_the_network_does(dtype: str):
-    """A noisy taxel changes the graphs' features as PyTorch's, and by much less than without the
+    """A noisy taxel changes the features of the graphs as PyTorch's, and much less than without the
     limit."""
     format = SweepFormat(4, 4, 750.0, 600, dtype)
     model, plain, int8 = trunks(format)
@@ -229,8 +227,8 @@ def test_int8_attenuates_as_the_network_does(dtype: str):
 
 
 def test_tenths_are_means_of_what_was_known():
-    """In float: the first half's features are those of a window of half the length, as both see the
-    same responses."""
+    """In float, the features of the first half are those of a window of half the length, because
+    both have the same responses."""
     format = SweepFormat(2, 2, 100.0, 800, "uint8")
     model, trunk, _ = trunks(format, prefixes=True)
     counts = drawn(format, 3)
@@ -241,8 +239,8 @@ def test_tenths_are_means_of_what_was_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CONVOLUTIONAL)
 def test_a_size_costs_what_it_states(name: str):
-    """Weights of the float graph, multiply-accumulates of its convolutions and head; within what is
-    allowed."""
+    """The weights of the float graph and the multiply-accumulates of its convolutions and head are
+    as stated and within the limits."""
     cost = ARCHITECTURES[name].cost(skin.FORMAT, 6)
     assert cost.weights == pytest.approx(1000 * int(name[:-1]), rel=0.45)
     plain = (
@@ -271,8 +269,8 @@ def test_a_size_costs_what_it_states(name: str):
 
 
 def test_every_operator_of_int8_is_fused(tmp_path: Path):
-    """onnxruntime runs whole-number convolutions on bytes in the order they come, integer sums, and
-    turns nothing."""
+    """onnxruntime runs whole-number convolutions on bytes in their order, and integer sums, without
+    a transposition."""
     _, _, int8 = trunks(skin.FORMAT, architecture=ARCHITECTURES["20k"])
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
@@ -288,8 +286,8 @@ def test_every_operator_of_int8_is_fused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_method_is_its_int8_graph():
-    """Logits are the graph's to the bit; the float form is the fit's network; the same fit gives
-    the same head."""
+    """Logits are those of the graph to the bit; its precision "float" is the network of the fit;
+    the same fit gives the same head."""
     s = easy(12)
     model = methods.find(["compact-1k"], Effort(share=0.02))[0].train(s, s.samples, 1)
     np.testing.assert_array_equal(
@@ -309,8 +307,8 @@ def test_the_method_is_its_int8_graph():
 
 
 def test_all_sizes_share_one_recipe():
-    """Names in order of size; `compact` is one of the sizes that may lose all stages; effort
-    reaches all."""
+    """Names are in order of size; `compact` is a size that may lose all stages; the effort reaches
+    all."""
     made = {m.name: m for m in compact_methods.methods(Effort(share=0.01))}
     assert list(made) == [*(f"compact-{size}" for size in ARCHITECTURES), "compact"]
     assert made["compact"].train.keywords["architecture"] == replace(ARCHITECTURES["20k"], fewest=0)
@@ -322,7 +320,7 @@ def test_all_sizes_share_one_recipe():
 
 
 FIRST, SECOND, THIRD, BANDS = (np.repeat(np.arange(4), (6, 8, 8, 5)) == k for k in range(4))
-"""Columns of what the heads of SMALL see of 64 frames."""
+"""Columns of the features of SMALL for 64 frames."""
 
 
 @pytest.mark.slow
@@ -339,8 +337,8 @@ FIRST, SECOND, THIRD, BANDS = (np.repeat(np.arange(4), (6, 8, 8, 5)) == k for k 
     ],
 )
 def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, banded: bool):
-    """The heads see the stages, and the spectrum or not, that help where they never were: no stage
-    at all where that is allowed. A set without a spectrum has none to choose."""
+    """The heads see the stages, and the spectrum or not, that help on unseen sweeps, even without
+    any stage if that is allowed. A set without a spectrum has no such choice."""
     rng, labels, held = np.random.default_rng(0), np.arange(90) % 3, np.arange(60) % 3
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
     known = rng.standard_normal((3, 27))
@@ -363,7 +361,7 @@ def test_what_only_knows_its_training_is_cut(useful: np.ndarray, depth: int, ban
 
 
 def test_a_cut_network_gives_what_its_first_stages_gave():
-    """Each stage as it was before; the spectrum behind them, or nothing but that."""
+    """Each stage is unchanged; after them comes the spectrum, or the spectrum is alone."""
     model, _, _ = trunks(SweepFormat(2, 2, 100.0, 64, "uint8"))
     counts = drawn(model.format)
     model.architecture = replace(SMALL, spectrum=True)
@@ -382,7 +380,7 @@ def test_a_cut_network_gives_what_its_first_stages_gave():
 
 @pytest.fixture(scope="module")
 def bare() -> compact_methods.CompactModel:
-    """The method of the box where its stages say nothing about what was held out."""
+    """The method on a set for which stages say nothing about held-out sweeps."""
 
     def blind(model: Compact, *others: object) -> stages.HeadInputs:
         inputs, size = seen_by_heads(model, *others), sum(model.architecture.channels)
@@ -398,8 +396,7 @@ def bare() -> compact_methods.CompactModel:
 
 @pytest.mark.slow
 def test_compact_may_end_without_a_convolution(bare: compact_methods.CompactModel):
-    """Then nothing in its graph is int8, its float form gives the same, and it learns what is
-    easy."""
+    """Then nothing in its graph is int8, both precisions agree, and it still learns an easy set."""
     assert bare.fit.architecture == DEFAULT.cut(0, spectrum=True)
     assert bare.fit.ranges.responses == ()
     done = {n.op_type for n in bare.graph().graph.node}
@@ -437,8 +434,8 @@ def test_a_fit_without_a_convolution_survives_its_file(
 
 @pytest.mark.parametrize("frames", [64, 1500])
 def test_training_augments_as_its_generator_says(frames: int):
-    """What PyTorch trains on: the same for the same state of its generator, which moves on; the
-    sweeps stay as they are."""
+    """PyTorch trains on the same sweeps for the same state of its generator, which moves on; the
+    original sweeps do not change."""
     format, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
     before, rng, again = (
         x.clone(),
@@ -455,8 +452,8 @@ def test_training_augments_as_its_generator_says(frames: int):
 
 
 def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
-    """With keep_means the head sees each taxel's mean beside the rest, in int8 too, and of each
-    tenth."""
+    """With keep_means the head sees the mean of each taxel beside the other features, in int8 too,
+    and for each prefix."""
     s = easy(6)
     made = stages.fit_network(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
     level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale

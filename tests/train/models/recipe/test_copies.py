@@ -1,5 +1,4 @@
-"""Augmented copies of raw counts: what is changed, what stays, and that PyTorch has no part in
-it."""
+"""Augmented copies of raw counts: changes, invariants, and independence of PyTorch."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ TYPES = ("uint8", "int16", "uint16", "float32")
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_without_augmentation_copies_are_the_sweeps_themselves(dtype: str):
-    """As often as asked, of the same type, with their labels, materials and groups; more sweeps
-    than fit in one batch."""
+    """There are as many as asked for, of the same type, labels, materials and groups, also for more
+    sweeps than fit in one batch."""
     sweeps = easy(BATCH // 2, dtype=dtype)
     made = list(copies(sweeps, STILL, 5, 3))
     assert len(made) == 3
@@ -36,8 +35,8 @@ def test_without_augmentation_copies_are_the_sweeps_themselves(dtype: str):
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_copies_are_augmented_raw_counts(dtype: str):
-    """The texture as the networks see it, augmented, and put back into raw counts around the mean
-    of each taxel."""
+    """The texture is augmented on the scale of the networks, and put back into raw counts around
+    the mean of each taxel."""
     sweeps = easy(6, dtype=dtype)
     scale = texture_scale(sweeps.samples)
     x = sweeps.samples.reshape(18, 64, 4).transpose(0, 2, 1).astype(np.float32)
@@ -55,7 +54,7 @@ def test_copies_are_augmented_raw_counts(dtype: str):
     ("dtype", "low", "high"), [("uint8", 0, 255), ("int16", -32768, 32767), ("uint16", 0, 65535)]
 )
 def test_what_the_data_type_cannot_hold_is_clipped(dtype: str, low: int, high: int):
-    """Strong gains reach both ends of the range, and nothing comes in again at the other end."""
+    """Strong gains reach both ends of the range, and no value wraps around."""
     sweeps = easy(6, dtype=dtype)
     rng = np.random.default_rng(2)
     sweeps = replace(
@@ -69,7 +68,7 @@ def test_what_the_data_type_cannot_hold_is_clipped(dtype: str, low: int, high: i
 
 
 def test_a_seed_gives_the_same_copies_and_each_differs():
-    """Another seed gives others; the sweeps themselves stay as they are."""
+    """Another seed gives other copies; the sweeps themselves do not change."""
     sweeps = easy(4)
     before = sweeps.samples.copy()
     once, again, other = (
@@ -83,7 +82,10 @@ def test_a_seed_gives_the_same_copies_and_each_differs():
 
 def test_copies_need_no_pytorch():
     """A fresh process that makes copies has not loaded it."""
-    code = "import sys, train.models.recipe.augment; print('torch' in sys.modules, 'scipy' in sys.modules)"
+    code = (
+        "import sys, train.models.recipe.augment; "
+        "print('torch' in sys.modules, 'scipy' in sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )

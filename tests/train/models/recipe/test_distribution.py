@@ -1,5 +1,5 @@
-"""The distribution of counts: its graph against the definition, what it cannot see, and how many
-features it may have."""
+"""The distribution of counts: its graph against the definition, offsets, and the number of
+features."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ ALONE = replace(FIXED, distribution=True)
 
 
 def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
-    """White noise [n, T, R, C] of raw counts, alike on all taxels: none is attenuated."""
+    """White noise [n, T, R, C] of raw counts, equal on all taxels, so that no taxel is
+    attenuated."""
     noise = np.random.default_rng(7).normal(100, 12, (n, format.window, *format.shape)).clip(0, 255)
     return noise.round().astype(format.dtype)
 
 
 def levels(format: SweepFormat) -> Levels:
-    """Fitted to twelve sweeps."""
+    """Levels fitted to twelve sweeps."""
     given = counts(format, 12)
     return distribution.fitted(given, texture_scale(given), np.random.default_rng(0))
 
@@ -49,7 +50,7 @@ def trunk(format: SweepFormat, some: Levels, int8: bool, prefixes: bool = False)
 
 
 def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
-    """Shares of frames above the levels, of counts about their mean and of differences."""
+    """Shares of frames above the levels, of counts minus their mean and of differences."""
     x = given.reshape(len(given), format.window, -1)[:, :, some.taxels] * texture_scale(
         counts(format, 12)
     )
@@ -64,8 +65,8 @@ def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
 
 @forms
 def test_the_graph_is_the_definition(format: SweepFormat):
-    """In both forms, but for a few frames about a level: bytes about their mean are rounded to
-    bytes again."""
+    """In both precisions, except for a few frames near a level: bytes minus their mean are rounded
+    to bytes again."""
     some, given = levels(format), counts(format)
     wanted = defined(format, some, given)
     for int8 in (False, True):
@@ -77,7 +78,7 @@ def test_the_graph_is_the_definition(format: SweepFormat):
 
 @forms
 def test_the_last_tenth_is_the_whole_window(format: SweepFormat):
-    """And the first depends on no later frame, where later ones repeat the newest."""
+    """The first tenth depends on no later frame, if later frames repeat the newest."""
     some, given = levels(format), counts(format)
     for int8 in (False, True):
         prefixes = run(trunk(format, some, int8, prefixes=True), given)
@@ -89,7 +90,7 @@ def test_the_last_tenth_is_the_whole_window(format: SweepFormat):
 
 
 def test_the_shares_of_training_sweeps_are_evenly_spaced():
-    """Levels are quantiles of what they were fitted to."""
+    """Levels are quantiles of the sweeps that they were fitted to."""
     format = FORMATS[3]
     some = levels(format)
     number = some.levels.shape[2]
@@ -100,7 +101,7 @@ def test_the_shares_of_training_sweeps_are_evenly_spaced():
 
 
 def test_an_offset_changes_nothing():
-    """Every taxel higher by as much: the same bits in int8, where counts are bytes."""
+    """An offset of all taxels changes no bit in int8 if counts are bytes."""
     format = FORMATS[3]
     given = counts(format).clip(0, 200)
     model = trunk(format, levels(format), True)
@@ -109,7 +110,7 @@ def test_an_offset_changes_nothing():
 
 @forms
 def test_the_features_have_a_limit(format: SweepFormat):
-    """More taxels have fewer levels each; of more than that random ones are looked at."""
+    """More taxels have fewer levels each; if there are still too many, random taxels are used."""
     some = levels(format)
     assert len(some) <= distribution.MOST_FEATURES
     assert distribution.FEWEST_LEVELS <= some.levels.shape[2] <= distribution.MOST_LEVELS
@@ -119,7 +120,7 @@ def test_the_features_have_a_limit(format: SweepFormat):
 
 @pytest.mark.parametrize("value", [7, 9])
 def test_a_silent_taxel_is_above_no_level(value: int):
-    """Whatever its constant count is, and although its mean is rounded."""
+    """This holds for any constant count, and although its mean is rounded."""
     format = FORMATS[0]
     given = counts(format, 12)
     given[:, :, 0, 0] = 7

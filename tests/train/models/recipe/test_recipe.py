@@ -1,5 +1,5 @@
-"""The default recipe: what it chooses, that its forms agree, that it needs no PyTorch, and what it
-cannot be fitted to."""
+"""The default recipe: its choice, agreement of its precisions, independence of PyTorch, and
+refusals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fitted() -> Fit:
 
 
 def test_an_easy_set_is_named_rightly(fitted: Fit):
-    """By heads that did not see the part; what was chosen is told."""
+    """The heads did not see the part; the description names the choice."""
     assert fitted.about["validation"]["accuracy"] > 0.9
     assert "filters" in fitted.about["chosen"] or "spectrum" in fitted.about["chosen"]
     assert len(fitted.train) + len(fitted.held) == len(easy())
@@ -58,7 +58,7 @@ def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
 
 
 def fitted_by_command(folder: Path, *options: str) -> Fit:
-    """What `palpate-train fit` makes of the easy set without stages."""
+    """The fit of the easy set by `palpate-train fit`, without stages."""
     easy().save(folder / "easy.npz")
     out = folder / "fit.npz"
     assert (
@@ -82,8 +82,8 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
 
 
 def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
-    """The command's option: all discriminants see copies, which else the held-out parts of the easy
-    set do not ask for."""
+    """With --reattached all discriminants see copies, which the held-out parts of the easy set
+    would not demand."""
     made = fitted_by_command(tmp_path, "--reattached")
     assert made.about["recipe"]["reattached"]
     assert all(part.copies for part in made.plan.parts)
@@ -92,13 +92,13 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
 
 @pytest.mark.slow
 def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
-    """The command's option is kept with the fit and told; then 60 Hz moves the spectrum as little
-    as 50 Hz that of the usual fit, which hears 60 Hz."""
+    """The fit keeps and reports --mains. Its spectrum then responds to 60 Hz as little as that of
+    the usual fit to 50 Hz, and the usual fit responds to 60 Hz."""
     sixty = fitted_by_command(tmp_path, "--mains", "60")
     assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
     assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
     sweeps, moved = sets.load("sim:T-LAB:1:2", 1), {}
-    # away from the ends of the range, since what is clipped has overtones
+    # away from the ends of the range, because clipped counts have overtones
     sweeps = replace(sweeps, samples=(sweeps.samples.clip(None, 200) + 40).astype(np.uint8))
     seconds = np.arange(sweeps.format.window)[:, None, None] / sweeps.rate_hz
     for mains_hz in (50, 60):
@@ -114,7 +114,7 @@ def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
 
 
 def test_int8_and_float_agree(fitted: Fit):
-    """Each with a head of its own."""
+    """Each precision has a head of its own."""
     forms = [
         with_head(
             fitted.trunk(int8), *(fitted.weights[f"{name}.{part}"] for part in ("weight", "bias"))
@@ -126,7 +126,7 @@ def test_int8_and_float_agree(fitted: Fit):
 
 
 def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
-    """The same answers, the same plan; a fit whose bank is missing is refused by name."""
+    """Answers and plan are the same; a fit without its bank is refused by name."""
     fitted.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
     assert again.plan == fitted.plan
@@ -143,7 +143,7 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
 
 
 def test_the_same_seed_gives_the_same_fit(fitted: Fit):
-    """And another one other filters. Where no stages can follow, the choice is the second part of
+    """Another seed gives other filters. If no stages can follow, the choice is the second part of
     two."""
     told: list[str] = []
     again, other = (recipe.fit(easy(), seed, CLOSED, told.append) for seed in (1, 2))
@@ -158,9 +158,9 @@ def test_the_same_seed_gives_the_same_fit(fitted: Fit):
 
 @pytest.mark.slow
 def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
-    """From LEAST_SWEEPS on, where filters leave something to mend: their features come first, with
-    a discriminant of their own; a fifth of the sweeps is held out from them, and their scale is
-    that of the filters."""
+    """Stages are trained from LEAST_SWEEPS on, if filters are not good enough. Their features come
+    first, with a discriminant of their own; a fifth of the sweeps is held out from them, and their
+    scale is that of the filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
         monkeypatch.setattr(recipe, name, value)
@@ -189,8 +189,8 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     monkeypatch: pytest.MonkeyPatch, better: bool
 ):
-    """For a skin that is put back: each stage then has a discriminant with the spectrum, and the
-    trunk holds no filters."""
+    """For a reattached skin each stage then has a discriminant with the spectrum, and the trunk
+    holds no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.HeldOutScores, "better", lambda *_: better)
@@ -215,9 +215,9 @@ def uncalibrated(given: object) -> NoReturn:
 
 @pytest.mark.slow
 def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The command, interrupted in its training: the next one begins after the last step that was
-    kept, and gives the same bits as one that was never interrupted. Another seed begins anew.
-    Nothing is left in the cache."""
+    """After an interruption of its training, the command continues after the last kept step and
+    gives the bits of an uninterrupted fit. Another seed begins anew, and nothing is left in the
+    cache."""
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
@@ -269,8 +269,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_filters_need_no_pytorch(tmp_path: Path):
-    """A process in which PyTorch cannot be imported fits and exports; the command says what it
-    chose."""
+    """A process that cannot import PyTorch fits and exports; the command prints its choice."""
     easy().save(tmp_path / "easy.npz")
     script = (
         "import sys\n"
@@ -311,8 +310,8 @@ def test_the_method_names_materials_that_it_never_saw_last():
 
 
 def test_groups_that_can_be_left_out_judge():
-    """Each group in parts, the first ones first; one that cuts recordings or counts trials does
-    not, and recordings do where there is none."""
+    """Each group comes in parts, the first parts first. A group that cuts recordings or counts
+    trials is left out, and recordings judge if no group is left."""
     n = 24
     labels, recording = np.arange(n) % 2, np.arange(n) // 2
     groups = {
@@ -344,7 +343,7 @@ def test_groups_that_can_be_left_out_judge():
 
 
 def test_what_cannot_be_fitted_is_named():
-    """A constant skin, and a window that is too short; nothing else is tried."""
+    """A constant skin and a window that is too short are refused at once."""
     still = replace(easy(), samples=np.full_like(easy().samples, 7))
     with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
         recipe.fit(still, 1, CLOSED)

@@ -1,5 +1,5 @@
-"""The spectrum against its definition, in PyTorch and in graphs: what it responds to, what it
-ignores, when there is one."""
+"""The spectrum against its definition, in PyTorch and in graphs: its response, its invariances, its
+limits."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from tests.factories.sweep_sets import easy
 from train.models.methods import Effort
 from train.models.recipe import graph, methods, spectrum, stages
 from train.models.recipe.architectures import ARCHITECTURES, Architecture
-from train.models.recipe.network import Compact
-from train.models.recipe.stages import FitRecipe
+from train.models.recipe.stages import Compact, FitRecipe
 from train.onnx_tools import graph_builder
 
 BARE = ARCHITECTURES["bands"]
@@ -39,12 +38,12 @@ FORMATS = {
     "shortest": (SweepFormat(2, 2, 100.0, 40, "uint8"), False),
     "three axes": (SweepFormat(3, 2, 750.0, 303, "int16", 3), True),
 }
-"""Forms, and whether the mains are taken away there."""
+"""Formats, and whether the hum of the mains is removed there."""
 
 
 def drawn(format: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: noise that all taxels feel, and some of their own; none is much
-    noisier than others."""
+    """Raw counts of n sweeps: noise that all taxels share, and some of their own; all are about
+    equally noisy."""
     rng = np.random.default_rng(seed)
     own = rng.standard_normal((n, format.window, *format.shape))
     x = 90 + 8 * rng.standard_normal((n, format.window, *(1,) * len(format.shape))) + 4 * own
@@ -54,22 +53,22 @@ def drawn(format: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
 def trunk(
     format: SweepFormat, scale: float = 0.1, prefixes: bool = False, mains_hz: float = 50.0
 ) -> onnx.ModelProto:
-    """The graph that gives nothing but the spectrum."""
+    """The graph of the spectrum alone."""
     return graph.trunk_graph(format, scale, {}, replace(BARE, mains_hz=mains_hz), prefixes=prefixes)
 
 
 def heard(
     format: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
 ) -> np.ndarray:
-    """What PyTorch's head sees where there is nothing but the spectrum."""
+    """The features that PyTorch's head sees of a network with only the spectrum."""
     with torch.no_grad():
         model = Compact(format, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
         return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
 
 def turned(x: np.ndarray) -> np.ndarray:
-    """What each series of [n, T, R * C * A] is multiplied with: more than three times the fifth of
-    sixteen is turned down."""
+    """The factor of each series of [n, T, R * C * A]: a series with more than three times the noise
+    of the fifth of sixteen is attenuated."""
     step = max(x.shape[1] // 150, 1)
     noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
     limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
@@ -79,11 +78,11 @@ def turned(x: np.ndarray) -> np.ndarray:
 def defined(
     format: SweepFormat, counts: np.ndarray, mains: bool, scale: float = 0.1, limited: bool = True
 ) -> np.ndarray:
-    """Log band powers [n, 10, bands] of the first tenth, two tenths ..., in complex128; those of
-    one axis after the other.
+    """Log band powers [n, 10, bands] of each prefix, in complex128; those of one axis after the
+    other.
 
-    Of each tenth of the taxels' mean what offset and mains fit best is taken away; Hann's window, a
-    transform at half bins, the mean of each band.
+    From each tenth of the mean of the taxels the best-fitting offset and mains are subtracted; then
+    Hann's window, a transform at half bins, and the mean of each band.
     """
     x, length = (
         counts.reshape(len(counts), format.window, -1).astype(np.float64),
@@ -106,8 +105,8 @@ def defined(
 
 @pytest.mark.parametrize(("format", "mains"), FORMATS.values(), ids=FORMATS)
 def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool):
-    """In PyTorch, in the graph, in the graph of tenths; the mains are taken away where a tenth
-    holds two periods."""
+    """This holds in PyTorch, in the graph, and in the graph of prefixes; the mains are removed if a
+    tenth holds two periods."""
     counts = drawn(format)
     want = defined(format, counts, mains)
     rows, whole = (
@@ -124,8 +123,8 @@ def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
-    """Behind the trunk's own features, in float and in int8; without the limit it would be
-    measured."""
+    """The bands come after the features of the stages, in float and in int8; without the limit a
+    noisy taxel would change them."""
     format = SweepFormat(4, 4, 750.0, 600, dtype)
     counts = drawn(format)
     counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
@@ -157,8 +156,8 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
 def test_the_hum_of_the_mains_changes_nothing(
     rate_hz: float, window: int, deaf: bool, mains_hz: float
 ):
-    """50 Hz of any phase and any strength on each taxel, where it can be separated; 60 Hz is
-    measured everywhere. Of a fit for 60 Hz the other way round."""
+    """50 Hz of any phase and strength on each taxel changes nothing if it can be separated; 60 Hz
+    changes the bands everywhere. In a fit for 60 Hz it is the reverse."""
     format = SweepFormat(2, 2, rate_hz, window, "float32")
     counts, rng = drawn(format), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
@@ -176,7 +175,8 @@ def test_the_hum_of_the_mains_changes_nothing(
 
 
 def test_a_fit_that_names_no_mains_is_as_before_it_could():
-    """50 Hz, in every bit of the graph; another frequency changes waves and nothing else."""
+    """Its graph is that of 50 Hz in every bit; another frequency changes the waves and nothing
+    else."""
     usual, fifty, sixty = (
         graph.trunk_graph(skin.FORMAT, 0.1, {}, shape, prefixes=True)
         for shape in (BARE, replace(BARE, mains_hz=50.0), replace(BARE, mains_hz=60.0))
@@ -192,8 +192,8 @@ def test_a_fit_that_names_no_mains_is_as_before_it_could():
 
 
 def test_later_frames_and_offsets_do_not_matter():
-    """Row d is of the first d + 1 tenths alone, to the bit; frames left over at the end are not
-    used; a skin that is loaded more has the same spectrum."""
+    """Row d depends on the first d + 1 tenths alone, to the bit. Frames left over at the end are
+    not used, and a constant load changes nothing."""
     counts = drawn(ODD)
     held, late = counts.copy(), counts.copy()
     held[:, 64:], late[:, 160:] = held[:, 63:64], 91
@@ -210,7 +210,7 @@ def test_later_frames_and_offsets_do_not_matter():
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_silence_is_finite(name: str):
-    """No power at all but what is added to each band, whatever the offset."""
+    """For any offset the power is only the constant that is added to each band."""
     format, _ = FORMATS[name]
     quiet = np.stack(
         [np.full((format.window, *format.shape), level, format.dtype) for level in (0, 90)]
@@ -224,8 +224,8 @@ def test_silence_is_finite(name: str):
 
 
 def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
-    """What the graph makes of a few numbers is one constant when it is loaded; the file stays below
-    10 kB for 180 kB."""
+    """The graph makes the waves from a few numbers, and they are one constant once it is loaded;
+    the file stays below 10 kB instead of 180 kB."""
     model = trunk(skin.FORMAT)
     assert len(model.SerializeToString()) < 10_000
     options = onnxruntime.SessionOptions()
@@ -243,8 +243,8 @@ def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
 
 
 def test_a_window_too_short_has_no_spectrum():
-    """Less than four frames a tenth: none is counted, a fit has none, and the size without
-    convolutions refuses with the reason."""
+    """With fewer than four frames in a tenth there are no bands, a fit has no spectrum, and the
+    size without convolutions refuses with the reason."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
     made = stages.fit_network(short, 1, FitRecipe(steps=2))

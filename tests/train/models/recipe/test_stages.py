@@ -21,8 +21,7 @@ from train.models.linear_head import closed_form_head
 from train.models.recipe import architectures, spectrum, stages
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT
 from train.models.recipe.fitted import Fit
-from train.models.recipe.network import Compact
-from train.models.recipe.stages import FitRecipe
+from train.models.recipe.stages import Compact, FitRecipe
 
 QUICK = FitRecipe(steps=40)
 
@@ -35,7 +34,7 @@ def fitted() -> Fit:
 
 @pytest.mark.slow
 def test_stages_follow_the_window():
-    """The kernels of the two windows that are known; every window gets a last stage, or a
+    """The kernels are as expected for the two known windows; every window gets a last stage, or a
     message."""
     assert [(s.kernel, s.stride) for s in DEFAULT.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
     assert [(s.kernel, s.stride) for s in DEFAULT.stages(128)] == [(4, 1), (5, 2), (5, 2)]
@@ -54,7 +53,7 @@ def test_stages_follow_the_window():
 
 @pytest.mark.parametrize(("size", "weights"), [("1k", 1_442), ("20k", 18_558)])
 def test_compact_is_as_small_as_it_says(size: str, weights: int):
-    """For the skin of the paper with six classes; what a shape costs is what its network holds."""
+    """For the skin of the paper with six classes, the stated cost is that of the network."""
     model = Compact(skin.FORMAT, 6, 1.0, norm=False, architecture=ARCHITECTURES[size])
     assert (
         sum(p.numel() for p in model.parameters())
@@ -70,8 +69,8 @@ def test_compact_is_as_small_as_it_says(size: str, weights: int):
 
 @pytest.mark.slow
 def test_compact_ignores_offsets():
-    """A constant on each taxel changes nothing: it is the offset, not the texture; by its kernels,
-    not by `prepare`."""
+    """A constant on each taxel changes nothing, because of the kernels and not because of
+    `prepare`."""
     model = Compact(skin.FORMAT, 6, 0.1, norm=False)
     rng = np.random.default_rng(0)
     counts = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
@@ -98,8 +97,8 @@ def test_fused_norms_change_nothing():
 
 
 def test_temperature_scaling_calibrates():
-    """Logits made five times too large are divided by five; a few right answers do not allow any
-    certainty."""
+    """Logits that are five times too large are divided by five; a few right answers do not allow
+    any certainty."""
     rng = np.random.default_rng(0)
     calibrated = 2 * rng.standard_normal((4000, 4))
     labels = np.array(
@@ -111,7 +110,7 @@ def test_temperature_scaling_calibrates():
 
 
 def test_a_head_of_two_classes_has_two_logits():
-    """scikit-learn gives one row there; the labels and their probabilities are the same."""
+    """scikit-learn gives one row then; the labels and their probabilities are the same."""
     rng = np.random.default_rng(0)
     labels = np.arange(200) % 2
     seen = rng.standard_normal((200, 5)) + labels[:, None] * np.array([2, 0, 0, 0, 0])
@@ -122,7 +121,7 @@ def test_a_head_of_two_classes_has_two_logits():
 
 @pytest.mark.slow
 def test_a_fit_learns_what_is_easy(fitted: Fit):
-    """Far above the third of chance on sweeps of another seed, with calibrated probabilities."""
+    """Its accuracy is far above chance on sweeps of another seed, with calibrated probabilities."""
     other = easy(seed=9)
     with torch.no_grad():
         p = torch.softmax(
@@ -136,8 +135,8 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
 
 @pytest.mark.slow
 def test_a_fit_is_its_seed_s_alone(fitted: Fit):
-    """The same bits again, whatever the state outside, which stays as it was; another seed gives
-    others."""
+    """It has the same bits for any random state outside, which does not change; another seed gives
+    other bits."""
     torch.manual_seed(99)
     before, threads = torch.get_rng_state(), torch.get_num_threads()
     again = stages.fit_network(easy(), 1, QUICK)
@@ -153,7 +152,7 @@ def test_a_fit_is_its_seed_s_alone(fitted: Fit):
 
 @pytest.mark.slow
 def test_positions_are_held_out_where_there_are_several():
-    """The figures of validation are of positions that training never saw."""
+    """The figures of validation are those of positions that training never saw."""
     s = easy()
     s.groups["position"] = np.arange(len(s)) % 5
     made = stages.fit_network(s, 1, replace(QUICK, steps=2))
@@ -164,7 +163,7 @@ def test_positions_are_held_out_where_there_are_several():
 
 @pytest.mark.slow
 def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
-    """Weights, sweeps and description come back; another file is refused by name."""
+    """Weights, sweeps and description are read again; another file is refused by name."""
     fitted.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
     assert (again.scale, again.about, again.train.materials) == (
@@ -184,7 +183,7 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
 
 
 def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
-    """No iteration, no cost; it distinguishes what is easy, and comes back from its file."""
+    """It has neither iterations nor a cost, learns an easy set, and can be read from its file."""
     made = stages.fit_network(easy(), 1, QUICK, architecture=ARCHITECTURES["bands"])
     assert (made.architecture, made.bands, made.cost) == (ARCHITECTURES["bands"], 5, [])
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
@@ -199,8 +198,8 @@ def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
 
 
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
-    """Weights that are not of the shape that the file names, and a file from before there were
-    shapes."""
+    """Weights that do not fit the architecture in the file are refused, and so is a file of an
+    older version."""
     replace(fitted, architecture=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
         FormatError,
@@ -220,8 +219,8 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
 )
 def test_fabrics_are_distinguished(tmp_path: Path):
-    """Real sweeps, seven fabrics, another skin: a short fit reaches nine of ten windows of
-    recordings it never saw."""
+    """On real sweeps of seven fabrics from another skin, a short fit names nine of ten windows of
+    unseen recordings rightly."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
     whole = sets.load(str(path)).select(["direction=0", "force<=180"])
     assert len(whole.materials) == 7
