@@ -4,9 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 SUDO = $$( [ `id -u` = 0 ] || echo sudo )
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+# Python compiles a module when it is first imported: compiling all of them here takes 30 s.
+INSTALL := $(PIP) install --no-compile
 RUNTIME := $(VENV)/runtime.done
 FLEET := $(VENV)/fleet.done
 DESKTOP := $(VENV)/desktop.done
+TOOLS := $(VENV)/tools.done
 SITE := $(VENV)/site.done
 NO_HOST = $(error name a box with HOST=user@box, or many with HOSTS=inventory.py)
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(NO_HOST)))
@@ -29,22 +32,22 @@ desktop: $(DESKTOP) ## install palpate, palpate-train and all that training need
 	@echo "palpate and palpate-train are in $(BIN): call $(BIN)/palpate-train,"
 	@echo "or first: source $(BIN)/activate"
 
-test: $(DESKTOP) ## run the tests, without those marked `thorough`
+test: $(TOOLS) ## run the tests, without those marked `thorough`
 	$(PYTEST) --dist worksteal -m "not thorough"
 
-test-fast: $(DESKTOP) ## run the tests that are neither `slow` nor `thorough`
+test-fast: $(TOOLS) ## run the tests that are neither `slow` nor `thorough`
 	$(PYTEST) --dist worksteal -m "not slow and not thorough"
 
 test-all: test ## run all tests; those on real sweeps need their folder in PALPATE_DATA
 	$(PYTEST) --dist loadfile -m thorough
 
-lint: $(DESKTOP) ## check style, imports between packages, and prose
+lint: $(TOOLS) ## check style, imports between packages, and prose
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.prose
 
-types: $(DESKTOP) ## check types: mypy --strict
+types: $(TOOLS) ## check types: mypy --strict
 	$(BIN)/mypy
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
@@ -85,29 +88,34 @@ $(RUNTIME): appliance/requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "installing python3-venv"; \
 	  $(SUDO) apt-get install -y -q python3-venv; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --require-hashes -r appliance/requirements.lock
-	$(PIP) install --no-deps -e .
+	$(INSTALL) --require-hashes -r appliance/requirements.lock
+	$(INSTALL) --no-deps -e .
 	@touch $@
 
 # The same with the tools that reach boxes.
 $(FLEET): $(RUNTIME)
-	$(PIP) install -e '.[deploy]'
+	$(INSTALL) -e '.[deploy]'
 	@touch $@
 
-# The same with the desktop's pinned tools: tests, training, export.
+# The same with training and export.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml
-	$(PIP) install -e '.[dev]' -e 'train[minirocket,dask]'
+	$(INSTALL) -e '.[page]' -e train
+	@touch $@
+
+# The same with tests, studies, and the tools that check the code.
+$(TOOLS): $(DESKTOP)
+	$(INSTALL) -e '.[dev]' -e 'train[studies,dask]'
 	@touch $@
 
 # The same with what builds the site.
-$(SITE): $(DESKTOP) pyproject.toml
-	$(PIP) install -e '.[site]'
+$(SITE): $(DESKTOP)
+	$(INSTALL) -e '.[site]'
 	@touch $@
 
 # ROS 2 with palpate_msgs, in a virtual environment of its own.
 MESSAGES := appliance/bridges/palpate_msgs
 build/ros/ready: $(wildcard $(MESSAGES)/* $(MESSAGES)/*/*) tests/robots/messages.py pyproject.toml \
-  | $(DESKTOP)
+  | $(RUNTIME)
 	@{ command -v cmake && command -v g++ && $(PYTHON) -c 'import pathlib, sysconfig, sys; \
 	  sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())'; } \
 	  >/dev/null || \

@@ -1,6 +1,15 @@
-"""Fixtures that several test files share: the default bundle, boxes on simulated devices."""
+"""Fixtures that several test files share: the default bundle, boxes on simulated devices.
+
+Numerical libraries use one thread in tests. Their models are small: with two threads a fit took 2.5
+times the processor time, and four times as long beside another test.
+"""
 
 from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy and PyTorch are imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -23,7 +32,8 @@ from tests.factories.simulated_box import OnSweep, Rigged
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser, for the tests of pages."""
+    """A browser, for the tests of pages. Not for the whole session: while it is open, asyncio.run
+    of another test would fail."""
     with browsers.launched() as one:
         yield one
 
