@@ -1,4 +1,4 @@
-"""How often a skin that has moved is marked. In: what contact_positions measured. Out: a picture,
+"""How often a skin that has moved is marked. In: what alignment measured. Out: a picture,
 SVG text."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the box answers where the skin has moved. In: what contact_positions measured. Out: tables
+"""What the box answers where the skin has moved. In: what alignment measured. Out: tables
 in Markdown.
 
 What it names by label alone stands beside what it answers, since the two are far apart where a skin

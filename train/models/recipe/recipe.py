@@ -180,8 +180,8 @@ class FixedFeatures:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """The chosen heads, and the scores that chose them."""
+class HeadChoice:
+    """The chosen heads, and the scores by which they were chosen."""
 
     scores: HeldOutScores
     chosen: ScoredPlan
@@ -225,17 +225,19 @@ def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     return Candidates(fixed.columns, setup.settings.choose and setup.settings.reattached)
 
 
-def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> Judged:
+def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
     """Step 3: the best candidate by held-out groups, with as few filters as suffice. Without a
     choice, one discriminant of all zero-sum filters."""
     scores = setup.scores(fixed.data, inner_parts(setup.sweeps))
     if not setup.settings.choose:
-        return Judged(scores, scores.score(heads.by_kind(shares=True)[:1]))
+        return HeadChoice(scores, scores.score(heads.by_kind(shares=True)[:1]))
     chosen = choice.choose(scores, heads, setup.part(2))
-    return Judged(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
+    return HeadChoice(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
 
 
-def with_stages(judged: Judged, fixed: FixedFeatures, setup: Setup) -> tuple[Trunk | None, Judged]:
+def with_stages(
+    judged: HeadChoice, fixed: FixedFeatures, setup: Setup
+) -> tuple[Trunk | None, HeadChoice]:
     """Step 4: trained stages and the heads beside them, if the heads without stages are not good
     enough; else None and these.
 
@@ -252,14 +254,14 @@ def with_stages(judged: Judged, fixed: FixedFeatures, setup: Setup) -> tuple[Tru
     )
     full = scores.score(_beside_stages(plan))
     if not setup.settings.choose:
-        return stages, Judged(scores, full)
+        return stages, HeadChoice(scores, full)
     if setup.settings.reattached:
         log("choosing: stages and the spectrum alone")
         lean = scores.score(_stages_alone(fixed.columns.bands))
         if not scores.better(full, lean):
-            return stages, Judged(scores, lean)
+            return stages, HeadChoice(scores, lean)
     filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
-    return stages, Judged(scores, fewer_filters(scores, full, filters, log))
+    return stages, HeadChoice(scores, fewer_filters(scores, full, filters, log))
 
 
 def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
@@ -283,7 +285,7 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
     return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
 
 
-def finish(trunk: Trunk, plan: HeadPlan, judged: Judged, setup: Setup) -> Fit:
+def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fit:
     """Step 6: heads of the float and the int8 trunk, calibration and contacts."""
     settings, classes, heads = setup.settings, len(setup.sweeps.materials), {}
     for name, int8 in (("head", False), ("int8", True)):

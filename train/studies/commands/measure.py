@@ -21,11 +21,12 @@ from train.data import sets
 from train.data.progress import Progress
 from train.evaluation import robustness, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
-from train.export import bundle_stress, contact_positions, quantized_bundle
+from train.export import bundle_stress, quantized_bundle
 from train.metrics import score
 from train.models import methods
 from train.reports import provenance
 from train.studies import (
+    alignment,
     contact_plot,
     contact_table,
     marked_text,
@@ -101,23 +102,23 @@ def _add_cnn_curve(add: Add) -> None:
 
 
 def _add_alignment(add: Add) -> None:
-    alignment = add("alignment", run_alignment)
-    alignment.add_argument(
+    command = add("alignment", run_alignment)
+    command.add_argument(
         "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
     )
-    alignment.add_argument(
+    command.add_argument(
         "--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on"
     )
-    alignment.add_argument(
+    command.add_argument(
         "--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places"
     )
-    alignment.add_argument(
+    command.add_argument(
         "--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead"
     )
-    alignment.add_argument(
+    command.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go"
     )
-    alignment.add_argument(
+    command.add_argument(
         "--draw",
         action="store_true",
         help="measure nothing: picture and tables of place.json in --out again",
@@ -308,9 +309,9 @@ def run_alignment(args: argparse.Namespace) -> None:
         )
     else:
         box = Classifier(bundle.load(args.bundle), SystemClock())
-        displacements = len(contact_positions.DIRECTIONS) * (2 * len(contact_positions.OFF_MM) + 1)
+        displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
         progress = Progress(displacements, options.Log())
-        result = contact_positions.measure(box, args.unseen, args.seen, args.hard, progress.begin)
+        result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
         put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     about = provenance.of(result)
     put(
@@ -327,7 +328,7 @@ def run_alignment(args: argparse.Namespace) -> None:
         ):
             text = marked_text.insert(text, name, content, str(page))
         put(page, provenance.in_markdown(text, about).encode())
-    print("\n".join(contact_positions.lines(result)))
+    print("\n".join(alignment.lines(result)))
 
 
 def run_references(args: argparse.Namespace) -> None:

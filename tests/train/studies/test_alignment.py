@@ -16,8 +16,7 @@ from appliance.inference.classifier import Classifier
 from appliance.signal.contact import ContactPositions
 from tests.factories.contacts import MIDDLE
 from tests.factories.paths import ROOT
-from train.export import contact_positions
-from train.studies import contact_plot, contact_table
+from train.studies import alignment, contact_plot, contact_table
 from train.studies.command import main as study
 
 
@@ -31,11 +30,11 @@ def model(default_bundle: Bundle) -> Bundle:
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     """A skin in place is not flagged, a skin that is a row forward always is; figures, picture and
     lines agree."""
-    monkeypatch.setattr(contact_positions, "OFF_MM", (8.0,))
+    monkeypatch.setattr(alignment, "OFF_MM", (8.0,))
     wide = replace(
         model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
     )
-    figures = contact_positions.measure(
+    figures = alignment.measure(
         Classifier(wide, SystemClock()),
         "sim:T-LAB:3:2",
         "sim:T-LAB:1:1",
@@ -58,7 +57,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         ] == pytest.approx(12, abs=0.01)
         assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
         assert point["network"][0] >= point["accuracy"][0]
-    text = "\n".join(contact_positions.lines(figures))
+    text = "\n".join(alignment.lines(figures))
     assert "rows +8.0 mm" in text
     assert "network alone" in text
     assert "marked" in contact_plot.draw(figures)
@@ -72,7 +71,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         in table.splitlines()[-1]
     )
     with pytest.raises(FormatError, match="no positions"):
-        contact_positions.measure(
+        alignment.measure(
             Classifier(
                 replace(wide, manifest=replace(wide.manifest, contact=None, displacement=None)),
                 SystemClock(),
