@@ -247,6 +247,7 @@ def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
     ]
 
 
+@pytest.mark.thorough  # 20 s of kills and power cuts
 def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
     shop: delivery.Shop, work: Path
 ):
@@ -259,6 +260,7 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
     assert wrong(points) == []
 
 
+@pytest.mark.thorough  # 20 s of kills and power cuts
 def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(
     shop: delivery.Shop, work: Path
 ):
@@ -270,6 +272,7 @@ def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_with
     assert wrong(points) == []
 
 
+@pytest.mark.thorough  # kills a box at every call that changes a file
 @pytest.mark.parametrize("name", ["delivery", "enrolment"])
 def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
     shop: delivery.Shop, work: Path, name: str

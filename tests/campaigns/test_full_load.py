@@ -196,6 +196,7 @@ def test_a_disk_fills_to_the_last_byte_and_goes(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts a file system")
 @pytest.mark.slow
+@pytest.mark.thorough  # a box with all its clients, for half a minute
 def test_one_skin_under_full_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both boxes at work with real processes, through each fault: recorded, compared and served,
     and each sentence accounted for."""

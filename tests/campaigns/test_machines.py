@@ -28,7 +28,7 @@ from train.models.recipe import stages
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # emulated processors
 
 EIGHT_BITS = "eight bits"
 INSIDE = ("default", "int16")

@@ -12,7 +12,7 @@ import pytest
 from tests.factories import nspawn
 from tests.factories.nspawn import SITE, STREAMS, WAIT_S, Machine, Service
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 

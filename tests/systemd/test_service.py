@@ -13,7 +13,7 @@ from tests.factories import nspawn
 from tests.factories.emulated_machines import ROOT
 from tests.factories.nspawn import CABLED, PALPATE, SIM, SITE, STREAMS, WAIT_S, Machine, Service
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 

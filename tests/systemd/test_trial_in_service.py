@@ -25,7 +25,7 @@ from appliance.bundle import bundle
 from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, Machine, Service
 from train.export.sign import sign
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 

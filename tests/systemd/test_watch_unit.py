@@ -12,7 +12,7 @@ from tests.factories import nspawn
 from tests.factories.install_scripts import run_here
 from tests.factories.nspawn import SITE, STREAMS, Machine, Service
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
 pytest_plugins = ["tests.factories.systemd_fixtures"]
 
