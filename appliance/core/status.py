@@ -1,4 +1,4 @@
-"""The outcomes of a sweep: a Status for each, with the reason if there is no label."""
+"""The outcomes of a sweep: a Status for each, with the reason why it has no label."""
 
 from __future__ import annotations
 

@@ -50,8 +50,8 @@ def check_binding(gpio: Any) -> None:
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
     """Map each name to (path of its chip, offset), searching all chips of this machine.
 
-    Raises LineError if a name is given twice, missing or ambiguous, if a chip may not be opened,
-    and if there is no chip.
+    Raises LineError if a name is given twice, missing or ambiguous, if a chip may not be opened, or
+    without any chip.
     """
     if len(set(names)) < len(names):
         raise LineError(
@@ -181,8 +181,8 @@ class Lines:
         return 1 << len(self._bits)
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Set READY, BUSY, FAULT and DECIDED, of which only changes are written. RESULT VALID falls
-        when BUSY rises."""
+        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when
+        BUSY rises."""
         if (ready, busy, fault, decided) == self._status:
             return
         if busy and not self._status[1]:

@@ -196,8 +196,8 @@ def unpack(data: bytes) -> Unpacked:
 
 
 def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
-    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if there is no
-    packet."""
+    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if no packet
+    begins there."""
     if len(data) - at < HEADER.size:
         return None, 0
     _, version, kind, length, flags, count, rows, cols, code, axes, seq, t_us = HEADER.unpack_from(

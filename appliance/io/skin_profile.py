@@ -28,7 +28,7 @@ FEW_FRAMES = 200
 20 mm/s a texture with ridges 0.4 mm apart, about the finest that feels rough to a hand. Materials
 with finer textures then differ only by stiffness and shape."""
 SLIDE_MM_S = 20
-"""Speed of sliding for which the warning gives the finest texture."""
+"""Speed of sliding at which the warning computes the finest texture."""
 NUMBERS = Literal["uint8", "int16", "uint16", "float32"]
 MARKS = ("sequence", "time", "checksum")
 """Abilities that a skin may lack."""

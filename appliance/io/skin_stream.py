@@ -252,9 +252,9 @@ class ArrivalWatch:
     """Decides from arrivals whether uncounted frames are missing, and measures the rate.
 
     While the host reads a backlog, frames come faster than the skin takes them, and their lateness
-    falls. If they come at an even pace and their lateness is constant, there is no backlog any
-    more, so frames are missing. pace: measured rate as a share of the expected rate, over several
-    steps of an even pace; 0 while unknown.
+    falls. If they come at an even pace and their lateness is constant, the backlog has been read,
+    so frames are missing. pace: measured rate as a share of the expected rate, over several steps
+    of an even pace; 0 while unknown.
     """
 
     def __init__(self, period_ns: float) -> None:

@@ -1,5 +1,5 @@
-"""The skin of a box by its settings: its profile, its sensor, and the format of its sweeps if there
-is no bundle yet."""
+"""The skin of a box by its settings: its profile, its sensor, and the format of its sweeps without
+a bundle."""
 
 from __future__ import annotations
 

@@ -280,7 +280,7 @@ class LinkSensor(ABC):
         self._quiet_ns = 0  # time spent reading since the last frame
         self._unheard = 0  # bytes since then
         self._opened_ns = 0
-        self._proof_ns = 0  # time for which frames must come before the skin counts as streaming
+        self._proof_ns = 0  # frames must come for this long before the skin counts as streaming
 
     @property
     def clock(self) -> dict[str, float] | None:
@@ -380,9 +380,9 @@ class LinkSensor(ABC):
             self._drop(self._no_frame(bytes_came=self._unheard > 0))
 
     def _drop(self, why: SensorError, proof_ns: int = 0) -> None:
-        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: time for
-        which it must then send frames before it counts as streaming; 0: its first frame is enough.
-        """
+        """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: the skin
+        then counts as streaming only after it has sent frames for this long; 0: with its first
+        frame."""
         self.close()
         self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000

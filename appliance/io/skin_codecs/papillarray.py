@@ -96,8 +96,8 @@ def _packets(data: bytes) -> tuple[list[Span], int]:
 
 
 def _end(data: bytes, begin: int) -> int:
-    """The end of the packet whose content begins at `begin`; 0 if more bytes are needed, -1 if
-    there is no packet."""
+    """The end of the packet whose content begins at `begin`; 0 if more bytes are needed, -1 if this
+    is not a packet."""
     tail = begin
     while (tail := data.find(_TAIL, tail)) >= 0 and tail - begin <= MOST_PACKET:
         if (

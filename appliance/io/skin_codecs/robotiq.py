@@ -53,7 +53,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
 
 
 def _tsf_end(data: bytes, at: int) -> int:
-    """The end of the packet at `at`; 0 if more bytes are needed, -1 if there is no packet."""
+    """The end of the packet at `at`; 0 if more bytes are needed, -1 if no packet begins there."""
     head = data[at : at + _TSF_HEADER]
     if not head.startswith(_TSF_START[: len(head)]):
         return -1

@@ -1,5 +1,5 @@
-"""One contract, many backends: the drivers' behaviour on the simulator, umockdev, the virtual box
-and a real board.
+"""The drivers fulfil one contract on many backends: the simulator, umockdev, the virtual box and a
+real readout board.
 
 PALPATE_BACKEND chooses one backend per process, the simulator by default (`backends`). Details of
 bus, chip and port, to the microsecond, are tested in virtual time by test_usb_sensor.py,
@@ -34,10 +34,10 @@ from tests.backends import Backend, Skin, mocks, remote, skins
 SECOND = 1_000_000_000
 LIMIT_S = 10
 SETTLE_S = 2.2
-"""Until the skin's clock is known well (DeviceClock), stamps may be set right by the delays of a
-busy machine."""
+"""Until the skin's clock is well known (DeviceClock), time stamps may shift by the delays of a busy
+machine."""
 RETRIED_S = 0.6
-"""A skin that was lost is looked for within this time."""
+"""A lost skin is searched for within this time."""
 Need = Callable[..., Backend]
 
 
@@ -53,7 +53,7 @@ def chosen() -> Iterator[Backend]:
 
 @pytest.fixture
 def need(chosen: Backend) -> Need:
-    """Returns the reset backend; skips a test that needs what this backend cannot do."""
+    """Returns the reset backend; skips a test whose needs it cannot meet."""
 
     def able(*wanted: str) -> Backend:
         if lacking := [what for what in wanted if what not in chosen.can]:
@@ -70,7 +70,7 @@ def now(u: Backend) -> int:
 
 
 def limit(u: Backend) -> int:
-    """The time at which a test gives up."""
+    """The time limit of a test."""
     return now(u) + round((LIMIT_S + u.slack_s) * SECOND)
 
 
@@ -138,14 +138,14 @@ class SensorReader:
 
 
 def check_content(u: Backend, frames: Frames) -> None:
-    """Each frame has the content that the skin gave this number."""
+    """Each frame has the content that belongs to its number."""
     if "numbered" in u.can:
         assert (frames.taxels == skins.counts(frames.seq, u.format)).all()
 
 
 def test_streams_without_a_gap(need: Need):
-    """Every frame once and in order, its time later than the one before and never in the future;
-    then the skin is released."""
+    """Every frame comes once and in order, its time later than that of the frame before and never
+    in the future. Then the skin is released."""
     u = need("skin")
     with SensorReader(u) as reader:
         reader.seconds(SETTLE_S)
@@ -158,16 +158,17 @@ def test_streams_without_a_gap(need: Need):
         check_content(u, frames)
         assert reader.sensor.counters.lost_frames == reader.sensor.counters.garbage_bytes == 0
         assert reader.sensor.identity
-        # an emulator may be too late with a first answer, so what matters is that it streamed
-        # unbroken once it did
+        # an emulator may be too late with its first reply, so only unbroken streaming after that is
+        # required
         assert reader.states[-1] == "streaming"
         assert reader.sensor.counters.enumerations == 1
-    with SensorReader(u) as reader:  # closing has let go of all that the first one held
+    with SensorReader(u) as reader:  # closing has released everything
         check_content(u, reader.frames(100))
 
 
 def test_absent_then_plugged(need: Need):
-    """No skin: state absent, the ids are named, no frames; it is used when it is plugged in."""
+    """No skin: state absent, a message with the ids, no frames. It is used when it is plugged
+    in."""
     u = need("plug")
     u.unplug()
     with SensorReader(u) as reader:
@@ -202,8 +203,8 @@ def test_unplugged_in_mid_read(need: Need):
 
 
 def test_driver_taken_and_given_back(need: Need):
-    """The skin fails as if it had gone, and is there again without having been plugged in: it
-    streams again each time, and nothing is left open."""
+    """The skin fails as if it had been unplugged, and is there again without a new plug: it streams
+    again each time, and nothing is left open."""
     u = need("unbind")
     with SensorReader(u) as reader:
         reader.frames(100)
@@ -220,7 +221,7 @@ def test_driver_taken_and_given_back(need: Need):
 
 
 def timers() -> int:
-    """Timers of the kernel that this process holds; a context of libusb has one."""
+    """Kernel timers of this process; a context of libusb has one."""
     return sum(
         os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]")
         for fd in os.listdir("/proc/self/fd")
@@ -228,8 +229,8 @@ def timers() -> int:
 
 
 def test_serial_number_chooses(need: Need):
-    """Only the skin with the configured serial number is used; for another the message says what
-    was found."""
+    """Only the skin with the configured serial number is used; for another number the message lists
+    the skins found."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
     with SensorReader(u, usb=f"{u.sensor.usb[:9]}:0043") as reader:
@@ -253,8 +254,8 @@ def test_serial_number_chooses(need: Need):
     ],
 )
 def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: str):
-    """A skin with another protocol or format is refused, naming both sides; a matching one is used
-    after it."""
+    """A skin with another protocol or format is refused with both sides named; a matching skin is
+    then used."""
     u = need("plug")
     u.plug(Skin(**change))
     with SensorReader(u) as reader:
@@ -270,7 +271,7 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     [("hold", "busy", 16, "another program"), ("deny", "denied", 13, "udev rule")],
 )
 def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code: int, hint: str):
-    """Held by another program, or not allowed: its own state, advice, and frames once that is
+    """Held by another program, or not allowed: a state of its own, advice, and frames once that is
     over."""
     u = need("skin", control)
     refuse = getattr(u, control)
@@ -288,7 +289,7 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
 
 
 def test_a_silent_skin_is_started_again(need: Need):
-    """A connected skin that sends nothing: silent after `silence_ms`, then it is started again
+    """A connected skin that sends nothing is silent after `silence_ms` and started again
     automatically."""
     u = need("silence")
     with SensorReader(u, silence_ms=300) as reader:
@@ -329,8 +330,8 @@ class Watcher:
         self._u = u
 
     def look(self) -> None:
-        """One call. The edges that it reports have held their level for `glitch_us`, and have the
-        time of the edge itself."""
+        """One call. Each reported edge has held its level for `glitch_us` and has the time of the
+        edge itself."""
         now_ns = now(self._u)
         for edge in self.trigger.edges(now_ns):
             if edge.kind is not EdgeKind.LOST:
@@ -445,7 +446,7 @@ def test_more_edges_than_the_kernel_keeps(need: Need):
 
 
 def test_lines_that_are_held(need: Need):
-    """A second holder is refused with errno 16; the lines are free again once the first has
+    """A second program is refused with errno 16; the lines are free again once the first has
     closed."""
     u = need("lines")
     with Watcher(u), pytest.raises(LineError, match=r"cannot request gpio lines .*errno 16"):
@@ -456,7 +457,7 @@ def test_lines_that_are_held(need: Need):
 
 
 def test_a_line_that_is_not_there(need: Need):
-    """A name that no chip has is refused, and so is one in two roles."""
+    """A name without a line is refused, and so is a line in two roles."""
     u = need("lines")
     with pytest.raises(LineError, match="no gpio line is named 'NO-SUCH-LINE'"):
         GpioTrigger(replace(u.trigger, start="NO-SUCH-LINE"), u.gpio)
@@ -508,7 +509,7 @@ def test_outputs(need: Need):
 
 
 def test_inputs_and_outputs_together(need: Need):
-    """The box holds both at once: driving outputs makes no edge, and edges move no output."""
+    """The box has both at once: driving outputs causes no edge, and edges change no output."""
     u = need("lines")
     with Watcher(u) as watcher, Lines(u.output, u.gpio, u.clock) as lines:
         lines.show(ready=True, busy=False, fault=False)
@@ -536,7 +537,7 @@ class Peer:
         self.heard += self._u.hear()
 
     def until(self, done: Callable[[], Any]) -> None:
-        """Turns until it is so."""
+        """Take turns until the condition is true."""
         until(self._u, lambda: (self.turn(), done())[1], 0.02)
 
 
@@ -571,8 +572,8 @@ def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
-    """Commands as a program and as a person sends them, cut anywhere; a wrong one says what is
-    wrong."""
+    """Commands as a program and as a person sends them, cut anywhere; a wrong command is answered
+    with its fault."""
     u = need("serial")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -595,7 +596,7 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
     def numbered(i: int) -> bytes:
         return sentence(
             "ANS", i, "x" * (i % 59)
-        )  # of many lengths: the line fills up within one, behind its number
+        )  # of many lengths, so that the line fills up within a sentence, after its number
 
     for i in range(total):
         began_ns = now(u)
@@ -614,15 +615,15 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
 
 @pytest.mark.slow
 def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
-    """Unplugged while open: the next sentence fails and `trouble` says so; plugged in again, it is
-    sent completely."""
+    """Unplugged while open: the next sentence fails and `trouble` gives the reason; plugged in
+    again, the sentence is sent completely."""
     u = need("serial", "pull")
     sink = sink_on(u)
     peer = Peer(u, sink)
     sink.say(sentence("ANS", 1))
     peer.until(lambda: peer.heard)
     u.pull()
-    sink.say(sentence("ANS", 2))  # a port that has gone reads as one on which nothing comes
+    sink.say(sentence("ANS", 2))  # reading from an unplugged port gives nothing, and no error
     until(u, lambda: (sink.commands(), sink.trouble)[1])
     assert u.serial.port in sink.trouble
     u.put()
@@ -685,7 +686,7 @@ def test_controls_over_a_wire():
     ],
 )
 def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
-    """If a backend is not available, one line says what to do."""
+    """If a backend is not available, one line gives the remedy."""
     if os.path.exists(there):
         pytest.skip(f"{there} is here")
     with pytest.raises(backends.BackendMissing, match=hint), backends.opened(name):

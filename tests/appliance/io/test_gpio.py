@@ -1,5 +1,5 @@
-"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms in; outputs
-in their order."""
+"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms of inputs;
+outputs in their order."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ class TriggerSetup:
             self.gpio.drive(name, level ^ i % 2, self.t0 + t_ns)
 
     def poll(self, t_ns: int) -> list[tuple[EdgeKind, int]]:
-        """The edges that one call at `t_ns` returns."""
+        """The edges from one call at `t_ns`."""
         self.clock.sleep_until(self.t0 + t_ns)
         return [
             (edge.kind, edge.t_ns - self.t0) for edge in self.trigger.edges(self.clock.now_ns())
         ]
 
     def run(self, until_ns: int, step_ns: int = MS) -> list[tuple[EdgeKind, int]]:
-        """The edges that calls at every step until `until_ns` return."""
+        """The edges from calls at every step until `until_ns`."""
         now_ns = self.clock.now_ns() - self.t0
         return [
             edge for t_ns in range(now_ns, until_ns + step_ns, step_ns) for edge in self.poll(t_ns)
@@ -175,7 +175,7 @@ def test_bias(active_low: bool, wanted: str) -> None:
 
 
 def test_active_low() -> None:
-    """With active_low and a pull-up a fall is START; the high level at rest is no edge."""
+    """With active_low and a pull-up a fall is START; the high level at rest is not an edge."""
     setup = TriggerSetup(mode="one-line", stop="", active_low=True)
     setup.drive("START", 10 * MS, 200 * MS, level=False)
     assert setup.run(300 * MS) == [(START, 10 * MS), (STOP, 200 * MS)]
@@ -221,7 +221,7 @@ def test_pulse_of_glitch_us() -> None:
 
 def test_level_seen_too_late() -> None:
     """The kernel may read the level too late: the same edge twice is one edge, and a return to the
-    level is none."""
+    level is not an edge."""
     setup = TriggerSetup()
     setup.queue((False, MS, 1), (False, MS + US, 2))
     assert setup.poll(3 * MS) == []
@@ -246,7 +246,7 @@ def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
 
 def test_interrupts_overtake() -> None:
     """An edge that the kernel's thread delivers late, but within `glitch_us`, is reported in order
-    and is no loss."""
+    and is not a loss."""
     setup = TriggerSetup()
     setup.drive("START", MS)
     setup.drive("STOP", MS + 5 * US)
@@ -262,8 +262,8 @@ def test_interrupts_overtake() -> None:
 
 
 def test_edges_that_the_kernel_joins() -> None:
-    """Two interrupts before their thread has run are one event with the level after both: no loss,
-    whether it is a glitch or not."""
+    """Two interrupts before their thread has run are one event with the level after both. This is
+    never a loss, whether it is a glitch or not."""
     setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
     reported = (
@@ -735,8 +735,8 @@ def test_not_wired() -> None:
 
 
 def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Closing takes READY and all else low by itself, as on a chip that keeps what was driven;
-    twice is fine."""
+    """Closing drives READY and all others low, as on a chip that keeps driven levels; closing twice
+    does no harm."""
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: OUTPUTS})
     monkeypatch.setattr(SimRequest, "release", lambda request: gpio.requests.remove(request))
@@ -755,8 +755,8 @@ def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """A chip that is gone cannot be taken low: LineError, and the other lines are given back all
-    the same."""
+    """A chip that is gone cannot be driven low: LineError, and the other lines are still
+    released."""
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     gpio.refuse[CHIP0] = 19

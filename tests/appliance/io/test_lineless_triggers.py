@@ -1,5 +1,5 @@
-"""Sweeps without lines: commands, the space bar of a real pseudo-terminal, the clock; and what each
-refuses."""
+"""Sweeps without GPIO lines: commands, the space bar of a real pseudo-terminal, the clock; and the
+settings that each refuses."""
 
 from __future__ import annotations
 
@@ -108,7 +108,8 @@ def test_commands_of_another_trigger_are_refused(rigged: Callable[..., Rigged]):
 
 
 def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
-    """Each press once, whatever else is typed; several in one read count each; a person is told."""
+    """Each press counts once, whatever else is typed, also if several come in one read; a message
+    confirms each."""
     far, near = terminal
     said: list[str] = []
     clock = rig.VirtualClock(7)
@@ -193,7 +194,7 @@ def test_standard_input_may_be_missing(monkeypatch: pytest.MonkeyPatch):
 def timed(
     every_s: float = 5.0, sweep_s: float = 3.0
 ) -> tuple[TimedTrigger, rig.VirtualClock, list[str]]:
-    """A trigger by the clock, the clock, and what it says."""
+    """A trigger by the clock, the clock, and its messages."""
     said: list[str] = []
     clock = rig.VirtualClock(0)
     return (
@@ -276,7 +277,7 @@ def test_a_sweep_must_leave_a_pause():
 
 
 def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
-    """The whole box: windows are cut in the middle of what the clock started and stopped."""
+    """The whole box: windows are cut from the middle of timed sweeps."""
     off = np.zeros((60 * 750, 4, 4), np.uint8)
     simulated = devices.build(
         skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim"

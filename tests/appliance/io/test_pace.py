@@ -1,8 +1,7 @@
-"""Comparison of a board's clock with its frame count, and faults that end by themselves. In virtual
-time.
+"""Comparison of the device clock with the frame count, and faults that end by themselves. In
+virtual time.
 
-In: a board whose packets are altered on the cable. Out: states, and no frame whose host time is
-wrong.
+Packets are altered on the cable; no frame may get a wrong host time.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> tuple[
 
 
 def late_ms(frames: Frames, simulated: SimDevices) -> np.ndarray:
-    """Delay in ms [n] of each frame's time stamp after the time at which the board took it."""
+    """Delay in ms [n] of each frame's time stamp after the time at which the frame was taken."""
     taken_ns = [
         simulated.backend.board.frame_ns(int(seq) & ((1 << EPOCH_BITS) - 1)) for seq in frames.seq
     ]
@@ -89,8 +88,8 @@ def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
     ],
 )
 def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames: int):
-    """If the board's clock disagrees with its count: mismatch, no frame gets a wrong time, and it
-    streams again afterwards."""
+    """If the device clock disagrees with the count: mismatch, no frame gets a wrong time, and the
+    skin streams again afterwards."""
     simulated = idle_devices(packet_frames=packet_frames)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 3)
@@ -107,8 +106,8 @@ def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
-    """A count that jumps ahead while the clock does not is no loss of frames: mismatch, and the
-    board is restarted."""
+    """A count that jumps ahead while the clock does not is not a loss of frames: mismatch, and the
+    readout board is restarted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -146,8 +145,8 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
 def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
-    """A board that stamps late by up to 4 ms and in whole milliseconds, so that time seems to stand
-    or go back: no refusal."""
+    """Time stamps that are late by up to 4 ms and in whole milliseconds, so that time seems to
+    stand or go back, are accepted."""
     rng = np.random.default_rng(8)
     format = SweepFormat(4, 4, rate_hz, 1500, "uint8")
     simulated = idle_devices(60, format, packet_frames=packet_frames)
@@ -163,7 +162,7 @@ def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
 
 
 def test_a_stalled_endpoint_is_cleared():
-    """errno 32 is not for ever: the endpoint is cleared, and the board streams again without being
+    """errno 32 ends: the endpoint is cleared, and the readout board streams again without being
     replugged."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
@@ -180,8 +179,8 @@ def test_a_stalled_endpoint_is_cleared():
     [(b"", "lost"), (b"\x05\x03a\0b", "absent"), (b"\x06\x03\x00\xd8\x00\xd8", "mismatch")],
 )
 def test_a_serial_number_that_is_no_text(string: bytes, state: str):
-    """Where the serial number chooses the board and is no text: a state that says so, not the end
-    of the program."""
+    """A serial number that is not text, where it chooses the skin: a state with the reason, and the
+    program goes on."""
     simulated = idle_devices()
     backend, control = simulated.backend, simulated.backend.ctrl_transfer
 
@@ -238,8 +237,8 @@ def test_windows_over_many_offsets(ppm: float):
 
 
 def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
-    """Pauses of the box, between reads and within one, are no silence; half a second of listening
-    in vain is."""
+    """Pauses of the box, between reads and within a read, are not silence; half a second without
+    bytes is."""
     simulated = idle_devices(fifo_frames=6000)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)

@@ -48,8 +48,8 @@ def test_bytes_are_the_documents_table():
     ("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))]
 )
 def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
-    """The byte after the data type is the number of axes, and 0 means one, in which form the box
-    writes it, too."""
+    """The byte after the data type is the number of axes. 0 means one axis, and the box writes one
+    axis as 0."""
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 0, 1, *shape[:2], 0, byte, 5, 7)
     by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
@@ -61,7 +61,7 @@ def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
 
 @pytest.mark.parametrize(("byte", "size"), [(9, 9), (3, 8), (255, 255)])
 def test_axes_that_cannot_be(byte: int, size: int):
-    """More than eight axes, or another number than the payload holds: the bytes are garbage."""
+    """More than eight axes, or another number than in the payload: the bytes are garbage."""
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, size, 0, 1, 1, 1, 0, byte, 5, 7)
     data = head + bytes(size) + struct.pack("<I", zlib.crc32(head + bytes(size)))
     got = wire.unpack(data)
@@ -167,8 +167,8 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(0, 2**32 - 1))
 def test_follow_accounts_for_every_frame(order: list[int], first: int):
-    """For any order of packets: numbers rise, and fresh + lost frames span exactly what was
-    seen."""
+    """For any order of packets: numbers rise, and fresh plus lost frames cover the whole range of
+    numbers."""
     packets = [
         wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8))
         for k in order
@@ -191,8 +191,8 @@ def test_follow_wraps():
 
 
 def test_follow_takes_a_count_far_back_as_restart():
-    """A board that begins again at 0 starts a new epoch: nothing is lost, and nothing looks
-    adjacent."""
+    """A readout board that begins again at 0 starts a new epoch: nothing is lost, and no frames
+    look adjacent."""
     packets = wire.unpack(stream(1, first=900_000)[0] + stream(1, first=0)[0]).packets
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     assert [s for s, _ in fresh] == [900_000, 1 << EPOCH_BITS]
@@ -237,7 +237,7 @@ def test_identity_and_format_survive():
     ],
 )
 def test_broken_replies_are_named(call, value, hint):
-    """A reply that is too short or has an unknown data type is a FormatError that says so."""
+    """A reply that is too short or has an unknown data type is a FormatError with the reason."""
     with pytest.raises(FormatError, match=hint):
         call(value)
 

@@ -51,7 +51,8 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
 
 
 def test_result_is_the_documents_example():
-    """The RES sentence in PROTOCOL.md is what the code sends, with the correct checksum."""
+    """The RES sentence in PROTOCOL.md is the one that the code writes, with the correct
+    checksum."""
     line = result(verdict(), "usb").decode().strip()
     assert f"`{line[:-2]}hh`" in PROTOCOL
 
@@ -119,8 +120,8 @@ def test_commands_are_read(line: bytes, want: Command):
     ],
 )
 def test_bad_commands_are_answered(line: bytes, hint: str):
-    """A wrong checksum, an unknown command, another protocol, noise: an error that says what to
-    send."""
+    """A wrong checksum, an unknown command, another protocol, noise: an error with the right
+    command."""
     (command,), rest = parse(line + b"\n")
     assert hint in command.error
     assert rest == b""
@@ -128,8 +129,8 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
 
 @pytest.mark.parametrize("line", [b"ID", b"help", b"$PPLP,MATERIAL", b"$PPLP,ID,now", b"\xff"])
 def test_the_example_of_an_error_can_be_copied(line: bytes):
-    """Whatever was typed, what the ANS sentence says to send is understood: nothing of it was lost
-    to NMEA's characters."""
+    """The command that an ANS error suggests is understood when it is sent, whatever was typed
+    before. No part of it is lost to NMEA's reserved characters."""
     ((bad,), _) = parse(line + b"\r\n")
     heard = sentence("ANS", bad.name, "error", bad.error).decode("ascii")
     example = re.search(r"(?:send for example|send it as) ([^,*]+)", heard)[1]
@@ -183,8 +184,8 @@ def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
 
 
 def test_a_port_that_goes_away_while_open():
-    """The other end closes (an adapter is pulled): `trouble` says so, nothing is raised, the next
-    port is opened."""
+    """The other end closes (an adapter is pulled): `trouble` gives the reason, nothing is raised,
+    the next port is opened."""
     clock = rig.VirtualClock()
     with pseudo_terminal.pair() as (_, name):
         sink = sink_on(name, clock)

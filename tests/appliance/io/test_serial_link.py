@@ -45,20 +45,20 @@ FAST = {"link": "serial", "retry_ms": 20, "timeout_ms": 50}
 
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
-    """(the skin's end, path of the box's end) of a line."""
+    """Two ends of a serial line: the skin's end, and the path of the box's end."""
     with pseudo_terminal.pair() as pair:
         yield pair
 
 
 @pytest.fixture
 def board() -> Iterator[SerialBoard]:
-    """A board that numbers its frames, not yet plugged in."""
+    """A readout board that numbers its frames, not yet plugged in."""
     with ExitStack() as stack:
         yield SerialBoard(skins.board(Skin(), CLOCK), stack)
 
 
 def sensor_on(board: SerialBoard, format: SweepFormat = FMT, **settings) -> UsbSensor:
-    """The driver on the board's port."""
+    """The driver on the readout board's port."""
     return UsbSensor(SkinConfig(port=str(board.path), **FAST | settings), format, CLOCK)
 
 
@@ -88,8 +88,8 @@ def test_streams_and_stops(board: SerialBoard):
 
 
 def test_unplugged_and_replugged(board: SerialBoard):
-    """Pulled while frames come: lost, then absent; back under the same name: a new epoch, content
-    right."""
+    """Pulled while frames come: lost, then absent; back under the same name: a new epoch with the
+    right content."""
     board.plug()
     with closing(sensor_on(board)) as sensor:
         first = read_until(sensor, lambda n: n > 100)
@@ -108,8 +108,8 @@ def test_unplugged_and_replugged(board: SerialBoard):
 
 
 def test_another_format_is_a_mismatch(board: SerialBoard):
-    """A board of another grid is refused with both forms; it is asked again, and taken once it
-    fits."""
+    """A readout board with another grid is refused with both formats named; it is asked again, and
+    used once it fits."""
     board.board = skins.board(Skin(rows=3), CLOCK)
     board.plug()
     with closing(sensor_on(board)) as sensor:
@@ -122,7 +122,7 @@ def test_another_format_is_a_mismatch(board: SerialBoard):
 
 
 def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
-    """Frames that an earlier program left running come before the reply: they are left out."""
+    """Frames that an earlier program left running come before the reply and are left out."""
     far, path = line
     who = packets.Identity(1, (1, 2, 3), "board", "7")
     stream = packets.pack(0, 0, np.zeros((6, 4, 4), np.uint8))
@@ -143,7 +143,7 @@ def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     [(b"", "sends nothing"), (b"hello", "sends 5 other bytes"), (bytes(20_000), "other bytes but")],
 )
 def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
-    """A port with something else on it, or nothing: given up after half a second or too many
+    """Another device at the port, or none: the attempt ends after half a second or too many
     bytes."""
     far, path = line
     with closing(SerialLink(path, 115200, CLOCK)) as link:
@@ -160,7 +160,7 @@ def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
 
 
 def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str]):
-    """Bytes of an earlier time are thrown away: they would be taken for new ones."""
+    """Bytes from before are discarded, since they would be taken for new frames."""
     far, path = line
     os.write(far, b"old")
     with closing(SerialLink(path, 115200, CLOCK)) as link:
@@ -169,8 +169,8 @@ def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str])
 
 
 def test_read_and_write(line: tuple[int, str]):
-    """All bytes values pass both ways unchanged; no byte within the timeout is b""; a longer text
-    is cut at `size`."""
+    """All byte values pass both ways unchanged; no byte within the timeout is b""; a longer text is
+    cut at `size`."""
     far, path = line
     with closing(SerialLink(path, 2_000_000, CLOCK)) as link:
         assert link.read(10, 1) == b""
@@ -185,8 +185,7 @@ def test_read_and_write(line: tuple[int, str]):
 def test_the_pause_after_a_read(
     line: tuple[int, str], held: int, pause_ns: int, monkeypatch: pytest.MonkeyPatch
 ):
-    """The fuller the port was, the sooner it is read again: a stream that a short pause has piled
-    up is caught up with."""
+    """The fuller the port was, the sooner it is read again, so that a backlog is caught up with."""
     far, path = line
     clock = VirtualClock()
     with closing(SerialLink(path, 2_000_000, clock)) as link:
@@ -199,7 +198,7 @@ def test_the_pause_after_a_read(
 
 
 def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
-    """A skin that does not read its requests is lost, not waited for without end."""
+    """A skin that does not read its requests is lost; the box does not wait for it without end."""
     monkeypatch.setattr(serial_link, "REPLY_MS", 10)
     with (
         closing(SerialLink(line[1], 115200, CLOCK)) as link,
@@ -220,8 +219,8 @@ def test_a_port_that_another_program_holds(line: tuple[int, str]):
 
 
 def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
-    """While it is open another program gets errno 11, after it not; closing does not drop DTR,
-    which restarts many boards."""
+    """Another program gets errno 11 while the port is open, but not after it. Closing does not drop
+    DTR, which restarts many readout boards."""
     link = SerialLink(line[1], 115200, CLOCK)
     with open(line[1], "rb", buffering=0) as other:
         with pytest.raises(BlockingIOError):

@@ -1,5 +1,5 @@
-"""The bytes of each skin, put together by hand from published layouts: what they hold, and what is
-no frame."""
+"""The bytes of each skin, put together by hand from published layouts: frames, and bytes that are
+not frames."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SMALL = SkinProfile(about="a", source="s", codec="fixed", marker=b"\xaa\x55", ro
 
 
 def decoded(p: SkinProfile, data: bytes) -> Decoded:
-    """All of it at once."""
+    """All bytes decoded at once."""
     return codec(p)(Rest(), data)
 
 
 def test_a_matrix_byte_by_byte():
-    """AA 55 and six bytes, three times: two frames, since the third has no mark behind it yet."""
+    """AA 55 and six bytes, three times: two frames, since no mark follows the third yet."""
     frame = bytes.fromhex("aa55 010203040506")
     found = decoded(SMALL, frame * 3)
     assert found.taxels.tolist() == [[[1, 2, 3], [4, 5, 6]]] * 2
@@ -35,7 +35,7 @@ def test_a_matrix_byte_by_byte():
 
 def test_anyskin_byte_by_byte():
     """Five times (t, x, y, z), CR LF: 82 bytes. The temperature is left out, z is last. The first
-    frame has no mark before it, so it is not taken."""
+    frame has no mark before it and is not used."""
     values = [25.0, 1.0, 2.0, 3.0] * 4 + [25.0, 7.0, 8.0, 9.5]
     frame = struct.pack("<20f", *values) + b"\r\n"
     assert len(frame) == 82
@@ -47,8 +47,8 @@ def test_anyskin_byte_by_byte():
 
 
 def test_reskin_and_vitac_lines():
-    """Decimal text with tabs or blanks; lines of rows that a shorter one ends; a row that its type
-    cannot hold is none."""
+    """Decimal text with tabs or blanks; rows on lines that a shorter line ends; a number outside
+    the range of its type makes the row invalid."""
     found = decoded(profile("reskin"), b"25.0\t1\t-2.5\t3e2\t" * 4 + b"25,1,2,3\r\n" + b"1 2 3\n")
     assert found.taxels[0, 0, 0].tolist() == [1, -2.5, 300]
     assert (len(found), found.garbage) == (1, 6)
@@ -64,14 +64,14 @@ def test_reskin_and_vitac_lines():
     "word", [b"1_0", b"0x10", b"1.5", b"+-1", b"", b"nan", b"99999999999999999999", b"-1"]
 )
 def test_a_word_that_is_no_whole_number(word: bytes):
-    """A text of whole numbers takes no other word."""
+    """A text of whole numbers contains no other word."""
     p = replace(profile("3d-vitac"), rows=1, cols=2)
     assert len(decoded(p, b"1 2 \n\n1 " + word + b"\n\n")) == 1
 
 
 def test_papillarray_byte_by_byte():
-    """One sensor of nine pillars: forces, counter and microseconds of its clock; a wrong sum, and
-    bytes of 0 that the sum does not see, are no frame."""
+    """One sensor of nine pillars: forces, count and microseconds of its clock. A packet with a
+    wrong sum, or with additional zero bytes, which the sum does not detect, is not a frame."""
     p = profile("papillarray")
     data = wire("papillarray", 5)
     found = decoded(p, data)
@@ -84,7 +84,7 @@ def test_papillarray_byte_by_byte():
 
 
 def test_papillarray_with_a_tail_inside():
-    """AA BB CC DD among the numbers ends nothing: the sum does not fit there."""
+    """AA BB CC DD among the numbers does not end the packet, since the sum does not fit there."""
     p = profile("papillarray")
     grid = np.zeros((3, 3, 6), np.float32)
     grid[1, 1, 2] = struct.unpack("<f", b"\xaa\xbb\xcc\xdd")[0]
@@ -95,19 +95,21 @@ def test_papillarray_with_a_tail_inside():
 
 
 def test_papillarray_of_changing_form():
-    """Packets of one length whose pillars are elsewhere are read by their own tables, and one that
-    is no packet is left out; what is read at once is what is read one by one."""
+    """Packets of the same length with other offsets of pillars are read by their own tables, and
+    invalid packets are left out. The result is the same whether packets come at once or one by one.
+    """
     p = replace(profile("papillarray"), rows=6)
     grids = [np.arange(108, dtype=np.float32).reshape(6, 3, 6) + i for i in range(5)]
     data = [papillarray(grid, i, sensors=2 if i % 2 else 1) for i, grid in enumerate(grids)]
-    data[2] += bytes(len(data[1]) - len(data[2]))  # garbage; then all are equally far apart
+    # garbage, after which all packets are equally far apart
+    data[2] += bytes(len(data[1]) - len(data[2]))
     alike = papillarray(grids[0], 7, sensors=2)
     other = bytearray(alike)
     at = other.index(b"\x02\x00", 40)
     other[at], other[at + 2] = (
         3,
         (other[at + 2] - 1) % 256,
-    )  # numbers of another type, and the same sum
+    )  # numbers of another type with the same sum
     stream = [*data, alike, bytes(other), alike]
     found = decoded(p, b"".join(stream))
     single = [decoded(p, packet).taxels for packet in stream]
@@ -118,7 +120,8 @@ def test_papillarray_of_changing_form():
 
 
 def test_papillarray_of_two_sensors():
-    """Two sensors are 6x3, one below the other; a profile of 3x3 says that this is another skin."""
+    """Two sensors are 6x3, one below the other; with a profile of 3x3 the error says that this is
+    another skin."""
     grid = np.arange(108, dtype=np.float32).reshape(6, 3, 6)
     data = papillarray(grid, 1, sensors=2)
     found = decoded(replace(profile("papillarray"), rows=6), data)
@@ -128,8 +131,9 @@ def test_papillarray_of_two_sensors():
 
 
 def test_xela_byte_by_byte():
-    """t 710 8 and eight bytes: X Y Z big-endian in bytes 1 to 6. Answers of the adapter are no
-    garbage; a first byte of X from FA on is no value, and a frame that lacks a taxel none."""
+    """t 710 8 and eight bytes: X Y Z big-endian in bytes 1 to 6. Answers of the adapter are not
+    garbage. A first byte of X from FA on marks a missing value, and a frame without a taxel is
+    invalid."""
     p = replace(profile("xela-can"), rows=1, cols=2)
     lines = [b"t7108001234567800FF00\r", b"t71180000010002000300\r"]
     found = decoded(p, b"\r\az\r" + b"".join(lines) + b"z\r")
@@ -143,8 +147,8 @@ def test_xela_byte_by_byte():
 
 
 def test_robotiq_byte_by_byte():
-    """The grids of two fingers in one packet or in two, big-endian; other fields are passed over;
-    the last packet waits for the next."""
+    """The grids of two fingers in one packet or in two, big-endian; other fields are ignored; the
+    last packet waits for the next."""
     p = profile("robotiq-tsf")
     fingers = [
         bytes([0x10 | k << 2]) + struct.pack(">28H", *range(1000 * k, 1000 * k + 28))
@@ -173,7 +177,7 @@ def test_robotiq_byte_by_byte():
     ],
 )
 def test_orientation(orientation: tuple[str, ...], wanted: list[list[int]]):
-    """Turns in their order; the format has the shape of what comes out."""
+    """Turns in their order; the format has the shape of the result."""
     p = replace(SMALL, orientation=orientation)
     got = arranged(p, np.arange(1, 7, dtype=np.uint8)[None])
     assert got[0].tolist() == wanted
@@ -243,8 +247,8 @@ def test_what_is_left_over_stays_small(name: str):
 
 @pytest.mark.parametrize("name", ["matrix", "flexitac", "anyskin"])
 def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Frames full of marks have no beginning that can be told. They are passed over whole, not byte
-    by byte, which would cost more time than they take to come: so many places are looked at."""
+    """Frames full of marks have no recognizable beginning. They are skipped as a whole and not byte
+    by byte, which would take longer than their arrival: the number of tried positions shows it."""
     p, looked = profile(name), []
     begins = fixed._begins
     monkeypatch.setattr(fixed, "_begins", lambda *args: looked.append(1) or begins(*args))

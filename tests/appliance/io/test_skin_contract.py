@@ -1,5 +1,5 @@
-"""One contract for all skins on a serial port: whatever is done to the wire, frames are those that
-were sent, at the times at which they were taken, or it is said why not. In virtual time."""
+"""One contract for all skins on a serial port: whatever happens to the wire, frames have the sent
+content and the time at which they were taken, or the state gives a reason. In virtual time."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_split_anywhere(name: str):
 
 @each
 def test_unplugged_and_replugged(name: str):
-    """Pulled: lost, then absent; back: a new epoch, frames right."""
+    """Pulled: lost, then absent; back: a new epoch with the right frames."""
     skin = WiredSkin(name)
     first = skin.seconds(2)
     skin.port.gone = True
@@ -123,8 +123,8 @@ def test_absent_is_found_by_its_ids(name: str):
 
 @each
 def test_silence(name: str):
-    """A skin that stops sending: silent after the time that is set, opened again, and it streams
-    when it sends."""
+    """A skin that stops sending is silent after the set time and opened again; it streams when it
+    sends."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.port.silent = True
@@ -151,7 +151,7 @@ def test_silent_from_the_start(name: str):
 
 @each
 def test_held_by_another_program(name: str):
-    """A port that another program has: busy, and used once it is free."""
+    """A port held by another program: busy, and used once it is free."""
     skin = WiredSkin(name)
     skin.port.busy = True
     skin.seconds(0.3)
@@ -163,8 +163,8 @@ def test_held_by_another_program(name: str):
 
 @each
 def test_garbage(name: str):
-    """One frame in twenty is damaged, cut or doubled on the cable: all others are right, the times
-    too, and the damage is counted."""
+    """One frame in twenty is damaged, cut or doubled on the cable: all others have the right
+    content and time, and the damage is counted."""
     skin = WiredSkin(name)
     rng = np.random.default_rng(3)
 
@@ -183,14 +183,14 @@ def test_garbage(name: str):
     assert skin.sensor.state == "streaming"
     late = skin.late_ms(frames)  # fails for a frame that was never sent
     assert len(frames) > 0.6 * 10 * skin.format.rate_hz
-    # a damaged frame more or less shows in the times only once it is certain
+    # one damaged frame more or less shows in the times only once it is certain
     assert np.mean(np.abs(late) < max(5, 1.6e3 / skin.format.rate_hz)) > 0.9
 
 
 @each
 def test_wrong_skin(name: str):
-    """Bytes of another skin: no frame, a mismatch that stays, and the message says what was heard
-    and what to do."""
+    """Bytes of another skin: no frame, never streaming, a mismatch that stays, and a message with
+    the remedy."""
     other = "3d-vitac" if name != "3d-vitac" else "flexitac"
     skin = WiredSkin(name)
     skin.port.frames = lambda i: wire(other, i)
@@ -232,7 +232,7 @@ def test_wrong_rate(name: str, rate: float):
         figure = float(seen[0].split("sends ")[1].split(" frames")[0])
         assert figure == pytest.approx(rate * skin.format.rate_hz, rel=0.05)
         assert "skin.rate_hz" in seen[0]
-    skin.port.period_ns = skin.format.period_ns  # somebody corrects it
+    skin.port.period_ns = skin.format.period_ns  # the rate is corrected
     skin.port.begun_ns = skin.clock.now_ns() - round(skin.port._next * skin.port.period_ns)
     skin.port.frames = lambda i: wire(name, i, skin.port.period_ns)
     skin.seconds(14)
@@ -270,7 +270,7 @@ def _change_rate(skin: WiredSkin, rate: float) -> None:
 @pytest.mark.parametrize("pause_s", [0.2, 1.0, 3.0])
 def test_a_backlog_after_a_pause(name: str, pause_s: float):
     """Nobody reads for a while and the driver keeps all: each frame comes with the time at which it
-    was taken, none as new."""
+    was taken."""
     skin = WiredSkin(name)
     skin.seconds(5)
     skin.clock.sleep_until(skin.clock.now_ns() + round(pause_s * 1e9))
@@ -285,8 +285,8 @@ def test_a_backlog_after_a_pause(name: str, pause_s: float):
 
 @each
 def test_a_driver_that_throws_away(name: str):
-    """Two seconds without a read, and the driver keeps 0.4 s: what is lost is counted, numbers of
-    before and after are never adjacent, and no frame has a wrong time."""
+    """Two seconds without a read, and the driver keeps 0.4 s: lost frames are counted, numbers
+    before and after the gap are never adjacent, and no frame has a wrong time."""
     skin = WiredSkin(name)
     before = skin.seconds(5)
     skin.port.capacity = round(0.4 * skin.format.rate_hz) * len(wire(name, 0)) + 11
@@ -323,8 +323,8 @@ def test_back_pressure(name: str):
 
 @each
 def test_commands(name: str):
-    """What the profile says is written at the start and at the end, and nothing else; a tare only
-    where it is set."""
+    """Only the commands of the profile are written at the start and at the end; a tare only if it
+    is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.sensor.close()
@@ -346,8 +346,8 @@ def test_tare():
 
 @pytest.mark.parametrize("name", ["flexitac", "matrix", "anyskin"])
 def test_a_mark_in_the_payload(name: str):
-    """The mark stands among the numbers, at rest in every frame at the same place: no frame is
-    taken from the wrong place, and once the number changes frames come."""
+    """The mark occurs among the numbers, in every frame at the same place while the skin is at
+    rest: no frame is cut at the wrong place, and once the number changes frames come."""
     skin = WiredSkin(name)
     mark = skin.profile.trailer + skin.profile.marker
     resting = bytearray(wire(name, 0))
@@ -375,8 +375,8 @@ def test_a_mark_in_the_payload(name: str):
 
 @pytest.mark.parametrize("name", ["flexitac", "anyskin"])
 def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
-    """A stream that is in step stays so while its numbers hold marks; a lost byte in such a time
-    invents no frame."""
+    """A synchronized stream stays so while its numbers contain marks; a byte lost meanwhile invents
+    no frame."""
     skin = WiredSkin(name)
     skin.seconds(2)
     mark = skin.profile.trailer + skin.profile.marker
@@ -400,7 +400,7 @@ def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
 
 
 def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
-    """A name by id is a link; who the skin is does not depend on how its port was named."""
+    """A name by id is a link; the identity of the skin does not depend on the name of its port."""
     link = tmp_path / "usb-skin-S1"
     link.symlink_to(PATH)
     for port in (PATH, str(link)):
@@ -411,7 +411,7 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
 
 
 def test_a_sequence_number_shows_each_loss():
-    """A home-made matrix with a count: loss is known, and each missing frame is a gap in the
+    """A self-made matrix with a frame count: loss is known, and each missing frame is a gap in the
     numbers."""
     skin = WiredSkin("matrix")
     p = replace(skin.profile, sequence="uint8")

@@ -1,4 +1,4 @@
-"""The factory: which sensor a profile gets, the form of its sweeps, and a real terminal with an
+"""The factory: the sensor for each profile, the format of its sweeps, and a real terminal with an
 emulated skin."""
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from tests.factories.skin_wires import NAMES, profile, taxels, wire
 
 
 def settings(*sets: str) -> Config:
-    """The delivered settings with these."""
+    """The delivered settings with these changes."""
     return config.load(None, sets, site=NO_SITE)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_profile_has_its_sensor_and_form(name: str):
-    """Skins of other protocols are read from a serial port; the form is the profile's, without
-    asking anything."""
+    """Skins of other protocols are read from a serial port; the format is the profile's, without
+    asking the skin."""
     simulated = idle_devices()
     chosen = settings(f"skin.profile={name}")
     assert skins.announced(chosen, simulated) == profile(name).format
@@ -44,7 +44,7 @@ def test_each_profile_has_its_sensor_and_form(name: str):
 
 
 def test_the_protocol_has_the_old_sensor():
-    """palpate is read as before, and its board is asked for the form."""
+    """The profile `palpate` is read as before, and its readout board is asked for the format."""
     simulated = idle_devices()
     chosen = simulated.wire(settings("skin.profile=flexitac", "skin.grid=3x3"))
     assert isinstance(skins.sensor(chosen, skin.FORMAT, simulated), UsbSensor)
@@ -52,7 +52,7 @@ def test_the_protocol_has_the_old_sensor():
 
 
 def test_a_rate_that_can_be_set_is_that_of_the_bundle():
-    """A bundle for 250 Hz sets a skin that can do that; another rate is not promised."""
+    """A bundle for 250 Hz sets a skin that has this rate; other rates are refused."""
     simulated, chosen = idle_devices(), settings("skin.profile=papillarray")
     wanted = SweepFormat(3, 3, 250, 500, "float32", 3)
     assert skins.announced(chosen, simulated, wanted) == wanted
@@ -60,8 +60,8 @@ def test_a_rate_that_can_be_set_is_that_of_the_bundle():
 
 
 def test_a_form_that_a_person_describes():
-    """The examples of the error are understood, with a window of two seconds; what is none is
-    refused with them."""
+    """The examples of the error are understood, with a window of two seconds; a wrong description
+    is refused with them."""
     assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
     assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
     with pytest.raises(
@@ -73,7 +73,7 @@ def test_a_form_that_a_person_describes():
 
 
 def test_a_wrong_profile_is_named():
-    """Nothing is guessed."""
+    """The profile is not guessed."""
     with pytest.raises(ConfigError, match="did you mean flexitac"):
         skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 

@@ -1,5 +1,4 @@
-"""Skin profiles: every way a file can be wrong, what the settings change, and the delivered ones as
-they are shipped."""
+"""Skin profiles: all faults of a file, the changes by settings, and the delivered profiles."""
 
 from __future__ import annotations
 
@@ -69,7 +68,7 @@ def written(tmp_path: Path, text: str) -> Path:
     ],
 )
 def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
-    """Each mistake names the file, the key with its value, and what is allowed."""
+    """Each mistake names the file, the key with its value, and the allowed values."""
     with pytest.raises(ConfigError) as e:
         load("own", [written(tmp_path, text)])
     assert str(tmp_path / "own.toml") in str(e.value)
@@ -78,8 +77,8 @@ def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
 
 
 def test_names(tmp_path: Path):
-    """A misspelt name, a name that leads out of the folder, none at all; the first folder wins;
-    palpate needs no file; a file is named by its ending."""
+    """A misspelt name, a name that leads out of the folder, an empty name. The first folder has
+    priority; palpate needs no file; a name with the ending .toml is a file."""
     folder = written(tmp_path, GOOD)
     with pytest.raises(
         ConfigError, match=r"skin\.profile = 'oven' has no profile in .*did you mean own"
@@ -100,7 +99,7 @@ def test_names(tmp_path: Path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_delivered(name: str):
-    """Each says what it is and where that is from, claims no measurement, and survives JSON."""
+    """Each describes itself and its source, claims no measurement, and survives JSON."""
     p = profile(name)
     assert p.about
     assert p.source
@@ -110,7 +109,7 @@ def test_delivered(name: str):
 
 
 def test_the_template_explains_each_key():
-    """matrix.toml holds or names every key."""
+    """matrix.toml contains or mentions every key."""
     text = (FOLDER / "matrix.toml").read_text()
     assert [
         key for key in skin_profile._KEYS if not re.search(rf"^#?{key} = ", text, re.MULTILINE)
@@ -181,14 +180,14 @@ def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepForma
     ],
 )
 def test_settings_that_do_not_fit(name: str, settings: dict, hint: str):
-    """The setting is named with what is allowed."""
+    """The error names the setting and the allowed values."""
     with pytest.raises(ConfigError) as e:
         adapted(profile(name), SkinConfig(**settings))
     assert hint in str(e.value)
 
 
 def test_grid_is_not_for_the_protocol():
-    """A board of PROTOCOL.md says itself what it sends."""
+    """A readout board of PROTOCOL.md announces its grid itself."""
     for settings in ({"grid": "4x4"}, {"rate_hz": 100.0}):
         with pytest.raises(ConfigError, match="speaks PROTOCOL"):
             adapted(SkinProfile(), SkinConfig(**settings))
@@ -211,7 +210,7 @@ def test_slow_skins_are_warned_of():
 
 
 def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """`/etc/palpate/skins` goes before what is delivered."""
+    """`/etc/palpate/skins` has priority over the delivered profiles."""
     monkeypatch.setattr(skins, "OWN", written(tmp_path, GOOD))
     settings = config.load(None, ["skin.profile=own", "skin.grid=2x3"], site=NO_SITE)
     assert settings.folder == ROOT / "firmware_config"
@@ -224,7 +223,7 @@ def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     )
 )
 def test_any_value_of_any_key_is_taken_or_refused(value: object):
-    """No value of a file ends in anything but a profile or a ConfigError."""
+    """Any value in a file gives a profile or a ConfigError."""
     for key in skin_profile._KEYS:
         with contextlib.suppress(ConfigError):
             assert from_json(

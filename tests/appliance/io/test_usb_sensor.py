@@ -35,14 +35,14 @@ def read_for(sensor: UsbSensor, simulated: SimDevices, seconds: float) -> Frames
 
 
 def check_content(frames: Frames) -> None:
-    """Each frame has the content that the board gave this number."""
+    """Each frame has the content that belongs to its number."""
     for seq, taxels in zip(frames.seq[::37], frames.taxels[::37], strict=True):
         frame = int(seq) & ((1 << EPOCH_BITS) - 1)
         assert (taxels == numbered(1, first=frame % 97)[0]).all()
 
 
 def test_a_board_that_does_not_know_dtr_is_read(monkeypatch: pytest.MonkeyPatch):
-    """It stalls SET_CONTROL_LINE_STATE, and streams all the same."""
+    """It stalls SET_CONTROL_LINE_STATE, and streams nevertheless."""
     simulated = idle_devices(acm=True)
     right = simulated.backend.ctrl_transfer
 
@@ -58,7 +58,7 @@ def test_a_board_that_does_not_know_dtr_is_read(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
-    """A healthy board, vendor class or CDC-ACM: every frame in order, its time correct to a
+    """A healthy readout board, vendor class or CDC-ACM: every frame in order, its time correct to a
     millisecond."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
@@ -77,7 +77,7 @@ def test_streams_without_loss(acm: bool):
 
 
 def test_acm_takes_the_board_from_the_kernel():
-    """cdc_acm holds a laboratory board at first; it is detached."""
+    """cdc_acm has the device at first, and is detached."""
     simulated = idle_devices(acm=True)
     assert simulated.backend.kernel_driver
     read_for(sensor_on(simulated), simulated, 0.1)
@@ -124,7 +124,7 @@ def test_failures_have_their_state_and_end(call: str, code: int, state: str, hin
 
 @pytest.mark.parametrize("code", [errno.EACCES, errno.EIO])
 def test_serial_number_that_cannot_be_read(code: int):
-    """A board whose descriptors may not be read is denied or failing, not absent."""
+    """A skin whose descriptors may not be read is denied or failing, not absent."""
     simulated = idle_devices()
     simulated.backend.errors["control"] = code
     sensor = sensor_on(simulated, usb="1209:7ac7:SIM0001")
@@ -134,8 +134,8 @@ def test_serial_number_that_cannot_be_read(code: int):
 
 
 def test_unplug_and_replug_in_mid_read():
-    """errno 19 while reading; back again: a new epoch, numbers never look adjacent, content is
-    right."""
+    """errno 19 while reading; back again: a new epoch, numbers never look adjacent, and the content
+    is right."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     now = simulated.clock.now_ns()
@@ -214,7 +214,7 @@ def test_a_board_that_answers_and_sends_no_frame(acm: bool):
 
 
 def test_overflow_loses_one_transfer():
-    """A transfer larger than asked for is lost, counted, and seen in the numbers; streaming goes
+    """A transfer larger than requested is lost, counted, and seen in the numbers; streaming goes
     on."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
@@ -241,8 +241,8 @@ def test_garbage_on_the_cable():
 
 
 def test_a_host_that_pauses_too_long():
-    """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, the
-    board says so."""
+    """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, and
+    the flag OVERFLOW is counted."""
     simulated = idle_devices(fifo_frames=188)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -282,8 +282,8 @@ def test_a_board_that_does_not_fit(change: dict, hint: str):
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_a_skin_with_three_axes(acm: bool):
-    """All axes of every frame arrive in their places; a box for one axis refuses the board, and the
-    other way round."""
+    """All axes of every frame arrive at their indices. A box for one axis refuses this skin, and
+    the other way round."""
     pillars = SweepFormat(3, 3, 1000.0, 2000, "float32", 3)
     simulated = idle_devices(format=pillars, acm=acm)
     sensor = sensor_on(simulated, pillars)
@@ -298,7 +298,7 @@ def test_a_skin_with_three_axes(acm: bool):
 
 
 def test_frames_with_other_axes_than_announced():
-    """A board that announces one axis and sends three: mismatch, naming both."""
+    """A skin that announces one axis and sends three: mismatch, naming both."""
     simulated = idle_devices(format=replace(FMT, axes=3))
     simulated.backend.board.skin = replace(simulated.backend.board.skin, axes=1)
     sensor = sensor_on(simulated)
@@ -317,7 +317,7 @@ def test_a_board_that_answers_nonsense(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_frames_of_another_form_than_announced():
-    """A board that announces 4x4 and sends 2x2 is a mismatch, and its frames are not taken."""
+    """A skin that announces 4x4 and sends 2x2 is a mismatch, and its frames are not used."""
     simulated = idle_devices()
     simulated.backend.mangle = lambda data: packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
     sensor = sensor_on(simulated)
@@ -329,7 +329,7 @@ def test_frames_of_another_form_than_announced():
 
 
 def test_no_fitting_interface():
-    """A CDC-ACM board where a vendor device is configured: the message names the setting."""
+    """A CDC-ACM device where a vendor device is configured: the message names the setting."""
     simulated = idle_devices(acm=True)
     sensor = UsbSensor(SkinConfig(link="vendor"), FMT, simulated.clock, simulated.backend)
     read_for(sensor, simulated, 0.3)
@@ -338,7 +338,8 @@ def test_no_fitting_interface():
 
 
 def test_acm_board_that_never_answers():
-    """A CDC-ACM board that ignores requests: no hang, a state, and another try."""
+    """A CDC-ACM device that ignores requests: the box does not hang, has a state, and tries
+    again."""
     simulated = idle_devices(acm=True)
     simulated.backend.board.request = lambda request: b""
     sensor = sensor_on(simulated)
@@ -348,7 +349,7 @@ def test_acm_board_that_never_answers():
 
 
 def test_acm_board_that_answers_a_byte_at_a_time():
-    """A reply that never becomes complete is given up after half a second, even if bytes still
+    """A reply that never becomes complete is abandoned after half a second, even if bytes still
     come."""
     simulated = idle_devices(acm=True)
     sensor = sensor_on(simulated)
