@@ -1,4 +1,4 @@
-"""What the client makes of the box's sentences, from the box's code that writes them."""
+"""The client's view of the box's sentences, written by the code of the box."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_an_answer_survives_its_sentence(status: Status):
 
 
 def test_a_field_more_is_the_loss_that_cannot_be_seen():
-    """RES with field 14 says so; without it loss is known."""
+    """RES with field 14: the loss is unknown; without it the loss is known."""
     lines = [
         result(verdict(Status.OK), "usb", loss_known=known).decode() for known in (True, False)
     ]
@@ -54,8 +54,8 @@ def test_a_field_more_is_the_loss_that_cannot_be_seen():
 
 @pytest.mark.parametrize("status", list(Status))
 def test_each_status_is_one_kind(status: Status):
-    """A status is known, unsure, faulty, or final without a label to use; and each says what to
-    do."""
+    """A status is known, unsure, faulty, or final without a label to use, and each has its
+    advice."""
     answer = Answer.read(result(verdict(status), "usb").decode())
     final = status in (Status.UNDECIDED, Status.UNKNOWN, Status.RECORDED)
     assert [answer.known, answer.unsure, answer.faulty, final].count(True) == 1
@@ -63,7 +63,7 @@ def test_each_status_is_one_kind(status: Status):
 
 
 def test_the_detail_stands_with_the_advice():
-    """What the box adds is not lost."""
+    """The detail of the box is kept."""
     answer = Answer.read(result(verdict(Status.STUCK_TAXEL, "taxel 2.3"), "usb").decode())
     assert answer.what_to_do == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
 

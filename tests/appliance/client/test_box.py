@@ -58,7 +58,7 @@ def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
 
 
 def test_a_command_is_asked_in_one_text_or_in_several(box: Palpate):
-    """As it stands in a sentence, or each field by itself: the box answers under its first word."""
+    """As it stands in a sentence, or each field by itself: the box answers with the first word."""
     assert box.ask("LABEL,1") == box.ask("LABEL", "1")
     assert box.ask("LABEL,1")[:2] == ["1", LABELS[0]]
 
@@ -78,7 +78,7 @@ def test_an_answer_waits_until_it_is_asked_for(speaking: SpeakingBox, box: Palpa
 
 
 def test_an_old_answer_is_not_taken_for_a_new_one(speaking: SpeakingBox, box: Palpate):
-    """An answer to a sweep that was given up is forgotten by `wait_ready` and by `start`."""
+    """A late answer to an abandoned sweep is dropped by `wait_ready` and by `start`."""
     for forget in (lambda: box.wait_ready(LONG_S), box.start):
         speaking.say(result(8, label="paper"))
         box.state()  # its answer comes after that
@@ -123,7 +123,8 @@ def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpat
 
 
 def test_a_sentence_from_a_newer_box_is_told(speaking: SpeakingBox, box: Palpate):
-    """A status that this client does not know is no answer; waiting says why."""
+    """A status that this client does not know is not an answer; a waiting call raises with the
+    reason."""
     speaking.say(result(1, "sideways"))
     box.state()
     with pytest.raises(NoAnswer, match="'sideways' is not a valid Status"):
@@ -131,7 +132,7 @@ def test_a_sentence_from_a_newer_box_is_told(speaking: SpeakingBox, box: Palpate
 
 
 def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate):
-    """What the box says; also for a command that was damaged on its way there."""
+    """The box's reason is raised, also for a command that was damaged on its way."""
     speaking.script = lambda s: [
         sentence("ANS", s.kind, "error", "sweeps are triggered otherwise; set trigger.mode")
     ]
@@ -145,7 +146,7 @@ def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate):
 
 
 def test_an_answer_to_another_command_is_left_alone(speaking: SpeakingBox, box: Palpate):
-    """The late answer to a command that was given up is not taken for that of the next."""
+    """The late answer to an abandoned command is not taken for that to the next command."""
     speaking.script = lambda s: [sentence("ANS", "TARE", "error", "late"), *obeying(s)]
     assert box.state().skin == "streaming"
 
@@ -212,7 +213,7 @@ def waiting(job: Callable[[], object]) -> tuple[threading.Thread, list[Appliance
 def test_unplugging_ends_every_wait(
     speaking: SpeakingBox, box: Palpate, job: Callable[[Palpate], object]
 ):
-    """What was asked is answered with an error at once, and after plugging in the same client goes
+    """A pending command ends with an error at once, and after plugging in the same client goes
     on."""
     speaking.script = lambda s: [] if s.kind == "TEST" else obeying(s)
     thread, errors = waiting(lambda: job(box))
@@ -284,7 +285,7 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking: SpeakingBox, box: P
     for number in range(1, KEPT + 3):
         speaking.say(result(number))
         if number % 16 == 0:
-            box.state()  # the line holds some kilobytes
+            box.state()  # the line can hold some kilobytes
     box.state()
     assert box.result(LONG_S).sweep == 3
     assert box.missed == 2
@@ -313,7 +314,7 @@ def test_commands_of_several_threads_do_not_mix(speaking: SpeakingBox, box: Palp
 
 
 def eventually(there: Callable[[], bool]) -> None:
-    """Wait for something that another thread does; fails where it never comes."""
+    """Wait for an event of another thread; fails if it never comes."""
     for _ in range(3000):
         if there():
             return
@@ -332,7 +333,7 @@ class ShiftedClock(SystemClock):
     ahead_ns = 0
 
     def now_ns(self) -> int:
-        """Real time and what was added."""
+        """Real time plus an added time."""
         return super().now_ns() + self.ahead_ns
 
 
@@ -377,8 +378,8 @@ def test_the_client_needs_pyserial_alone():
 
 
 def test_what_is_no_sentence_of_ours_is_counted(box: Palpate, speaking: SpeakingBox):
-    """REC of `palpate record` and kinds of later versions are passed over; their form is right, so
-    they are no damage."""
+    """REC of `palpate record` and kinds of later versions are skipped; they are valid sentences, so
+    they do not count as damage."""
     speaking.say(sentence("REC", 7, "stored", 5), sentence("NEW", 1), result(1))
     assert box.result(LONG_S).sweep == 1
     assert box.damaged == 0

@@ -25,7 +25,7 @@ HELLO = b'{"type": "hello", "schema": 1}\n'
 
 
 class FakeFeed:
-    """A box that sends what a test says."""
+    """A box that sends the lines of a test."""
 
     def __init__(self, path: Path) -> None:
         path.unlink(missing_ok=True)
@@ -79,7 +79,7 @@ def test_lines_come_whole_however_they_are_split():
     ],
 )
 def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
-    """An error in `parse`; for who reads, a reason, and the connection is closed."""
+    """`parse` raises; a Feed closes the connection and gives the reason."""
     with pytest.raises(FormatError, match=why.split(";")[0]):
         parse(data)
     server = FakeFeed(feed.path)
@@ -95,7 +95,7 @@ def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
 
 @pytest.mark.slow
 def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
-    """Each new connection begins with what this reader wants."""
+    """Each new connection begins with the requests of this reader."""
     server = FakeFeed(feed.path)
     feed.ask(frames_hz=5)
     with server.meet(feed, HELLO) as connection:
@@ -114,8 +114,8 @@ def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
 
 @pytest.mark.slow
 def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
-    """No socket, and one that nobody serves: no error but a reason; a loop over lines ends with
-    it."""
+    """No socket, or a socket without a server: a reason and not an error; a loop over lines ends
+    with it."""
     assert feed.read(0) is None
     assert (
         "no palpate offers its feed there: the box is off or restarting; start it" in feed.trouble
@@ -149,8 +149,7 @@ def test_it_is_not_closed_by_silence_and_waits_as_long_as_it_should(feed: Feed):
 
 
 def test_the_reason_of_the_box_is_kept(tmp_path: Path):
-    """A request that is none: what the box said before it closed stands in `trouble`, and is a line
-    of its own."""
+    """An invalid request: the box's reason is in `trouble`, and is a line of its own."""
     offered = Offered(tmp_path / "feed.sock")
     offered.turns()
     with Feed(offered.path, frames_hz=50) as feed:
@@ -216,7 +215,7 @@ def running(path: Path) -> Iterator[subprocess.Popen]:
 @pytest.mark.slow
 def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
     """One reader over two processes: hello again with another pid, though the first left its socket
-    behind; the second ends in order, says so, and removes it."""
+    behind. The second ends in order, sends its reason, and removes the socket."""
     path = tmp_path / "feed.sock"
     pids = []
     with Feed(path, frames_hz=5, sweeps=True) as feed:
@@ -230,7 +229,7 @@ def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
                         assert line["labels"]
                     if {wait, "frame"} <= set(seen):
                         break
-                begin = seen.index("hello")  # before it stands what the first box said last
+                begin = seen.index("hello")  # the last lines of the first box come before it
                 assert seen[begin : begin + 2] == ["hello", "health"]
                 if wait == "health":
                     process.send_signal(signal.SIGTERM)

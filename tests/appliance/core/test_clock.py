@@ -93,8 +93,8 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm: float):
 @pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
 def test_no_line_is_kept_for_ever(ppm: float):
-    """A board beyond the bound whose first packets all came late: the error is that of the last 20
-    s and stops growing."""
+    """A device clock beyond the bound whose first packets all came late: the error is that of the
+    last 20 s and stops growing."""
     rng, clock, arrival_ns, error_ms = np.random.default_rng(0), DeviceClock(), 0, []
     for true_ns in range(0, 150_000_000_000, 16_000_000):
         late_ns = 20e6 if true_ns < 5e9 else 1e6

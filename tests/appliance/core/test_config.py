@@ -1,5 +1,4 @@
-"""Settings: layers and their sources, every way a file can be wrong, and the board files as wiring
-plans."""
+"""Settings: layers and their sources, all faults of a file, and the board files as wiring plans."""
 
 from __future__ import annotations
 
@@ -186,8 +185,8 @@ def test_set_takes_toml_or_a_bare_string(
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
 def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> None:
-    """By option and by site file; no name leads out of the folder, and a value that is no name is
-    an error."""
+    """By option and by site file; no name leads out of the folder, and an invalid name is an
+    error."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
     with pytest.raises(ConfigError, match=r"palpate\.toml: board = .*boards there: a, b$"):
         _load(folder)
@@ -219,7 +218,7 @@ def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
 
 
 def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
-    """A named site file that is missing, a folder in its place, and bytes that are no UTF-8."""
+    """A named site file that is missing, a folder at its path, and bytes that are not UTF-8."""
     with pytest.raises(ConfigError, match=r"other\.toml: no such file"):
         config.load(None, folder=folder, site=folder / "other.toml")
     with pytest.raises(ConfigError, match="cannot be read: is a directory"):
@@ -333,8 +332,8 @@ def _page(board: str) -> str:
 
 
 def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
-    """What the comment of a board file draws: {pin: name}, {role: name}, a role with its arrow as
-    seen from the box."""
+    """The drawing in the comment of a board file: {pin: name}, {role: name}, a role with its arrow
+    as seen from the box."""
     rows = re.findall(
         r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
         r"]+))?$",
@@ -388,8 +387,8 @@ def test_one_cable_fits_both_boards() -> None:
 
 
 def test_rules_and_unit_agree_with_the_settings() -> None:
-    """The udev rules carry the sensor's ids, and the unit's groups are those that sysusers makes
-    and the rules use."""
+    """The udev rules have the skin's ids, and the unit's groups are those that sysusers makes and
+    the rules use."""
     skin = config.SkinConfig()
     rules = (FIRMWARE / "70-palpate.rules").read_text()
     assert (

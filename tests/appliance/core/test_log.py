@@ -22,8 +22,8 @@ def line(text: str, level: int = logging.INFO, *, journal: bool) -> str:
 
 
 def test_priorities_are_for_the_journal_alone():
-    """A terminal shows who speaks and no priority; the journal knows the former and wants the
-    latter."""
+    """A terminal shows the program's name and no priority; the journal knows the name and needs the
+    priority."""
     assert line("skin: gone", logging.WARNING, journal=True) == "<4>skin: gone"
     assert line("skin: gone", logging.WARNING, journal=False) == "palpate: skin: gone"
     assert line("skin: streaming", journal=True) == "<6>skin: streaming"
@@ -66,7 +66,7 @@ def test_a_full_disk_costs_the_line_alone(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
-    """Each once, a warning but for the end; without a text for the end there is no line for it."""
+    """Each once, as a warning except the end; without a text for the end it has no line."""
     trouble = TroubleLog("skin", "look at the cable", end="skin: streaming")
     for now in ("", "", "gone", "gone", "busy", "", "", "gone"):
         trouble.update(now)
@@ -84,7 +84,7 @@ def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
 
 
 def test_the_first_state_is_logged_where_it_is_not_known(logged: list[str]):
-    """What was never said before is news, also where it is no trouble."""
+    """A first state is news, also if it is not a trouble."""
     trouble = TroubleLog("serial", end="serial: open", known=False)
     trouble.update("")
     trouble.update("")

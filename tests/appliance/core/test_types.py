@@ -74,6 +74,6 @@ def test_a_recording_from_before_there_were_axes(tmp_path: Path):
 
 
 def test_a_bundle_of_one_axis_keeps_its_id(default_bundle: bundle.Bundle):
-    """The manifest that the box comes with has no axes, and is written as it is on disk."""
+    """The manifest of the packaged bundle has no axes, and is written as it is on disk."""
     assert "axes" not in json.loads((bundle.DEFAULT / bundle.MANIFEST).read_text())["format"]
     assert default_bundle.manifest.json() == (bundle.DEFAULT / bundle.MANIFEST).read_bytes()

@@ -1,5 +1,5 @@
-"""The feed: what each line says, and that no reader, however slow, many or hostile, costs the loop
-more than a little."""
+"""The feed: the content of each line; and no reader, however slow or hostile, nor many readers,
+cost the loop more than a small share of its time."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.factories.simulated_box import SECOND, Rigged
 
 @pytest.fixture
 def offered(tmp_path: Path) -> Iterator[Offered]:
-    """A feed that has taken its first turn."""
+    """A feed after its first turn."""
     one = Offered(tmp_path / "feed.sock", trial="7 of 20 sweeps")
     one.turns()
     yield one
@@ -156,7 +156,7 @@ def test_a_verdict_is_not_kept_for_the_next_look(offered: Offered) -> None:
 
 
 def test_without_a_new_frame_none_is_repeated(offered: Offered) -> None:
-    """A skin that has gone: its last frame comes once."""
+    """The last frame of a skin that is gone comes once."""
     peer = offered.peer()
     peer.ask('{"frames": 20}')
     offered.turns(20)
@@ -183,7 +183,8 @@ def test_of_a_large_skin_fewer_frames_are_offered(tmp_path: Path) -> None:
 
 
 def test_the_window_of_a_sweep_comes_bit_for_bit(offered: Offered) -> None:
-    """To who asked for it, after the verdict; of a sweep without a window nothing comes."""
+    """The readers that requested windows get it after the verdict; a sweep without a window gives
+    no line."""
     peer, other = offered.peer(), offered.peer()
     peer.ask('{"sweeps": true}')
     offered.turns(2)
@@ -217,7 +218,7 @@ LARGE = SweepFormat(16, 32, 100.0, 200, "uint8")
 
 @pytest.fixture
 def large(tmp_path: Path) -> Iterator[Offered]:
-    """The feed of a large skin that has taken its first turn."""
+    """The feed of a large skin after its first turn."""
     one = Offered(tmp_path / "large.sock", LARGE)
     one.turns()
     yield one
@@ -234,8 +235,8 @@ def asking(offered: Offered) -> FeedPeer:
 
 
 def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
-    """Over 64 kB, in pieces as the readers take them, with other lines in their order; it is held
-    once for both."""
+    """Over 64 kB, in pieces as the readers accept them, with other lines in their order. Both
+    readers share one copy."""
     peers = [asking(large), asking(large)]
     sweep = cut(LARGE)
     large.feed.answered(OK)
@@ -267,8 +268,9 @@ def test_the_window_of_a_large_skin_comes_bit_for_bit(large: Offered) -> None:
 
 
 def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
-    """While a reader takes none, the next one is lost to all; after five seconds the reader is
-    closed, and told why when it reads in the end; the other one gets the third."""
+    """While a reader does not take a window, all readers lose the next. After five seconds this
+    reader is closed, with the reason as its last line, and the other reader gets the third window.
+    """
     slow, quick = asking(large), asking(large)
     got: list[dict[str, Any]] = []
 
@@ -287,8 +289,8 @@ def test_one_large_window_is_on_its_way_at_a_time(large: Offered) -> None:
 
 
 def test_readers_that_never_read_hold_one_large_window(large: Offered) -> None:
-    """Sixty-four of them, and a sweep a second: the box holds less than 2 MiB more, and goes on
-    serving who reads."""
+    """Sixty-four such readers, and a sweep a second: the box needs less than 2 MiB more, and goes
+    on serving others."""
     peers = [asking(large) for _ in range(MOST_READERS - 1)]
     quick = asking(large)
     quick.lines()
@@ -309,7 +311,7 @@ def test_readers_that_never_read_hold_one_large_window(large: Offered) -> None:
 
 
 def test_a_window_that_is_too_large_is_counted(tmp_path: Path) -> None:
-    """Over 640 kB: the reader is told of one line that it has lost."""
+    """Over 640 kB: the reader gets a `lost` line for one line."""
     format = SweepFormat(32, 32, 100.0, 250, "uint16")
     offered = Offered(tmp_path / "feed.sock", format)
     peer = offered.peer()
@@ -323,7 +325,7 @@ def test_a_window_that_is_too_large_is_counted(tmp_path: Path) -> None:
 
 
 def test_counts_that_are_no_numbers_become_null(tmp_path: Path) -> None:
-    """A float skin with a broken taxel: the line is JSON all the same."""
+    """A float skin with a broken taxel: the line is valid JSON."""
     format = SweepFormat(1, 3, 100.0, 200, "float32", 3)
     offered = Offered(tmp_path / "feed.sock", format)
     peer = offered.peer()
@@ -339,8 +341,9 @@ def test_counts_that_are_no_numbers_become_null(tmp_path: Path) -> None:
 
 
 def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offered) -> None:
-    """Two thousand verdicts that one reader does not take: what it gets in the end, with what it
-    lost, is all of them; another that reads has them all, and the queue stayed within its limit."""
+    """Two thousand verdicts that one reader does not read: the lines that it gets in the end and
+    its lost lines are all of them. Another reader has them all, and the queue stayed within its
+    limit."""
     slow, quick = offered.peer(), offered.peer()
     all_lines: list[dict[str, Any]] = []
     for i in range(2000):
@@ -369,7 +372,7 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offere
 
 
 def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> None:
-    """A reader that takes nothing: of four windows two fit, and of eight lines in all each is there
+    """A reader that reads nothing: of four windows two fit, and of eight lines in all each is there
     or counted."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
@@ -393,8 +396,8 @@ def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> Non
 
 @pytest.mark.slow
 def test_one_that_never_reads_costs_no_memory_without_bound(offered: Offered) -> None:
-    """Sixty-four of them that asked for all: after thousands of lines and windows the box holds
-    less than 2 MiB more."""
+    """Sixty-four readers that requested everything and never read: after thousands of lines and
+    windows the box needs less than 2 MiB more."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
     for peer in peers:
         peer.ask('{"frames": 20, "sweeps": true}')
@@ -484,8 +487,8 @@ def test_what_is_no_request_closes_its_reader_alone(offered: Offered, data: str)
 def test_endless_requests_are_read_a_little_each_turn(
     offered: Offered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A reader that sends without a pause: of its bytes no more than a few are taken in a turn, and
-    others are served."""
+    """Only a few bytes of a reader that sends without a pause are read in a turn, and others are
+    served."""
     taken: list[int] = []
     plain = feed_reader.requests
 
@@ -511,15 +514,15 @@ def test_endless_requests_are_read_a_little_each_turn(
 
 
 def test_a_turn_serves_a_few_and_all_in_the_end(offered: Offered) -> None:
-    """A verdict for 64 readers: SERVED get it at the first look at the sockets, the last after 64 /
-    SERVED looks."""
+    """A verdict for 64 readers: SERVED of them get it in the first round, the last after 64 /
+    SERVED rounds."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
     offered.turns(MOST_READERS)
     for peer in peers:
         peer.lines()
     offered.feed.answered(OK)
     for turn in range(1, MOST_READERS // SERVED + 1):
-        offered.turns()  # one look at the sockets
+        offered.turns()  # one round
         got = [peer for peer in peers if "verdict" in kinds(peer.lines())]
         assert len(got) == SERVED, f"turn {turn}"
 
@@ -535,7 +538,7 @@ def test_a_turn_serves_a_few_and_all_in_the_end(offered: Offered) -> None:
 def test_a_costly_look_at_the_sockets_puts_off_the_next(
     offered: Offered, monkeypatch: pytest.MonkeyPatch, cost_ns: int, period_ns: int
 ) -> None:
-    """Looks take no more than SHARE of a core: one that took three times that is followed by a
+    """Rounds use no more than SHARE of a core: a round of three times that length is followed by a
     pause three times as long."""
     offered.cost_ns = cost_ns
     looks: list[int] = []
@@ -557,8 +560,8 @@ def test_a_reader_that_stops_in_the_middle_or_is_killed(offered: Offered) -> Non
 
 
 def test_one_that_only_listens_may_close_its_own_side(offered: Offered) -> None:
-    """As `socat` does when its input ends: its last request holds, and lines go on; when it leaves
-    it is let go."""
+    """As `socat` does when its input ends: its last request stays valid, and lines go on; when it
+    leaves, it is closed."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     peer.socket.shutdown(socket.SHUT_WR)
@@ -600,8 +603,7 @@ def test_members_of_the_group_may_read_and_nobody_else(tmp_path: Path) -> None:
 
 
 def test_the_socket_of_a_process_that_died_is_replaced(tmp_path: Path, logged: list[str]) -> None:
-    """What a killed box leaves behind refuses connections; the next one takes its place without a
-    word."""
+    """The socket of a killed box refuses connections; the next box replaces it silently."""
     dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     dead.bind(str(tmp_path / "feed.sock"))
     dead.close()
@@ -612,8 +614,8 @@ def test_the_socket_of_a_process_that_died_is_replaced(tmp_path: Path, logged: l
 
 
 def test_a_path_that_cannot_be_bound_is_told_once(tmp_path: Path, logged: list[str]) -> None:
-    """A folder that is missing, a file in its place, a path that is too long: one line each, and
-    turns go on; once the reason is gone the feed is there."""
+    """A missing folder, a file at the path, a path that is too long: one log line each, and turns
+    go on. Once the reason is gone the feed is there."""
     offered = Offered(tmp_path / "run" / "feed.sock")
     offered.turns(2000)
     assert len(logged) == 1
@@ -638,7 +640,7 @@ def test_a_path_that_cannot_be_bound_is_told_once(tmp_path: Path, logged: list[s
 def test_two_boxes_do_not_take_the_socket_from_each_other(
     offered: Offered, logged: list[str]
 ) -> None:
-    """The second says so, and offers its feed when the first has ended."""
+    """The second logs it, and offers its feed when the first has ended."""
     second = Offered(offered.path)
     second.turns(1000)
     assert len(logged) == 1
@@ -652,8 +654,8 @@ def test_two_boxes_do_not_take_the_socket_from_each_other(
 
 
 def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered: Offered) -> None:
-    """Readers get what was waiting, the reason, and an end; the verdict of a sweep that was open
-    then is no error."""
+    """Readers get the waiting lines, the reason, and an end. The later verdict of an open sweep is
+    not an error."""
     peer = offered.peer()
     offered.feed.answered(OK)
     offered.feed.stopping()

@@ -1,4 +1,4 @@
-"""What a person sees of the service: the status file and its reader, and the log lines of
+"""The service as a person sees it: the status file and its reader, and the log lines of
 verdicts."""
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class ClockedStatus:
         return len(set(inodes))
 
     def read(self) -> dict:
-        """What a reader gets now."""
+        """The result for a reader now."""
         return status.read(self.path, self.clock.now_ns())
 
     def text(self) -> str:
@@ -93,7 +93,7 @@ class ClockedStatus:
 
 @pytest.fixture
 def status_file(tmp_path: Path) -> ClockedStatus:
-    """A status file that nobody has written yet."""
+    """A status file that was not written yet."""
     return ClockedStatus(tmp_path)
 
 
@@ -194,8 +194,8 @@ def test_text_of_a_device_does_not_steer_a_terminal(status_file: ClockedStatus):
 
 
 def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
-    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: it says why.
-    All exit with 1."""
+    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: `why` has the
+    reason. All exit with 1."""
     assert status.exit_code(status_file.read()) == 1
     assert "does not run" in status_file.text()
     status_file.turns(0.01)
@@ -220,14 +220,14 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
     "text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}']
 )
 def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
-    """What is no status of this version is an error, not a guess."""
+    """A status of another version is an error, not a guess."""
     status_file.path.write_text(text)
     with pytest.raises(FormatError, match="not a status of this version"):
         status_file.read()
 
 
 def test_a_file_that_may_not_be_read_is_named(status_file: ClockedStatus):
-    """A folder in its place: the error names the path and what to try."""
+    """A folder at its path: the error names the path and the remedy."""
     status_file.path.mkdir()
     with pytest.raises(ApplianceError, match="cannot be read"):
         status_file.read()
@@ -293,7 +293,8 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
         ),
         (
             replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
-            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel shows a constant count; check the skin; "
+            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel shows a constant count; check the "
+            "skin; "
             "taxel 2.3",
         ),
         (
@@ -303,13 +304,13 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
     ],
 )
 def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: list[str]):
-    """In words; one that a person should look at is a warning."""
+    """In words; a verdict that needs attention is a warning."""
     VerdictLog().answered(verdict)
     assert logged == [line]
 
 
 def test_every_status_without_a_label_has_its_reason():
-    """One list: a new status must say what to check."""
+    """One list: a new status needs its advice."""
     assert set(REASONS) == {s for s in Status if not s.classified}
 
 
@@ -405,8 +406,8 @@ def test_what_is_counted_is_shown(
 
 
 def test_numbers_of_a_state_are_left_out_rather_than_cut():
-    """After years of faults the line is full: the counts that are there are whole, and the line is
-    no longer than ever."""
+    """After years of faults the line is full: the counts in it are whole, and it is not longer than
+    the limit."""
     states = [
         "31536000.125",
         "streaming",

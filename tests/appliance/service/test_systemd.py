@@ -1,5 +1,5 @@
-"""The box as a service of systemd: what the service manager gets and when, and the log lines of
-verdicts."""
+"""The box as a service of systemd: the messages to the service manager and their times, and the log
+lines of verdicts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ManagerSocket:
 
 @pytest.fixture(params=["path", "abstract"])
 def socket_end(request: pytest.FixtureRequest, tmp_path: Path):
-    """A socket with a place in the file system, and one without."""
+    """A socket with a path in the file system, and an abstract socket."""
     socket_end = ManagerSocket(
         str(tmp_path / "notify") if request.param == "path" else f"@palpate-test-{os.getpid()}"
     )
@@ -129,8 +129,8 @@ def test_no_watchdog_or_another_s_is_not_fed(socket_end: ManagerSocket, more: di
 
 
 def test_text_of_a_device_is_no_message(socket_end: ManagerSocket):
-    """A line break in a status would begin another message; what is no text is sent all the
-    same."""
+    """A line break in a status would begin another message. Bytes that are not text are sent,
+    too."""
     sender, _ = notifier(socket_end)
     sender.turn(state(False, "skin absent: no\nREADY=1\r\nMAINPID=1 \udcff"))
     assert socket_end.heard() == [["STATUS=skin absent: no READY=1 MAINPID=1 ?"]]
@@ -147,8 +147,8 @@ def test_without_a_socket_nothing_is_sent(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path: Path):
-    """Nobody listens, or nobody reads: the box goes on, and what was not accepted is sent when
-    somebody reads."""
+    """Without a listener, or with a full socket, the box goes on; unsent messages are sent
+    later."""
     sender, _ = notifier(socket_end)
     socket_end.socket.close()
     Path(socket_end.address).unlink(missing_ok=True)
@@ -192,7 +192,7 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
-    """Without a skin the status names what is missing; then it streams, and counts the answered
+    """Without a skin the status names the missing part; then it streams, and counts the answered
     sweeps."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
@@ -215,8 +215,8 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
 
 
 def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[..., Rigged]):
-    """The board answers and no frame comes: it is absent until it is found silent, never
-    streaming."""
+    """The readout board answers and no frame comes: the state is absent until silence is detected,
+    and never streaming."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.mangle = lambda data: b""
     rigged(simulated, observers=[turn_log]).seconds(3)
@@ -248,7 +248,7 @@ def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
 
 
 def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
-    """What is open is answered after systemd has been notified."""
+    """An open sweep is answered after systemd has been notified."""
     turn_log = TurnLog()
     box = rigged(
         idle_devices(),

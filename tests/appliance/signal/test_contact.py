@@ -1,5 +1,4 @@
-"""The centre of a contact, the advice that follows from it, and the positions that a bundle
-holds."""
+"""The centre of a contact, the advice that follows from it, and the positions in a bundle."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ NAN, INF = float("nan"), float("inf")
     ],
 )
 def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: str):
-    """Values that are no numbers, not finite, too many or not in pairs: a BundleError that names
+    """Values that are not numbers, not finite, too many or not in pairs: a BundleError that names
     them."""
     with pytest.raises(BundleError, match=re.escape(message)):
         replace(MIDDLE, **wrong)
@@ -70,7 +69,7 @@ def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
 
 
 def test_only_the_normal_axis_of_several_counts():
-    """Shear, however large, moves no centre; the distance is that of the normal axis alone, tare
+    """Shear, however large, does not move the centre; only the normal axis counts, tare
     included."""
     load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
     flat = counts(load + tare)
@@ -82,8 +81,8 @@ def test_only_the_normal_axis_of_several_counts():
 
 
 def test_without_contact_there_is_no_centre():
-    """Below the threshold, or where a floating-point skin gives no number: None, and nothing is
-    moved."""
+    """Below the threshold, or if a floating-point skin gives no number: None, and no
+    displacement."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
         assert displacement(counts(load), TARE, 5.0, MIDDLE) == ""

@@ -138,8 +138,8 @@ def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
 
 
 def test_h_features_are_equation_5() -> None:
-    """All 760 numbers equal the paper's sum, with the mean taken off and two neighbouring bins a
-    band."""
+    """All 760 numbers equal the paper's sum, with the mean subtracted and two neighbouring bins in
+    a band."""
     x = _sweep()
     assert features.h_shape(FRAMES, RATE) == (40, 19)
     np.testing.assert_allclose(
@@ -168,7 +168,7 @@ def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
     ("rate_hz", "frames", "hz"), [(750.0, 1500, 133.0), (750.0, 1500, 361.5), (100.0, 200, 31.0)]
 )
 def test_a_tone_lands_in_its_band_and_centroid(rate_hz: float, frames: int, hz: float) -> None:
-    """c1 is the tone's frequency, and in every short window the band that holds it is the
+    """c1 is the tone's frequency, and in every short window the band of the tone is the
     strongest."""
     x = _tone(hz, rate_hz, frames)
     assert features.l_features(x, rate_hz)[1] == pytest.approx(hz, abs=0.5)

@@ -1,5 +1,5 @@
-"""The unloaded skin is found in the stream: where it is lifted, only once it was touched, and
-without a guess."""
+"""The unloaded skin is found in the stream: when the finger is lifted, certain only after a touch,
+and never guessed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_without_a_change_nothing_is_certain(noise: float):
 
 
 def test_a_tare_is_certain_and_stays():
-    """What a person says counts from then on, until another skin comes."""
+    """A person's tare counts from then on, until another skin comes."""
     tracker = tracked(skin(800, 3))
     tracker.set(skin(600, 3))
     tracker.put(skin(300, 1))
@@ -73,8 +73,8 @@ def test_whole_counts_have_a_least_difference():
 
 
 def test_broken_taxels_do_not_count():
-    """One that gives no number, and one that is far noisier than the others, leave the threshold as
-    it is."""
+    """A taxel that gives no number, and a taxel that is far noisier than the others, do not change
+    the threshold."""
     frames = skin(500, 3).astype(np.float32)
     whole = UnloadedSkin.measured(frames).contact
     frames[:, 0, 0] = np.nan
@@ -87,7 +87,7 @@ def test_broken_taxels_do_not_count():
 
 
 def test_several_axes_are_judged_by_the_normal_one():
-    """Shear that moves without a load along the normal is no touch."""
+    """Shear that varies without a load along the normal is not a touch."""
     frames = skin(500, 3, 400, shape=(4, 4, 3))
     frames[200:, ..., :2] += 400
     format = SweepFormat(4, 4, 100.0, 200, "uint16", 3)

@@ -116,15 +116,15 @@ def test_the_tare_of_each_axis_counts():
 
 
 def test_an_axis_that_gives_no_number_is_dead():
-    """It is named with its axis, also where it is shear."""
+    """The detail names it with its axis, also a shear axis."""
     taxels = sheared().astype(np.float32)
     taxels[9, 3, 0, 1] = np.nan
     assert inspect(taxels, SHEARED, THREE).detail == "taxel 4.1 axis 2"
 
 
 def test_negative_full_scale_of_the_normal_axis_is_no_fault():
-    """A tared skin may be pulled; the normal axis is saturated at its upper end alone, as that of a
-    skin of one axis."""
+    """A tared skin may be pulled: the normal axis is saturated only at its upper end, as in a skin
+    of one axis."""
     taxels = sheared()
     taxels[:, 3, 3, 2] = np.where(np.arange(300) % 2, -2000, -1999)
     assert inspect(taxels, SHEARED, THREE).status is Status.OK
@@ -190,8 +190,8 @@ def test_a_skin_whose_counts_fall_under_load():
 
 
 def test_what_vibrates_is_touched():
-    """Also if its mean is that of a stretch that was taken for the unloaded skin, such as a finger
-    at rest."""
+    """Also if its mean equals that of a stretch taken for the unloaded skin, such as a finger at
+    rest."""
     at_rest = UnloadedSkin(np.full((4, 4), 80.0), np.full((4, 4), 0.3), 2.0)
     assert inspect_bare(moving(80), at_rest).status is Status.OK
 

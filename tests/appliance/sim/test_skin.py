@@ -1,5 +1,5 @@
-"""Tests of the simulated finger and skin (`appliance.sim.skin`): shapes, what each effect does
-alone, and the sets."""
+"""The simulated finger and skin (`appliance.sim.skin`): shapes, the result of each effect alone,
+and the sets."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ SHEAR = World(shear=True)
 
 
 def test_the_normal_axis_of_a_skin_with_shear_is_that_without() -> None:
-    """Same finger, same random numbers: but for the readout's noise the pressure is the same; shear
-    only adds axes."""
+    """With the same finger and random numbers, the pressure differs only by the noise of the
+    readout; shear only adds axes."""
     off = frozenset({"noise"})
     plain, three = (
         skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True)

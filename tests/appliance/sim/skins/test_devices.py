@@ -1,4 +1,4 @@
-"""The box with an emulated skin in place of a real one: what was felt comes out of the recorder,
+"""The box with an emulated skin instead of a real skin: the recorded counts are the simulated ones,
 through each skin's bytes."""
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
 
 
 def test_unplugged_and_plugged_in_again() -> None:
-    """The sensor says so, takes the skin up by itself, and numbers go on in the next epoch."""
+    """The state shows it, the skin is used again without help, and numbers go on in the next
+    epoch."""
     chosen = settings("papillarray")
     profile = skins.profile(chosen)
     acts = script.tubes(1, seen=sweeps.view("papillarray", profile.format))
@@ -85,7 +86,7 @@ def test_unplugged_and_plugged_in_again() -> None:
 
 
 def test_demo_without_a_bundle_for_the_skin(capsys: pytest.CaptureFixture[str]) -> None:
-    """One line that says what is wanted and how to make it."""
+    """One line with the missing bundle and how to make it."""
     assert main(["demo", "--skin", "papillarray", "--virtual", "--sweeps", "1"]) == 65
     (line,) = capsys.readouterr().err.splitlines()
     assert (

@@ -43,7 +43,7 @@ class PlayedSkin:
         self.fd = -1
 
     def read(self, seconds: float) -> bytes:
-        """What comes in this time."""
+        """The bytes that come in this time."""
         data, until = b"", self.clock.now_ns() + round(seconds * SECOND)
         while (left := until - self.clock.now_ns()) > 0:
             if self.clock.wait_readable(self.fd, left / 1e9):
@@ -74,7 +74,7 @@ def test_frames_come_at_the_skins_rate(bench: PlayedSkin) -> None:
 
 
 def test_sends_only_while_a_program_has_it_open(bench: PlayedSkin) -> None:
-    """What a skin sends to nobody is gone: who opens the port gets frames of now."""
+    """Bytes that nobody reads are lost: a program that opens the port gets present frames."""
     bench.clock.sleep_until(bench.clock.now_ns() + 2 * SECOND)
     bench.open()
     assert bench.read(0.105) == bench.expected(200, 10)
@@ -102,8 +102,8 @@ def test_unplugged_and_plugged_in_again(bench: PlayedSkin) -> None:
 
 
 def test_slow_reader_gets_what_the_driver_held(bench: PlayedSkin) -> None:
-    """A backlog: what the driver could hold comes first, unchanged; the rest was thrown away and is
-    counted."""
+    """A backlog: the bytes that the driver could keep come first, unchanged; the others were
+    discarded and are counted."""
     bench.open()
     bench.clock.sleep_until(bench.clock.now_ns() + 5 * SECOND)
     data = bench.read(0.505)
@@ -126,7 +126,7 @@ def test_a_computer_that_is_too_slow_for_the_skin_skips_frames(tmp_path: Path) -
 
 
 def test_pause_and_bad_cable(bench: PlayedSkin) -> None:
-    """A paused skin sends nothing; what a cable does to the bytes arrives so."""
+    """A paused skin sends nothing; bytes altered by a cable arrive altered."""
     bench.open()
     bench.read(0.105)
     bench.player.paused = True
@@ -137,8 +137,8 @@ def test_pause_and_bad_cable(bench: PlayedSkin) -> None:
 
 
 def test_as_fast_as_it_is_read(tmp_path: Path) -> None:
-    """Without pace the next frame is sent when the one before is read: all come, and time plays no
-    part."""
+    """Without pace the next frame is sent when the frame before is read: all come, independent of
+    time."""
     bench = PlayedSkin("flexitac", tmp_path, paced=False)
     bench.open()
     data = b""
@@ -153,7 +153,7 @@ def test_as_fast_as_it_is_read(tmp_path: Path) -> None:
 
 
 def test_adapter_that_collects(tmp_path: Path) -> None:
-    """Every 16 ms the adapter passes on what it has; no frame is lost by that."""
+    """The adapter passes bytes on every 16 ms; no frame is lost by that."""
     bench = PlayedSkin("papillarray", tmp_path, collect_ns=16_000_000)
     bench.open()
     came = []
@@ -169,8 +169,8 @@ def test_adapter_that_collects(tmp_path: Path) -> None:
 
 
 def test_commands_reach_the_skin(tmp_path: Path) -> None:
-    """A command changes the rate from then on; an adapter answers at once and sends when it was
-    told to."""
+    """A command changes the rate from then on; an adapter answers at once and sends after its start
+    command."""
     bench = PlayedSkin("papillarray", tmp_path)
     bench.open()
     bench.read(0.1)

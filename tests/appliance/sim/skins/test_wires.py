@@ -1,5 +1,5 @@
-"""What the emulated skins send, against bytes put together by hand from the published layouts. None
-of them was at hand."""
+"""The bytes of the emulated skins, compared with bytes put together by hand from the published
+layouts. None of the skins was available."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ PREVIEW = bytes.fromhex(
     "556677880201001b0003002700040029020500630206000f0307002b0300004efa320031aa768f0000000002002d002b01"
     "090041005b0075008f00a900c300dd"
 )
-"""The first bytes that a real PapillArray controller (v2.0, two sensors) sent to a user, who
-published them in the tests of the project langxin11/parallel_gripper_tactile."""
+"""The first bytes that a real PapillArray controller (v2.0, two sensors) sent to a user, published
+in the tests of the project langxin11/parallel_gripper_tactile."""
 
 
 def test_marked() -> None:
@@ -74,7 +74,7 @@ def test_rows() -> None:
 
 
 def test_papillarray_as_a_controller_sends_it() -> None:
-    """The form of two sensors is that of a real controller to the byte; sum and end marker follow
+    """The layout of two sensors is that of a real controller to the byte; sum and end marker follow
     from the layout."""
     sent = wires.PapillArray(counter=0x32FA4E).frame(np.zeros((6, 3, 3), np.float32), 0x8F76AA31)
     assert sent.startswith(PREVIEW)
@@ -131,7 +131,7 @@ def test_slcan() -> None:
     assert skin.hear(b"S6\rO\rt20120700\rC\r") == b"\r\r\a\r"
     assert skin.hear(b"S8\rO\rO\rS8\r") == b"\r\r\a\a"
     assert not skin.streaming
-    assert skin.hear(b"t20220700\rt20110") == b"z\r"  # another board
+    assert skin.hear(b"t20220700\rt20110") == b"z\r"  # another CAN board
     assert not skin.streaming
     assert skin.hear(b"7\rt20120700\r\rV\rX\r") == b"z\rz\r\rV1013\r\a"
     assert skin.streaming
@@ -173,8 +173,8 @@ def test_unknown_name() -> None:
 
 
 def test_a_zero_that_is_missing_makes_no_frame() -> None:
-    """The controller's sum does not see it. Wherever one is missing, the box takes the frame as it
-    was sent, or none."""
+    """The controller's sum does not detect a missing zero byte. Wherever it is missing, the box
+    reads the frame as it was sent, or no frame."""
     profile = skin_profile.load("papillarray", [ROOT / "firmware_config" / "skins"])
     force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     sent = wires.PapillArray().frame(force, 1000)
@@ -183,4 +183,4 @@ def test_a_zero_that_is_missing_makes_no_frame() -> None:
         for taxels in codec(profile)(Rest(), sent[:at] + sent[at + 1 :]).taxels:
             assert (taxels == force).all()
             taken += 1
-    assert taken > 0  # what follows the forces is of no interest
+    assert taken > 0  # the bytes after the forces do not matter
