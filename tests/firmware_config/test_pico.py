@@ -26,12 +26,12 @@ from tests.factories.paths import NO_SITE
 
 pytestmark = pytest.mark.slow
 LIMIT_S = 60
-"""How long a busy machine may take."""
+"""Time limit on a busy machine."""
 FORM = {"ROWS": 3, "COLS": 5, "RATE_HZ": 200}
 
 
 class PortReader:
-    """The box's sensor at a board's port."""
+    """The box's sensor at the port of a readout board."""
 
     def __init__(
         self, port: str, rows: int = 3, cols: int = 5, rate_hz: float = 200, dtype: str = "uint8"
@@ -58,7 +58,7 @@ class PortReader:
 
 
 def scans(frames: Frames) -> np.ndarray:
-    """Number of the scan of each frame, modulo 97; fails unless each taxel stands at its place."""
+    """Number of the scan of each frame, modulo 97; fails unless each taxel stands at its index."""
     taxels = frames.taxels.astype(int) >> (8 if frames.taxels.itemsize == 2 else 0)
     flat = taxels.reshape(len(taxels), -1)
     assert ((flat - flat[:, :1]) % 256 == np.arange(flat.shape[1])).all()
@@ -66,8 +66,8 @@ def scans(frames: Frames) -> np.ndarray:
 
 
 def check_all_there(frames: Frames) -> None:
-    """Nothing that the board took is missing: what is, its interrupt had come too late for, and the
-    numbers tell."""
+    """No frame of the readout board is missing, except those whose interrupt came too late, and the
+    numbers show these."""
     assert (np.diff(scans(frames)) % 97 == 1).all()
     assert (np.diff(frames.seq) >= 1).all()
 
@@ -81,7 +81,7 @@ def check_all_there(frames: Frames) -> None:
     ],
 )
 def test_the_box_reads_it(format: dict[str, Any]) -> None:
-    """Identity, format and frames with each taxel at its place, through multiplexers that the
+    """Identity, format and frames with each taxel at its index, through multiplexers that the
     firmware switches."""
     given = {
         name.lower(): format[name]
@@ -97,7 +97,8 @@ def test_the_box_reads_it(format: dict[str, Any]) -> None:
 
 
 def test_it_is_taken_up_again() -> None:
-    """A program that ended, with STOP or without, leaves a board that the next one can use."""
+    """A program that ended, with STOP or without, leaves a readout board that the next program can
+    use."""
     with pico.plugged_in(**FORM) as port:
         with PortReader(port) as reader:
             reader.frames(20)
@@ -128,8 +129,8 @@ def test_counters_wrap() -> None:
 
 
 def test_late_interrupts_cost_frames_and_not_the_clock() -> None:
-    """Every twentieth interrupt comes 30 ms late: the numbers tell what was not taken, and clock
-    and count agree."""
+    """Every twentieth interrupt comes 30 ms late: the numbers show the missed frames, and clock and
+    count agree."""
     with pico.plugged_in(**FORM, late_ms=30, late_every=20) as port, PortReader(port) as reader:
         frames = reader.frames(200)
         check_all_there(frames)
@@ -175,8 +176,8 @@ def test_requests_in_the_middle_of_frames() -> None:
 
 
 def test_a_reader_that_stops() -> None:
-    """The FIFO runs over: the oldest frames go, a flag says so, and numbers and content go on as if
-    all had been read."""
+    """The FIFO overflows: the oldest frames are dropped, a flag shows it, and numbers and content
+    go on as if all had been read."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
         link = BoardLink(port, 115200, SystemClock())
         format = packets.unpack_format(ask(link, packets.Request.FORMAT))
@@ -232,7 +233,7 @@ def test_stop_ends_the_stream() -> None:
 
 ALLOCATES = """
 import sys
-sys.path.insert(0, {folder!r})
+sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
 import pico_shell, settings, micropython, gc
 sys.modules["machine"] = machine = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
 sys.modules["time"] = clock = pico_shell.PicoTicks(0)
@@ -329,7 +330,7 @@ def test_the_page_names_pins_and_settings_as_they_are() -> None:
 
 CTRL_C = """
 import sys
-sys.path.insert(0, {folder!r})
+sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
 import pico_shell, settings
 sys.modules["machine"] = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
 import main

@@ -18,8 +18,8 @@ SMALL = 1 << 30
 
 
 class DrivenBoard:
-    """A Readout whose time and interrupts a test makes. Its frames hold their scan's number in each
-    taxel."""
+    """A Readout whose time and interrupts are made by a test. Each taxel of its frames has the
+    number of the scan."""
 
     def __init__(self, ticks=0, wrap=SMALL, level=0, **settings):
         counters = {name: settings.pop(name) for name in ("seq", "t_us") if name in settings}
@@ -87,7 +87,7 @@ class DrivenBoard:
             assert all(abs(v) < SMALL for v in held), "an integer that a Pico allocates"
 
     def sent(self):
-        """All that the board has to send now."""
+        """All bytes that the readout board sends now."""
         data = b""
         while True:
             packet, size = self.board.next()
@@ -96,7 +96,7 @@ class DrivenBoard:
             data += bytes(packet[:size])
 
     def packets(self):
-        """What the box reads of it; nothing is damaged."""
+        """Its bytes as read by the box; nothing is damaged."""
         read = packets.unpack(self.sent())
         assert read.garbage == 0
         assert read.leftover == b""
@@ -117,7 +117,7 @@ class DrivenBoard:
     ],
 )
 def test_a_setting_that_cannot_be_is_named(settings, named):
-    """With its value and what is allowed."""
+    """The error gives its value and the allowed values."""
     with pytest.raises(ValueError, match=f"^{named} is (out of range|unknown); use "):
         DrivenBoard(**settings)
 
@@ -137,7 +137,7 @@ def test_a_setting_that_cannot_be_is_named(settings, named):
     ],
 )
 def test_replies_are_those_of_the_protocol(settings, format):
-    """Byte by byte what the box's encoder makes; the FIFO is not shorter than asked, the rate is
+    """Byte by byte as from the box's encoder; the FIFO is not shorter than the setting, the rate is
     the timer's."""
     made = DrivenBoard(**settings)
     made.ask(readout.IDENTITY)
@@ -152,8 +152,8 @@ def test_replies_are_those_of_the_protocol(settings, format):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("level", [0, 1])
 def test_packets_are_those_of_the_protocol(dtype, level):
-    """Byte by byte what the box's encoder makes of the same frames, with the trigger line of the
-    first."""
+    """Byte by byte as from the box's encoder for the same frames, with the trigger line of the
+    first frame."""
     made = DrivenBoard(dtype=dtype, level=level, seq=(65534, 7))
     made.ask(readout.START)
     made.tick(8)
@@ -206,8 +206,7 @@ def test_counters_wrap_where_the_protocol_says():
 
 @pytest.mark.parametrize(("late_us", "missed"), [(400, 0), (600, 1), (2400, 2), (100_600, 101)])
 def test_a_late_interrupt_keeps_count_and_clock_together(late_us, missed):
-    """Frames that were not taken keep their numbers; interrupts that had waited take no frame
-    twice."""
+    """Missed frames keep their numbers; pending interrupts take no frame twice."""
     made = DrivenBoard()
     made.ask(readout.START)
     made.tick(8)
@@ -223,7 +222,7 @@ def test_a_late_interrupt_keeps_count_and_clock_together(late_us, missed):
 
 
 def test_a_packet_ends_where_numbers_do_not_follow():
-    """Frame i of a packet was taken i periods after the first, so a gap begins another."""
+    """Frame i of a packet was taken i periods after the first, so a gap begins another packet."""
     made = DrivenBoard()
     made.ask(readout.START)
     made.tick(3)
@@ -250,7 +249,7 @@ def test_a_full_fifo_drops_the_oldest_and_says_so_once():
 
 
 def test_what_is_being_sent_is_not_overwritten():
-    """A packet that was taken stays as it is while the FIFO runs over behind it."""
+    """A packet that was taken does not change while the FIFO overflows behind it."""
     made = DrivenBoard()
     made.ask(readout.START)
     made.tick(8)
@@ -261,8 +260,8 @@ def test_what_is_being_sent_is_not_overwritten():
 
 
 def test_start_and_stop():
-    """START while it runs changes nothing, STOP drops what was not sent, and numbers go on after
-    the next START."""
+    """START while it runs changes nothing, STOP drops unsent frames, and numbers go on after the
+    next START."""
     made = DrivenBoard()
     made.ask(readout.STOP)
     assert made.callback is None
@@ -283,7 +282,7 @@ def test_start_and_stop():
 
 
 def test_other_bytes_are_left_alone():
-    """A modem manager sends AT commands; the board goes on as if nothing had come."""
+    """A modem manager sends AT commands; the readout board goes on as if no bytes had come."""
     made = DrivenBoard()
     made.ask(*b"AT+CGMI\r\n\xff\x00\x05")
     assert not made.board.running
@@ -292,8 +291,7 @@ def test_other_bytes_are_left_alone():
 
 
 class SlowPort:
-    """A port that takes a few bytes at a time, or nothing, and hands requests out at given
-    turns."""
+    """A port that accepts a few bytes at a time, or none, and gives requests at set turns."""
 
     def __init__(self, made, requests, chunks):
         self.made, self.requests, self.chunks = made, dict(requests), itertools.cycle(chunks)
@@ -315,7 +313,7 @@ class SlowPort:
         return 1
 
     def write(self, buffer, at, length):
-        """Takes what it likes."""
+        """Accepts a random part."""
         n = min(next(self.chunks), length)
         self.taken += bytes(buffer[at : at + n])
         return n or None
@@ -323,8 +321,8 @@ class SlowPort:
 
 @pytest.mark.parametrize("chunks", [(1000,), (7,), (64, 0, 0, 3)])
 def test_replies_wait_for_the_end_of_a_packet(chunks):
-    """However little the port takes at a time, no packet is torn apart by a request that comes in
-    its middle."""
+    """However few bytes the port accepts at a time, no packet is torn apart by a request that comes
+    in its middle."""
     made = DrivenBoard()
     asked = {
         2: readout.START,

@@ -50,7 +50,7 @@ print(*asked())
 
 
 def ask(machine: Machine, program: str, *args: str) -> str:
-    """What a program on the machine prints."""
+    """The output of a program on the machine."""
     return machine.get("/opt/palpate/bin/python", "-c", program, *args)
 
 
@@ -131,7 +131,7 @@ def test_the_line_over_tcp(machine: Machine, bridges: Service):
 
 
 def test_settings_that_cannot_be_used(machine: Machine, bridges: Service):
-    """No line for the bridge: exit 78, no restart; the journal says what to set."""
+    """No serial line for the bridge: exit 78, no restart; the journal names the setting."""
     machine.put(SITE, '[serial]\nport = "/dev/ttyAMA0"\n')
     machine.get("systemctl", "start", TCP)
     until(machine, f"systemctl is-failed -q {TCP}")
@@ -140,7 +140,7 @@ def test_settings_that_cannot_be_used(machine: Machine, bridges: Service):
 
 
 def test_what_it_cannot_do(machine: Machine, bridges: Service):
-    """It has no capability, and reads nothing of what the service keeps."""
+    """It has no capability, and cannot read the files of the service."""
     bridges.start()
     machine.get("systemctl", "start", MODBUS)
     ask(machine, ASK_MODBUS, "1")

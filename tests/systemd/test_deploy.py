@@ -1,8 +1,8 @@
 """Installing and delivering to real hosts: containers with systemd and sshd, reached as a bare user
 (see hosts.py).
 
-The skin is simulated. That takes minutes, so only PALPATE_SYSTEMD=1 does it, which also makes what
-it needs.
+The skin is simulated. That takes minutes, so it runs only with PALPATE_SYSTEMD=1, which also makes
+the containers.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
-    """Two bare hosts, of which the second stays bare, and a desktop that may log in there."""
+    """Two bare hosts, the second of which stays bare, and a desktop that may log in there."""
     if os.environ.get("PALPATE_SYSTEMD") != "1":
         pytest.skip("installs on real hosts take minutes; run python -m tests.campaigns systemd")
     with hosts.Hosts(2, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:
@@ -70,7 +70,7 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
     assert done.returncode == 0, done.stdout + done.stderr
     assert (
         "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
-    )  # told, not taken in silence
+    )  # reported, not changed silently
     return done.stdout
 
 
@@ -160,7 +160,7 @@ def test_a_second_install_changes_nothing(
 def test_the_board_that_is_named_last_holds(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
 ):
-    """It replaces a wrong one, what a person added stays, and the service starts with it."""
+    """It replaces a wrong board, other settings stay, and the service starts with it."""
     file, pid = "/etc/palpate/palpate.toml", host.service["MainPID"]
     host.machine.put(file, 'board = "rpi9"\n# mine\n')
     done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi5")
@@ -172,7 +172,7 @@ def test_the_board_that_is_named_last_holds(
 
 
 def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
-    """With the boards that there are."""
+    """The error lists the existing boards."""
     command = [
         sys.executable,
         SCRIPTS / "install.py",
@@ -198,8 +198,8 @@ def test_signers_are_never_overwritten(
     done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
     assert done.returncode == 1
     assert (
-        "FAILED: users, folders and settings: /etc/palpate/allowed_signers differs from this file there"
-        in done.stdout
+        "FAILED: users, folders and settings: /etc/palpate/allowed_signers differs from this file "
+        "there" in done.stdout
     )
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
 
@@ -263,7 +263,7 @@ def upgraded(
 
 
 def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tuple[str, str]]):
-    """Another release runs; the one before is kept, those before that are gone."""
+    """Another release runs; the previous release is kept, older releases are removed."""
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
     for _, output in upgraded[1:]:
@@ -440,8 +440,7 @@ def test_a_bundle_is_delivered_and_runs_on_trial(
 def test_a_bundle_with_an_unknown_key_is_refused(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """By the desktop where it is given the signers, by the box always; the process that classifies
-    goes on."""
+    """By the desktop if it has the signers, by the box always; the running program goes on."""
     bundle = sender.made(99, deliveries.key(tmp_path))
     before, pid = serves(host), host.service["MainPID"]
     done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers")
@@ -486,8 +485,8 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
 def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
 ):
-    """It is reported well before the deadline, and is no failure of the bundle; with the skin it is
-    READY."""
+    """It is reported well before the deadline, and is not a failure of the bundle; with the skin it
+    is READY."""
     host.machine.put("/opt/palpate/cable.py", CABLE)
     host.service.configure(CABLED)
     bundle = sender.made()
@@ -658,7 +657,7 @@ for why in ("apt-get: E: Unable to locate package", "apt-get: sh: 1: sudo: not f
 
 
 def test_a_copy_that_fails_names_the_disk():
-    """Over SFTP a full disk is no more than "Failure"."""
+    """SFTP reports a full disk just as "Failure"."""
     code = """
 import fleet
 from types import SimpleNamespace
@@ -691,8 +690,8 @@ def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
 
 @pytest.mark.slow
 def test_another_system_is_refused_with_what_is_needed():
-    """Not Debian, another architecture, /opt on its own file system, an old Python: a line says
-    what is needed."""
+    """Not Debian, another architecture, /opt on a separate file system, an old Python: one line
+    names the requirement."""
     code = """
 import install
 class Box:

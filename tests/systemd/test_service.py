@@ -70,7 +70,7 @@ def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
 
 
 def test_the_udev_rules_are_sound(machine: Machine, before: list[bool]):
-    """udev reads them without a complaint: it knows each key, operator and group."""
+    """udev reads them without a warning: it knows each key, operator and group."""
     rules = "70-palpate.rules"
     machine.put(f"/etc/udev/rules.d/{rules}", (ROOT / "firmware_config" / rules).read_text())
     output = machine.run("udevadm", "test", "/sys/class/mem/null").stderr
@@ -94,8 +94,8 @@ def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
 
 
 def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, service: Service):
-    """Without a skin it stays in its start and says why; with one it becomes active, and stays
-    active without it."""
+    """Without a skin it stays in its start and gives the reason; with a skin it becomes active, and
+    stays active without it."""
     service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}")
     machine.get("systemctl", "start", "--no-block", "palpate")
     absent = r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps answered: \d"
@@ -121,7 +121,7 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
 
 
 def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
-    """Before READY there is no watchdog, but a start whose loop hangs times out."""
+    """Before READY the watchdog does not run, but a start whose loop hangs times out."""
     service.configure(
         CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}\nRestartSec=100ms"
     )
@@ -133,7 +133,7 @@ def test_a_start_that_hangs_is_begun_again(machine: Machine, service: Service):
 
 
 def test_a_process_that_stands_still_is_killed_and_started_again(service: Service):
-    """SIGSTOP: the watchdog finds it in time; the service restarts by itself and answers."""
+    """SIGSTOP: the watchdog finds it in time; the service restarts and answers."""
     first = service.start(SIM + "WatchdogSec=3")
     begin = time.monotonic()
     service.kill("SIGSTOP")
@@ -183,7 +183,7 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
 
 
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
-    """Exit 78: the reason is logged once, and there is no restart; once it is corrected, it
+    """Exit 78: the reason is logged once, without a restart; once it is corrected, the service
     starts."""
     service.start()
     machine.put(SITE, "[sweep]\nmax_duration_s = 'for ever'\n")
@@ -223,8 +223,7 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
 
 
 def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
-    """The open sweep is answered `aborted`, and the program ends by itself well within the
-    limit."""
+    """The open sweep is answered `aborted`, and the program ends well within the limit."""
     service.start()
     end = time.monotonic() + WAIT_S
     while not (status := service.status()).get("sweeping") or not status["answered"]:

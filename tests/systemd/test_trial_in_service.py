@@ -1,4 +1,4 @@
-"""A new bundle under a real systemd: its trial, what ends it, what does not, and the shadow of a
+"""A new bundle under a real systemd: its trial, the events that end it or not, and the shadow of a
 candidate.
 
 Bundle A is deployed and committed; each test deploys another, B, signed and with a higher counter.
@@ -98,7 +98,7 @@ class DeliveredStore:
 
     @property
     def ledger(self) -> dict[str, Any]:
-        """The content of bundles.json: what the box knows of its bundles."""
+        """The content of bundles.json, the records of the box's bundles."""
         return dict(json.loads(self.machine.get("cat", "/var/lib/palpate/bundles.json")))
 
     def starts(self, sha: str) -> int:
@@ -215,8 +215,8 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """Exit 78, no restarts, and the journal says what to do; after `palpate rollback` and a start,
-    A serves."""
+    """Exit 78, no restarts, and the remedy in the journal; after `palpate rollback` and a start, A
+    serves."""
     new = store.deploy()
     store.do("commit")
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
@@ -273,7 +273,7 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
 
 
 def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) -> None:
-    """Wait for something that should take a second or two."""
+    """Wait for a condition that usually takes a second or two."""
     end = time.monotonic() + limit_s
     while not done():
         assert time.monotonic() < end, service.journal()

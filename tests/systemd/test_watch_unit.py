@@ -72,7 +72,8 @@ def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
 
 
 def test_it_goes_on_without_the_service(page: Machine, service: Service):
-    """The service stops under it: the page says so, and is there when it starts again."""
+    """The service stops during its work: the page shows it, and is live again after the next
+    start."""
     before = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
     page.get("systemctl", "stop", "palpate")
     assert (
@@ -84,8 +85,8 @@ def test_it_goes_on_without_the_service(page: Machine, service: Service):
 
 
 def test_the_token_is_for_root_and_the_page_alone(page: Machine):
-    """Another user reads neither token nor key, nor the feed; the page reads nothing of what the
-    service keeps."""
+    """Another user can read neither token nor key, nor the feed; the page cannot read the files of
+    the service."""
     other = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", "cat")
     for name in ("token", "key.pem", "certificate.pem"):
         path = f"/etc/palpate/watch/{name}"
@@ -114,7 +115,7 @@ def test_the_token_is_for_root_and_the_page_alone(page: Machine):
 
 
 def test_without_a_token_it_does_not_start_on_the_network(machine: Machine, service: Service):
-    """Exit 78, no restart; the journal names the file and what makes it."""
+    """Exit 78, no restart; the journal names the file and the command that makes it."""
     machine.run("rm", "-rf", "/etc/palpate/watch")
     machine.put(SITE, '[watch]\naddress = "0.0.0.0"\n')
     machine.get("systemctl", "start", UNIT)

@@ -1,4 +1,4 @@
-"""What the tests of all bridges need."""
+"""Fixtures for the tests of all bridges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a bridge takes from the settings of the box where no option says otherwise."""
+"""Values that a bridge takes from the settings of the box where no option sets them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Na
 
 
 def test_the_settings_of_a_new_box():
-    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a line, and
-    says which to set."""
+    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a serial line,
+    and the error names the setting."""
     args = settled("modbus")
     assert (args.feed, args.link, args.listen, args.allow_writes) == (
         "/run/palpate/feed.sock",
@@ -43,8 +43,8 @@ def test_the_settings_of_a_new_box():
 
 @pytest.mark.parametrize("kind", LINKS)
 def test_the_line_of_the_bridge(kind: str):
-    """serial.port names its link: it makes that one, at the address of the settings, and passes
-    commands on if they may be."""
+    """serial.port names its link: the bridge makes it, listens at the address of the settings, and
+    passes commands on if that is allowed."""
     sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
     args = settled(kind, sets=sets)
     assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)

@@ -1,5 +1,5 @@
 """The Modbus bridge as a process, seen by pymodbus's client and by bytes put together by hand; and
-its map by itself."""
+its map alone."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def word(client: RawModbus, name: str) -> int:
 
 
 def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address: Address):
-    """pymodbus, which knows nothing of us, finds the answer in input and in holding registers, and
-    the inputs."""
+    """pymodbus, an independent client, finds the answer in input and in holding registers, and the
+    inputs."""
     box.say(result(70_000, label="paper"), state(answered=7))
     eventually(
         lambda: word(raw, "answered") == 0 and raw.registers(ADDRESSES["answered"], 2) == [0, 7]
@@ -180,7 +180,7 @@ def test_a_command_that_the_box_refuses(box: SpeakingBox, raw: RawModbus):
 
 
 def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Address):
-    """While the box carries out one of them another peer is told that it is busy, and reading goes
+    """While the box carries out a command, another peer gets the exception BUSY, and reading goes
     on."""
     box.script = lambda s: [] if s.kind == "TARE" else obeying(s)
     raw.send(bytes.fromhex("050003ff00"))
@@ -280,7 +280,7 @@ def is_closed(peer: socket.socket) -> bool:
 
 
 def test_a_thousand_connections(raw: RawModbus, address: Address):
-    """No more than the limit are held, the others are closed at once, and who was there first is
+    """No more connections than the limit are kept, the others are closed at once, and the first is
     still served."""
     peers = []
     for _ in range(1000):
@@ -329,8 +329,8 @@ HELLO = {"type": "hello", "schema": 1, "labels": ["wood", "paper"], "bundle": "b
 
 
 def test_the_feed_in_place_of_the_line(tmp_path: Path):
-    """On the box, beside a robot that has the line: the same map; commands are refused; lines of a
-    later form are counted and do no harm."""
+    """On the box, beside a robot that has the serial line: the same map. Commands are refused;
+    lines of a later version are counted and do no harm."""
     strange = {"type": "verdict", "status": "sideways"}
     lines = [HELLO, HEALTH, strange, VERDICT, {"type": "later"}, {"type": "lost", "lines": 4}]
     path = tmp_path / "feed.sock"
@@ -387,7 +387,7 @@ def test_requests_split_anywhere(data: bytes, cuts: list[int]):
 
 @given(st.binary(min_size=1, max_size=253))
 def test_every_pdu_is_parsed_or_refused(pdu: bytes):
-    """Nothing else is ever raised; what is parsed stays within the specification's limits."""
+    """No other error is raised; parsed requests stay within the limits of the specification."""
     try:
         wanted = modbus_pdu.parse(pdu)
     except modbus_pdu.RequestRefused:
@@ -416,7 +416,7 @@ def test_each_status_has_its_code(status: Status):
 
 
 def test_before_anything_was_heard():
-    """All zero but the version and what says that nothing was heard."""
+    """All zero except the version and the entries for a box that is not heard."""
     words = registers(BoxView(), alive=False)
     assert {i: w for i, w in enumerate(words) if w} == {0: 1, ADDRESSES["status"]: STALE}
     assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]

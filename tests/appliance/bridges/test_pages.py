@@ -94,7 +94,7 @@ class SocketOfUr:
         return True
 
     def read(self, name: str, prefix: str = "", suffix: str = "", timeout: float = 2) -> str:
-        """What stands between prefix and suffix, without them; "" at the time-out."""
+        """The text between prefix and suffix, without them; "" at the time-out."""
         deadline = threading.Event()
         timer = threading.Timer(timeout, deadline.set)
         timer.start()
@@ -153,8 +153,8 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
 
 
 def test_urscript_by_socket(box: SpeakingBox):
-    """urscript.md against a real bridge: a retry without NEW, what is sorted out, each fault by its
-    name."""
+    """urscript.md against a real bridge: a retry without NEW, objects that are sorted out, each
+    fault by its name."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
         box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)
@@ -285,7 +285,7 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
         try:
             client = program.replace("127.0.0.1:1503", f"{address[0]}:{address[1]}")
             assert client != program
-            # the box needs a moment to start, which a person in three terminals takes anyway
+            # the box needs a moment to start, as with a person in three terminals
             (tmp_path / "client.py").write_text(
                 client.replace("as box:\n", "as box:\n    box.wait_ready(timeout_s=60)\n", 1)
             )
@@ -308,8 +308,8 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
-    """The real program behind a bridge, ended without a word in the middle of a sweep: the client's
-    wait ends, the restart is told, and the same client sweeps on."""
+    """The real program behind a bridge is killed in the middle of a sweep: the client's wait ends,
+    the restart is counted, and the same client sweeps on."""
     command = [
         sys.executable,
         "-m",

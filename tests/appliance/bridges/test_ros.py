@@ -57,8 +57,8 @@ def verdict(box: SpeakingBox, node: RosPeer, line: bytes) -> dict:
 
 
 def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
-    """OK with the label; WARN where it cannot be used; ERROR where nothing was learned; stamped,
-    with its frame; early answers say so."""
+    """OK with the label; WARN if it cannot be used; ERROR if nothing was learned; with time stamp
+    and frame; early answers are marked."""
     eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
     heard = verdict(box, node, result(1, label="paper"))
     assert (heard["level"], heard["message"], heard["frame_id"]) == (OK, "paper", "fingertip")
@@ -114,7 +114,7 @@ def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
 
 
 def test_services(box: SpeakingBox, node: RosPeer):
-    """Each is its command; what the box says is the message; a refusal is no success."""
+    """Each is its command; the message is the box's reply; a refusal is not a success."""
     assert node.call("tare") == {"service": "tare", "success": True, "message": "16 taxels"}
     for name in ("new_object", "start", "stop", "abort"):
         assert node.call(name)["success"]
@@ -163,7 +163,7 @@ def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
 
 
 def test_a_late_node_gets_the_state(box: SpeakingBox, node: RosPeer):
-    """The last state is kept for who comes later; the first node stands for the cell, the second
+    """The last state is kept for later subscribers; the first node stands for the cell, the second
     for a screen."""
     with ros.peer() as late:
         assert late.last("state")["values"]["skin"] == "streaming"
@@ -198,7 +198,7 @@ def test_frames_from_the_feed(tmp_path: Path):
 
 
 def test_no_box_is_named():
-    """Neither port nor feed: the node stays unconfigured, and can be told another time."""
+    """Neither port nor feed: the node stays unconfigured, and can be configured later."""
     with ros.peer() as node, ros.bridge():
         assert not node.call("configure")["success"]
 
@@ -235,8 +235,8 @@ def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[s
 
 def test_the_launch_file(box: SpeakingBox):
     """The process that it describes is the bridge with the parameters beside it, configured and
-    activated; it goes through its lifecycle, and ends with SIGINT, which launch sends first.
-    `launch` itself is no wheel: it was not run."""
+    activated. It goes through its lifecycle, and ends with SIGINT, which launch sends first.
+    `launch` itself is not available as a wheel and was not run."""
     ((process, command),) = ros_launch.processes(
         PARAMETERS.with_name("palpate.launch.py"), port=str(box.path)
     )

@@ -30,7 +30,8 @@ def _installed() -> None:
 
 @pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
-    """A node that hears the box through a bridge which may command it, and knows its labels."""
+    """A node that hears the box through a bridge with permission to command it, and knows its
+    labels."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}", *WRITES):
         ready(box, peer)
         yield peer
@@ -43,7 +44,7 @@ def ready(box: SpeakingBox, peer: RosPeer) -> None:
 
 
 def commands(box: SpeakingBox) -> list[str]:
-    """What the box has heard, without questions."""
+    """The commands that the box has heard, without questions."""
     return [s.kind for s in box.heard if s.kind not in ("STATE", "LABEL")]
 
 
@@ -61,7 +62,7 @@ def later(node: RosPeer, before: int) -> Mapping[str, Any]:
 
 
 def phases(node: RosPeer) -> list[str]:
-    """What was said of the goals."""
+    """The feedback of the goals."""
     return [feedback["phase"] for feedback in node.on("feedback")]
 
 
@@ -78,8 +79,8 @@ def silent(heard: Sentence) -> list[bytes]:
 
 
 def test_a_sweep(box: SpeakingBox, node: RosPeer):
-    """START, the slide, STOP, the answer with all that RES says; feedback tells when to slide; NEW
-    where it is wanted."""
+    """START, the slide, STOP, the answer with all fields of RES; feedback announces the slide; NEW
+    if it is requested."""
     found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True)
     assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
     assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (
@@ -161,7 +162,7 @@ def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
 
 
 def test_a_dead_box(box: SpeakingBox, node: RosPeer):
-    """A box that says nothing any more: given up long before the time limit."""
+    """A box that has fallen silent: the goal ends long before the time limit."""
     box.script = silent
     begun(node)
     assert (
@@ -235,7 +236,7 @@ def test_commands_need_allow_writes(box: SpeakingBox):
 
 
 def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
-    """palpate_msgs cannot be imported: one line of the log says so, and everything else works."""
+    """palpate_msgs cannot be imported: one log line about it, and everything else works."""
     broken = tmp_path / "path" / "palpate_msgs"
     broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise ImportError('no palpate_msgs here')\n")
@@ -268,9 +269,9 @@ def test_with_the_messages_nothing_is_said_of_them(box: SpeakingBox, tmp_path: P
 
 @pytest.mark.slow
 def test_with_the_box_itself(tmp_path: Path):
-    """The box's program on a simulated skin, a bridge on its line, another node: sweeps are
-    numbered, timed and answered by it, whatever the simulated finger did; a second START is what
-    the box makes of it."""
+    """The box's program on a simulated skin, a bridge on its serial line, another node: the box
+    numbers, times and answers sweeps, whatever the simulated finger did; it decides about a second
+    START."""
     quiet = [
         "--set",
         "store.runtime=",

@@ -1,4 +1,4 @@
-"""The TCP server of the bridges: a peer that takes nothing does not keep the program from
+"""The TCP server of the bridges: a peer that reads nothing does not keep the program from
 ending."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import socket
 from appliance.bridges.server import BUFFER, TcpPeer, TcpServer
 
 LONG_S = 60.0
-"""Far more than the end may take, even on a busy machine."""
+"""Far longer than the end may take, even on a busy machine."""
 
 
 def test_a_peer_that_never_reads_does_not_hold_the_end() -> None:

@@ -22,7 +22,7 @@ from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
 
 class Wanted(NamedTuple):
-    """What is wanted of a sweep."""
+    """Parameters of a sweep."""
 
     new_object: bool = False
     slide_s: float = 0.05
@@ -30,7 +30,7 @@ class Wanted(NamedTuple):
 
 
 class Hurried(SystemClock):
-    """A clock on which each look takes a second."""
+    """A clock that advances by a second with each reading."""
 
     def __init__(self) -> None:
         self._looks = 0
@@ -96,7 +96,7 @@ def saying(**lines: bytes) -> Callable[[Sentence], list[bytes]]:
 
 
 def test_start_slide_stop_answer(swept: Swept):
-    """The commands in order, and NEW only where it is wanted."""
+    """The commands in order, and NEW only if it is requested."""
     answer = swept.run()
     assert (answer.status, answer.label, answer.sweep) == (Status.OK, "wood", 1)
     assert swept.has_heard("START", "STOP")
@@ -130,7 +130,7 @@ def test_a_sweep_of_another_is_not_stopped(swept: Swept):
 
 
 def test_an_answer_counts_although_stop_fails(swept: Swept):
-    """The line is lost after an early answer: the answer holds."""
+    """The line is lost after an early answer: the answer is valid."""
     swept.box.script = saying(START=result(1, share="0.40"))
     swept.at_phase = lambda phase: phase == "early" and swept.box.unplug()
     assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).early
@@ -216,7 +216,7 @@ def test_unplugged_while_sliding(swept: Swept):
 
 
 def test_a_box_that_falls_silent(swept: Swept):
-    """Without a sentence for 3.5 s the sweep is given up, long before its time limit."""
+    """Without a sentence for 3.5 s the sweep ends, long before its time limit."""
     swept.use(Hurried())
     swept.box.script = saying()
     with pytest.raises(
@@ -252,7 +252,7 @@ def test_a_box_that_refuses(swept: Swept):
 
 
 def test_a_box_that_is_not_ready(swept: Swept, monkeypatch: pytest.MonkeyPatch):
-    """No sweep is begun; the reason says what is missing."""
+    """No sweep is begun; the reason names the missing condition."""
     monkeypatch.setattr(sweep, "READY_S", 0.3)
     absent = sentence(
         "ANS", "STATE", "ok", "9.000", "absent", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim"
@@ -276,7 +276,7 @@ def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
 
 
 def test_the_feed_begins_nothing(tmp_path: Path):
-    """It is read-only, and says so."""
+    """It is read-only, and the error names it."""
     source = FeedSource(str(tmp_path / "feed.sock"))
     with pytest.raises(CommandRefused, match="the feed is read-only"):
         CommandedSweep(source, canceled=lambda: False, say=lambda phase, answer: None).run(Wanted())

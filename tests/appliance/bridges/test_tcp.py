@@ -1,5 +1,5 @@
-"""The serial line over TCP as a process: what peers hear and may say; the pseudo-terminal that a
-box opens; limits."""
+"""The serial line over TCP as a process: the sentences and commands of peers; the pseudo-terminal
+that a box opens; limits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Address = tuple[str, int]
 
 
 def url(address: Address) -> str:
-    """What the client opens."""
+    """The URL for the client."""
     return f"socket://{address[0]}:{address[1]}"
 
 
@@ -63,8 +63,8 @@ def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
 
 
 def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
-    """Two peers get the same sentences, and each the answers to its own commands alone; what is
-    damaged on the line is not passed on."""
+    """Two peers get the same sentences, and each the answers only to its own commands; damaged
+    sentences are not passed on."""
     with bridge("tcp", "--port", box.path) as address:
         peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
         for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
@@ -115,7 +115,7 @@ def test_a_line_that_is_gone(box: SpeakingBox):
 
 
 def all_of(peer: socket.socket) -> bytes:
-    """What can be read until the connection ends."""
+    """All bytes until the connection ends."""
     got = b""
     with peer, suppress(ConnectionError):  # reset: what waited is gone
         while more := peer.recv(1 << 16):
@@ -124,7 +124,7 @@ def all_of(peer: socket.socket) -> bytes:
 
 
 def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
-    """It fills its buffer and is dropped; the other one gets every sentence."""
+    """It fills its buffer and is dropped; the other peer gets every sentence."""
     with bridge("tcp", "--port", box.path) as address:
         deaf = socket.socket()
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
@@ -143,7 +143,7 @@ def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
 
 
 class DeafPort:
-    """A port that takes what it is given."""
+    """A port that accepts all bytes."""
 
     def __init__(self) -> None:
         self.written: list[bytes] = []
@@ -163,7 +163,8 @@ class DeafPort:
 
 
 def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
-    """Of many commands at once one goes out, and the next after its time, whoever sent it."""
+    """Of many commands at once one is sent, and the next after its pause, whichever peer sent
+    it."""
     monkeypatch.setattr(tcp, "PACE_S", 3600.0)
     monkeypatch.setattr(tcp, "ANSWER_S", 0.01)
     port = DeafPort()
@@ -185,7 +186,7 @@ def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
-    """The peer is told; an answer that comes too late, or to another command, is for nobody."""
+    """The peer gets an error; an answer that comes too late, or to another command, is dropped."""
     monkeypatch.setattr(tcp, "ANSWER_S", 0.1)
     monkeypatch.setattr(tcp, "PACE_S", 0.0)
 
@@ -227,7 +228,8 @@ def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
 
 
 def test_a_silent_peer_makes_room():
-    """A full server gives up who has been silent longest, but nobody who has spoken lately."""
+    """A full server drops the peer that has been silent longest, but none that has sent something
+    lately."""
 
     async def run() -> None:
         server = TcpServer(lambda peer: asyncio.sleep(LONG_S), most=2)
@@ -246,8 +248,8 @@ def test_a_silent_peer_makes_room():
 
 
 def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
-    """--link: one name, for serial.port of a box on this machine; what was written before it came
-    is not read later, and the name goes with the bridge."""
+    """--link: one name, for serial.port of a box on this machine. Bytes written before the bridge
+    came are not read later, and the name goes with the bridge."""
     path = tmp_path / "line"
     with bridge("tcp", "--link", path, "--allow-writes") as address:
         with (
@@ -263,7 +265,7 @@ def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
 
 
 def test_a_link_that_was_left_behind(tmp_path: Path):
-    """The name of a bridge that was killed is taken over; a file of somebody else is not."""
+    """The link of a killed bridge is replaced; another program's file is not."""
     path = tmp_path / "line"
     path.symlink_to("/dev/pts/999999")
     port = LinkPort(path)
@@ -277,7 +279,7 @@ def test_a_link_that_was_left_behind(tmp_path: Path):
 
 
 def test_a_link_that_nobody_reads(tmp_path: Path):
-    """Writing does not hang: what does not fit is an error."""
+    """Writing does not hang: if the buffer is full it raises."""
     port = LinkPort(tmp_path / "line")
     with pytest.raises(BlockingIOError):
         port.write(sentence("ID") * 10_000)

@@ -341,9 +341,9 @@ def test_counts_that_are_no_numbers_become_null(tmp_path: Path) -> None:
 
 
 def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offered) -> None:
-    """Two thousand verdicts that one reader does not read: the lines that it gets in the end and
-    its lost lines are all of them. Another reader has them all, and the queue stayed within its
-    limit."""
+    """Two thousand verdicts, and a reader that does not read: its lines in the end and its lost
+    lines add up to all of them. Another reader has them all, and the queue stayed within its limit.
+    """
     slow, quick = offered.peer(), offered.peer()
     all_lines: list[dict[str, Any]] = []
     for i in range(2000):
