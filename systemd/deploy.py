@@ -1,6 +1,6 @@
 """Delivers a bundle to boxes, and prints a line for each box.
 
-A box does not trust the copied files: `palpate install` checks signature, manifest, model and
+A box does not trust the copied files: `palpate bundles install` checks signature, manifest, model and
 golden sweeps with the box's runtime, and the bundle runs on trial from the next start on. If the
 delivery is interrupted at any moment, the box has the old bundle or the new bundle; run the command
 again to finish.
@@ -98,7 +98,7 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{packed.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
     how = (" --shadow" if shadow else "") + (" --other-skin" if other_skin else "")
-    install = f"{PALPATE} install {incoming}/{packed.sha}{how}"
+    install = f"{PALPATE} bundles install {incoming}/{packed.sha}{how}"
     box.run("checking it there", install, user="palpate", limit_s=120)
     box.run("tidying up", f"rm -r {incoming}/{packed.sha}", user="palpate")
     return outcome(box, packed, ready=box.restart(READY_S, STARTS), shadow=shadow)
@@ -115,7 +115,8 @@ def where(box: FleetBox) -> tuple[str, str]:
         raise Failed(
             f"its settings name a bundle, classifier.bundle = {own!r}; remove this setting first"
         )
-    return str(settings["store"]["folder"]), str(settings["store"]["status"])
+    folder, runtime = (str(settings["store"][key]) for key in ("folder", "runtime"))
+    return folder, f"{runtime}/status.json"
 
 
 def _runs(box: FleetBox, packed: BundleArchive, store: str, status: str) -> bool:
@@ -145,7 +146,9 @@ def outcome(box: FleetBox, packed: BundleArchive, *, ready: bool, shadow: bool) 
         raise Failed(f"the bundle is {entry['role']} there; another delivery ran at the same time")
     role = f"{entry['role']}: {entry['detail']}" if entry["detail"] else entry["role"]
     if not ready and box.result["waits"].startswith("skin mismatch"):
-        raise Failed(f"the bundle is {role}, but {box.result['waits']}; palpate rollback goes back")
+        raise Failed(
+            f"the bundle is {role}, but {box.result['waits']}; palpate bundles rollback goes back"
+        )
     if not ready:
         return f"{packed.name} is {role}; READY waits: {box.result['waits']}"
     lost = f"{box.result['lost_s']} s without classifying; " if "lost_s" in box.result else ""

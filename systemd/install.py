@@ -60,7 +60,7 @@ LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS
 PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
-from appliance.cli.commands import load_bundle; from appliance.core import clock, config, errors
+from appliance.cli.common import load_bundle; from appliance.core import clock, config, errors
 from appliance.inference import classifier
 try:
     settings = config.load(None, folder=Path(sys.argv[1]))

@@ -11,13 +11,14 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from appliance.cli.main import RUNS
-from appliance.cli.parser import parser
+from appliance.cli.parser import MENU, parser
 from appliance.core import config
+from appliance.core.menu import CommandParser
 from appliance.core.schema import Key
 from appliance.core.storage import put
 
@@ -52,6 +53,8 @@ BOX_PAGES = (
 )
 """Pages below docs/ that the box holds as one text, in this order."""
 MARKER = re.compile(r"(?ms)^<!-- palpate: ([a-z-]+) -->\n.*?^<!-- /palpate -->$")
+Command = tuple[str, str, argparse.ArgumentParser]
+"""Full name, description and parser of a command."""
 TITLE = """\
 # Palpate: the manual
 
@@ -65,7 +68,9 @@ def references() -> dict[str, str]:
     """The text for each marker that a page of the box may hold."""
     return {
         "settings": settings_tables(),
-        "commands": command_sections(parser(RUNS)),
+        "commands": command_sections(
+            [(f"palpate {name}", text, parser(name)) for name, text in MENU.commands.items()]
+        ),
     }
 
 
@@ -168,29 +173,34 @@ def allowed(key: Key) -> str:
     return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}"
 
 
-def command_sections(top: argparse.ArgumentParser, level: str = "##") -> str:
-    """A section for each command of a parser: its description and its options. Options that more
-    than half of the commands share come first, once."""
-    found = list(leaves(top))
-    counts: dict[str, int] = {}
-    for _, _, command in found:
-        for option in command._actions:
-            counts[_option(option)] = counts.get(_option(option), 0) + 1
-    shared = {name for name, count in counts.items() if count > len(found) / 2 > 1}
+def command_sections(found: Sequence[Command], level: str = "##") -> str:
+    """A section for each command: its description, actions and options. Options that more than half
+    of the commands share come first, once."""
+    counts = Counter(
+        (_option(option), option.help) for _, _, command in found for option in command._actions
+    )
+    shared = {name for (name, _), count in counts.items() if count > len(found) / 2 > 1}
     parts = []
-    if shared - {_option(top._actions[0])}:
+    if shared - {_option(found[0][2]._actions[0])}:
         parts.append(f"{level} Options of most commands\n\n" + _options(found, shared.__contains__))
     for name, text, command in found:
         own = _options([(name, text, command)], lambda option: option not in shared)
         about = (text or command.description or "").strip()
         sentence = f"{about[:1].upper()}{about[1:].rstrip('.')}."
-        parts.append("\n".join(filter(None, [f"{level} {name}\n", sentence + "\n", own])))
+        actions = _actions(command)
+        parts.append("\n".join(filter(None, [f"{level} {name}\n", sentence + "\n", actions, own])))
     return "\n".join(parts)
 
 
-def leaves(
-    top: argparse.ArgumentParser, prefix: str = ""
-) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
+def _actions(command: argparse.ArgumentParser) -> str:
+    """The table of a command's actions; "" without any."""
+    if not isinstance(command, CommandParser) or not command.actions:
+        return ""
+    lines = [f"| `{name}` | {_cell(text)} |" for name, text in command.actions.items()]
+    return "\n".join(["| action | effect |", "|---|---|", *lines, ""])
+
+
+def leaves(top: argparse.ArgumentParser, prefix: str = "") -> Iterator[Command]:
     """Every command below a parser: full name, help, parser."""
     prefix = prefix or top.prog
     for action in top._actions:
@@ -211,9 +221,7 @@ def _option(option: argparse.Action) -> str:
     return names if option.nargs == 0 else f"{names} {value}"
 
 
-def _options(
-    found: list[tuple[str, str, argparse.ArgumentParser]], wanted: Callable[[str], bool]
-) -> str:
+def _options(found: Sequence[Command], wanted: Callable[[str], bool]) -> str:
     """The table of the options that are wanted, each once; "" without any."""
     rows: dict[str, str] = {}
     for _, _, command in found:
@@ -221,6 +229,8 @@ def _options(
             name = _option(option)
             if wanted(name) and option.dest != "help" and option.help != argparse.SUPPRESS:
                 text = option.help or ""
+                if isinstance(command, CommandParser) and command.actions_of(option):
+                    text = f"{', '.join(command.actions_of(option))}: {text}"
                 given = {**vars(option), "prog": command.prog}
                 rows[name] = text % given if "%" in text else text
     if not rows:

@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 from appliance import __version__
+from appliance.bridges import options as bridges
 from appliance.cli import bundle_commands, parser
-from appliance.cli.main import RUNS
+from appliance.cli.main import COMMANDS
+from appliance.cli.parser import BUNDLE_ACTIONS, MENU, SKIN_ACTIONS
 from appliance.core import config, errors, sentences
 from appliance.core.types import Status, Verdict
 from appliance.deployment import state
@@ -37,7 +39,6 @@ MANUAL = "\n".join(PAGES.values())
 CHANGES = (ROOT / "CHANGELOG.md").read_text()
 BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
 """The lines of all code blocks."""
-PARSER = parser.parser(RUNS)
 PICTURES = sorted(DOCS.glob("manual/*.svg"))
 
 
@@ -111,20 +112,22 @@ def test_sentences_are_as_the_box_forms_and_reads_them():
 
 def test_every_command_has_its_section(manual: ModuleType):
     """The reference holds each command of the parser with its help; a command in a text exists."""
-    assert PARSER.parse_args(["bench"]).run is RUNS["bench"]
     text = manual.references()["commands"]
-    assert re.findall(r"(?m)^## palpate (.*)$", text) == [
-        name.removeprefix("palpate ") for name, _, _ in manual.leaves(PARSER)
-    ]
-    assert set(re.findall(r"(?m)^## palpate (.*)$", text)) == set(RUNS)
+    assert re.findall(r"(?m)^## palpate (.*)$", text) == [*MENU.commands]
+    assert set(MENU.commands) == set(COMMANDS)
+    assert len(MENU.commands) <= 15
+    for actions in (BUNDLE_ACTIONS, SKIN_ACTIONS, bridges.TEXTS):
+        assert all(f"| `{name}` | {effect} |" in text for name, effect in actions.items())
     assert "| `--web PORT` |" in text
-    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= {name.split()[0] for name in RUNS}
+    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= set(MENU.commands)
+    assert set(re.findall(r"`palpate bundles ([a-z]+)", MANUAL)) <= set(BUNDLE_ACTIONS)
+    assert set(re.findall(r"`palpate skin ([a-z]+)", MANUAL)) <= set(SKIN_ACTIONS)
 
 
 @pytest.mark.parametrize("words", spoken(), ids=" ".join)
 def test_commands_can_be_copied(words: list[str]):
     """Each `palpate` command of a code block is one that the parser takes."""
-    assert PARSER.parse_args(words).run
+    assert parser.arguments(words[0], words[1:])
 
 
 def test_commands_to_be_copied_are_many():

@@ -12,7 +12,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from appliance.bridges.options import LINKS, PORTS, add_arguments
+from appliance.bridges.options import LINKS, PORTS, add_arguments, parse
 from appliance.bridges.server import TcpServer, address, stop_event, until
 from appliance.bridges.source import FeedSource, LineSource, LinkPort, Source
 from appliance.client.line import open_port
@@ -21,6 +21,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import log, to_stderr
+from appliance.core.menu import CommandParser
 
 EVERY_S = 1.0
 
@@ -31,7 +32,7 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     if args.listen is None:
         args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
-    if args.port or args.link or getattr(args, "feed", None):
+    if args.port or args.link or args.feed:
         return
     if settings.serial.port == LINKS[kind]:
         args.link = Path(LINKS[kind])
@@ -47,7 +48,7 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
 
 
 def _source(args: argparse.Namespace) -> Source:
-    if getattr(args, "feed", None):
+    if args.feed:
         return FeedSource(args.feed)
     return LineSource(*_port(args), baud=args.baud)
 
@@ -124,6 +125,11 @@ def run_ros(args: argparse.Namespace) -> int:
 RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
 
 
+def run(args: argparse.Namespace) -> int:
+    """`palpate bridge KIND`."""
+    return RUNS[args.kind](args)
+
+
 def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> None:
     host, port = server.address
     commands = (
@@ -139,15 +145,12 @@ def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> No
 
 def main(argv: Sequence[str] | None = None) -> int:
     """`python -m appliance.bridges`."""
-    parser = argparse.ArgumentParser(
-        "python -m appliance.bridges", description="Bridges from a Palpate box."
-    )
-    commands = parser.add_subparsers(required=True, metavar="BRIDGE", dest="bridge")
-    add_arguments(lambda name, text: commands.add_parser(name, help=text, description=text))
-    args = parser.parse_args(argv)
+    parser = CommandParser("python -m appliance.bridges", description="Bridges from a Palpate box.")
+    add_arguments(parser)
+    args = parse(parser, sys.argv[1:] if argv is None else argv)
     to_stderr()
     try:
-        return RUNS[args.bridge](args)
+        return run(args)
     except ApplianceError as e:
         print(f"palpate: {e}", file=sys.stderr)
         return e.exit_code

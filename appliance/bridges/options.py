@@ -4,10 +4,11 @@ bridge."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.core.config import SerialConfig, StoreConfig
+from appliance.core.menu import CommandParser
 
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
@@ -23,51 +24,66 @@ TEXTS = {
 }
 
 
-def add_arguments(add: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    """Add the options of all bridges. add: makes the parser of a bridge, from its name and help."""
-    for name in TEXTS:
-        command = add(name, TEXTS[name])
-        if name == "ros":
-            command.add_argument(
-                "--ros-args",
-                nargs=argparse.REMAINDER,
-                default=[],
-                metavar="...",
-                help="parameters and names of ROS; the last option",
-            )
-            continue
-        box = command.add_mutually_exclusive_group()
-        box.add_argument(
-            "--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT"
-        )
-        link = f"on the box: make the link PATH; default if serial.port is {LINKS[name]}"
-        box.add_argument("--link", type=Path, metavar="PATH", help=link)
-        if name == "modbus":
-            box.add_argument(
-                "--feed",
-                nargs="?",
-                const=FEED,
-                metavar="PATH",
-                help=f"on the box: read the feed at PATH (default {FEED})",
-            )
-        command.add_argument(
-            "--baud",
-            type=int,
-            default=BAUD,
-            metavar="N",
-            help=f"baud rate of the serial line (default {BAUD})",
-        )
-        listen = f"default: bridge.address of the settings, port {PORTS[name]}"
-        command.add_argument("--listen", metavar="HOST:PORT", help=listen)
-        writes = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
-        command.add_argument("--allow-writes", action="store_true", help=writes)
-        command.add_argument(
-            "--most",
-            type=_number,
-            default=MOST,
-            metavar="N",
-            help=f"most connections at a time (default {MOST})",
-        )
+def add_arguments(command: CommandParser) -> None:
+    """Add the kind of bridge and the options of all kinds."""
+    command.choose("kind", TEXTS)
+    lines = command.only_for("tcp", "modbus")
+    lines("--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT")
+    links = " or ".join(map(str, LINKS.values()))
+    lines(
+        "--link",
+        type=Path,
+        metavar="PATH",
+        help=f"on the box: make the link PATH; default if serial.port is {links}",
+    )
+    lines(
+        "--baud",
+        type=int,
+        default=BAUD,
+        metavar="N",
+        help=f"baud rate of the serial line (default {BAUD})",
+    )
+    ports = ", ".join(f"{kind} {port}" for kind, port in PORTS.items())
+    lines(
+        "--listen",
+        metavar="HOST:PORT",
+        help=f"default: bridge.address of the settings, and the port of the kind ({ports})",
+    )
+    lines(
+        "--allow-writes",
+        action="store_true",
+        help="peers may start, stop, tare and abort, even if bridge.allow_writes is false",
+    )
+    lines(
+        "--most",
+        type=_number,
+        default=MOST,
+        metavar="N",
+        help=f"most connections at a time (default {MOST})",
+    )
+    command.only_for("modbus")(
+        "--feed",
+        nargs="?",
+        const=FEED,
+        metavar="PATH",
+        help=f"on the box: read the feed at PATH (default {FEED})",
+    )
+    command.only_for("ros")(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="...",
+        help="parameters and names of ROS; the last option",
+    )
+
+
+def parse(command: CommandParser, words: Sequence[str]) -> argparse.Namespace:
+    """The arguments of a bridge; ends the program if they are wrong, or with help."""
+    args = command.parse(words)
+    ways = [name for name in ("port", "link", "feed") if getattr(args, name)]
+    if len(ways) > 1:
+        command.error(f"--{ways[0]} and --{ways[1]} both name a way to the box; use one of them")
+    return args
 
 
 def _number(text: str) -> int:

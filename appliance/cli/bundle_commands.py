@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle
-from appliance.cli.commands import load_settings, status_file
+from appliance.cli.common import load_settings, status_file
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
@@ -35,7 +35,7 @@ NEXT = "from the next start on: systemctl restart palpate"
 class ListedBundle:
     """One bundle of the store; sha "" for the packaged one, which nobody signed.
 
-    role: current, on trial, previous (what `palpate rollback` goes back to), candidate, left, kept,
+    role: current, on trial, previous (what `palpate bundles rollback` goes back to), candidate, left, kept,
     or damaged. detail: the progress of its trial, why it was left, or what is wrong with it.
     """
 
@@ -116,7 +116,7 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
     return ("kept", "") if standing.committed else ("left", standing.why or "another was deployed")
 
 
-def run_bundles(args: argparse.Namespace) -> int:
+def run_list(args: argparse.Namespace) -> int:
     """`palpate bundles`: which bundle runs, and what it goes back to."""
     from appliance.deployment import shadow
 
@@ -131,7 +131,7 @@ def run_bundles(args: argparse.Namespace) -> int:
 
 
 def run_install(args: argparse.Namespace) -> int:
-    """`palpate install`: a signed bundle comes into the store."""
+    """`palpate bundles install`: a signed bundle comes into the store."""
     settings = load_settings(args)
     store = assembly.store(settings)
     skin = None if args.other_skin else streaming(settings, store)
@@ -169,7 +169,7 @@ def suits(new: Bundle, skin: SweepFormat | None) -> None:
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """`palpate verify`: whether a bundle would be taken, but for its counter."""
+    """`palpate bundles verify`: whether a bundle would be taken, but for its counter."""
     signed = assembly.store(load_settings(args)).examine(args.folder)
     m = signed.bundle.manifest
     print(
@@ -179,29 +179,34 @@ def run_verify(args: argparse.Namespace) -> int:
 
 
 def run_commit(args: argparse.Namespace) -> int:
-    """`palpate commit`: the trial is over."""
+    """`palpate bundles commit`: the trial is over."""
     print("committed" if assembly.store(load_settings(args)).commit() else "nothing is on trial")
     return 0
 
 
 def run_rollback(args: argparse.Namespace) -> int:
-    """`palpate rollback`: back to the bundle before."""
+    """`palpate bundles rollback`: back to the bundle before."""
     sha = assembly.store(load_settings(args)).rollback()
     print(f"{f'bundle {sha[:8]}' if sha else 'the packaged bundle'} runs {NEXT}")
     return 0
 
 
 def run_promote(args: argparse.Namespace) -> int:
-    """`palpate promote`: the candidate becomes the current bundle."""
+    """`palpate bundles promote`: the candidate becomes the current bundle."""
     print(f"bundle {assembly.store(load_settings(args)).promote()[:8]} runs on trial {NEXT}")
     return 0
 
 
-RUNS = {
-    "bundles": run_bundles,
+RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    "list": run_list,
     "install": run_install,
     "verify": run_verify,
     "commit": run_commit,
     "rollback": run_rollback,
     "promote": run_promote,
 }
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate bundles ACTION`."""
+    return RUNS[args.action](args)

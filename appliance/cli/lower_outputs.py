@@ -9,25 +9,25 @@ acts on them.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from typing import Any
 
 import gpiod
 
-from appliance.cli.parser import settings
+from appliance.cli.parser import add_settings
 from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError
+from appliance.core.menu import CommandParser
 from appliance.io.gpio_lines import Lines
 
 
 def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
     """Drive all configured outputs low and release them; the exit code, as those of `palpate`."""
     about = "Sets all output lines low. Options as for palpate run."
-    args = argparse.ArgumentParser(
-        "python -m appliance.cli.lower_outputs", description=about, parents=[settings()]
-    ).parse_args(argv)
+    parser = CommandParser("python -m appliance.cli.lower_outputs", description=about)
+    add_settings(parser)
+    args = parser.parse_args(argv)
     try:
         loaded = config.load(args.board, args.set, folder=args.config_dir)
         Lines(loaded.output, gpio, SystemClock()).close()  # requested as low, then released

@@ -10,12 +10,14 @@ import argparse
 import os
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from appliance.cli.commands import OpenDevices, load_settings, local_page, stop_flag
+from appliance.cli.common import load_settings, local_page, stop_flag
+from appliance.cli.devices import open_devices
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
@@ -25,20 +27,29 @@ from appliance.io import serial_port, skin_profile, skins
 from appliance.io.serial_port import PortInfo
 from appliance.io.skin_profile import DEFAULT, SkinProfile
 
+if TYPE_CHECKING:
+    from appliance.tools.skin_new import PortSample
 
-def run_check(args: argparse.Namespace, open_devices: OpenDevices) -> int:
+CHECK_S = 10.0
+"""Default of `palpate skin check --seconds`."""
+NEW_S = 3.0
+"""Default of `palpate skin new --seconds`, at each speed."""
+
+
+def run_check(args: argparse.Namespace) -> int:
     """`palpate skin check`: each part of PROTOCOL.md, one line each; 1 where any fails."""
     from appliance.tools import skin_check
 
-    devices = open_devices(None)
+    devices = open_devices(args, None)
     settings = devices.wire(load_settings(args))
     failed, port = 0, settings.skin.link == "serial"
+    seconds = args.seconds or CHECK_S
     with closing(skins.open_board(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
         log.info(
-            f"frames are listened to for {args.seconds:g} s; stopping, requests and overflow take {more} more"
+            f"frames are listened to for {seconds:g} s; stopping, requests and overflow take {more} more"
         )
-        for found in skin_check.check(link, devices.clock, args.seconds, port=port):
+        for found in skin_check.check(link, devices.clock, seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
     return 1 if failed else 0
@@ -60,41 +71,51 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_detect(args: argparse.Namespace) -> int:
-    """`palpate skin detect`: what is plugged in, and which profile fits; 1 where none does."""
-    from appliance.io.serial_link import SerialLink
+    """`palpate skin detect`: what is plugged in, and which profile fits; 1 if none does."""
     from appliance.tools import skin_detect
 
-    if args.write and not args.port:
+    if args.write and not args.skin_port:
         raise ConfigError(
             "--write writes commands to a port, so it has to be named: add --port /dev/..."
         )
-    settings, clock = load_settings(args), SystemClock()
-    profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
+    settings, port = load_settings(args), args.skin_port
     there = serial_port.ports()
-    if args.port:
-        there = [port for port in there if port.path == args.port] or [PortInfo(args.port)]
-    # a port that is soldered on may lead to the robot, or to nothing: only the named one is opened
-    usb = [port for port in there if port.vendor_id or args.port]
+    if port:
+        there = [one for one in there if one.path == port] or [PortInfo(port)]
+    # a port that is soldered on may lead to the robot, or to nothing: only the named port is opened
+    usb = [one for one in there if one.vendor_id or port]
     found = 0
     for line in skin_detect.on_usb(settings.skin):
         print(line, flush=True)
         found += 1
-    if usb:
-        log.info(f"listening at {', '.join(port.path for port in usb)}; some seconds at each")
+    found += _listen(usb, settings, args.write)
+    if not found and not usb:
+        others = ", ".join(one.path for one in there) or "none"
+        print(f"no skin on USB; plug it in, or name another port with --port (there are: {others})")
+    return 0 if found else 1
+
+
+def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
+    """Listen at each port and print the profiles that fit; the number of ports where one fits."""
+    from appliance.io.serial_link import SerialLink
+    from appliance.tools import skin_detect
+
+    clock, fitting = SystemClock(), 0
+    profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
+    if ports:
+        names = ", ".join(port.path for port in ports)
+        log.info(f"listening at {names}; some seconds at each")
     for one in skin_detect.detect(
-        usb,
+        ports,
         profiles,
         lambda path, baud: SerialLink(path, baud, clock),
         clock,
-        write=args.write,
+        write=write,
         seconds=skin_detect.LISTEN_S,
     ):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
-        found += bool(one.profile)
-    if not found and not usb:
-        others = ", ".join(port.path for port in there) or "none"
-        print(f"no skin on USB; plug it in, or name another port with --port (there are: {others})")
-    return 0 if found else 1
+        fitting += bool(one.profile)
+    return fitting
 
 
 def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:
@@ -107,12 +128,12 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
             yield name, e
 
 
-def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
+def run_show(args: argparse.Namespace) -> int:
     """`palpate skin show`: the skin live, in the terminal and on a page, until Ctrl-C."""
     from appliance.tools import skin_show
     from appliance.tools.skin_screen import SkinScreen
 
-    devices = open_devices(None)
+    devices = open_devices(args, None)
     settings = devices.wire(load_settings(args))
     format = devices.format or skins.announced(settings, devices)
     if slow := skin_profile.warning(format):
@@ -132,29 +153,39 @@ def run_show(args: argparse.Namespace, open_devices: OpenDevices) -> int:
 
 
 def run_new(args: argparse.Namespace) -> int:
-    """`palpate skin new`: listens to a port, and writes a profile where the grid is named; else
-    says how it can be."""
+    """`palpate skin new`: listen to a port and propose profiles; with a grid, write a profile."""
     from appliance.io.serial_link import SerialLink
     from appliance.tools import skin_new
 
-    settings = load_settings(args)
+    settings, seconds = load_settings(args), args.seconds or NEW_S
     path = (args.out or skins.OWN) / f"{_new_name(args, settings)}.toml"
     if args.grid:
         _make(path.parent)  # before a user has listened in vain
-    port, clock = args.port, SystemClock()
+    port, clock = args.skin_port, SystemClock()
     bauds = (args.baud,) if args.baud else skin_new.BAUDS
     log.info(
-        f"listening at {port}: {args.seconds:g} s at each speed, until one shows a pattern; touch the skin"
+        f"listening at {port}: {seconds:g} s at each speed, until one shows a pattern; touch the"
+        " skin"
     )
-    heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, args.seconds, clock)
+    heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, seconds, clock)
     for number, proposal in enumerate(heard.proposals, 1):
         print(f"{number}: {skin_new.words(proposal)}")
-    if not args.grid:
+    if args.grid:
+        _write(path, heard, args)
+    else:
         print(
-            f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first is not right"
+            f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first"
+            " is not right"
         )
-        return 0
+    return 0
+
+
+def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
+    """Write the profile of the chosen proposal, and print how it is used."""
+    from appliance.tools import skin_new
+
     chosen, grid = skin_new.choose(heard, args.grid, args.proposal or 0)
+    port = args.skin_port
     there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
@@ -165,7 +196,6 @@ def run_new(args: argparse.Namespace) -> int:
         else f'--skin {path.stem} (skin.profile = "{path.stem}")'
     )
     print(f"{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with {use}")
-    return 0
 
 
 def _make(folder: Path) -> None:
@@ -195,5 +225,15 @@ def _new_name(args: argparse.Namespace, settings: Config) -> str:
     return name
 
 
-WITH_DEVICES = {"skin check": run_check, "skin show": run_show}
-RUNS = {"skin list": run_list, "skin detect": run_detect, "skin new": run_new}
+RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    "list": run_list,
+    "detect": run_detect,
+    "check": run_check,
+    "show": run_show,
+    "new": run_new,
+}
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate skin ACTION`."""
+    return RUNS[args.action](args)

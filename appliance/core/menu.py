@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from appliance.core.schema import closest
 
@@ -67,7 +67,68 @@ class Menu:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose error is one line, as all errors of the program are."""
+    """The parser of one command. Its errors are one line, as all errors of the program are.
+
+    The first word after the command can choose an action. Options can then be for some actions.
+    """
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        more.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(*args, **more)
+        self.actions: Mapping[str, str] = {}
+        self._kind = ""
+        self._some: list[tuple[tuple[str, ...], argparse.Action, bool]] = []
+
+    def choose(self, kind: str, actions: Mapping[str, str], default: str | None = None) -> None:
+        """Let the first word choose one of the `actions`, which have descriptions.
+
+        kind: what the actions are called, and their name among the arguments. default: the action
+        without a word; None if the word is required.
+        """
+        self._kind, self.actions = kind, actions
+        self.add_argument(
+            kind,
+            metavar=kind.upper(),
+            type=one_of(kind, [*actions]),
+            nargs="?" if default else None,
+            default=default,
+            help=f"{', '.join(actions)}" + (f" (default {default})" if default else ""),
+        )
+        width = max(map(len, actions))
+        lines = [f"  {name:<{width}}  {text}" for name, text in actions.items()]
+        self.description = "\n".join([self.description or "", "", *lines])
+
+    def only_for(self, *actions: str) -> Callable[..., argparse.Action]:
+        """A function like add_argument, for arguments of these actions alone, under a heading. With
+        needed=True the actions do not go without the argument.
+        """
+        group = self.add_argument_group(", ".join(actions))
+
+        def add(*names: str, needed: bool = False, **how: Any) -> argparse.Action:
+            option = group.add_argument(*names, **how)
+            self._some.append((actions, option, needed))
+            return option
+
+        return add
+
+    def actions_of(self, option: argparse.Action) -> tuple[str, ...]:
+        """The actions that an option is for; () if it is for all."""
+        return next((actions for actions, one, _ in self._some if one is option), ())
+
+    def parse(self, words: Sequence[str]) -> argparse.Namespace:
+        """The arguments; ends the program if they are wrong, or with help."""
+        if not self.actions:
+            return self.parse_args(words)
+        args = self.parse_intermixed_args(words)
+        action = getattr(args, self._kind)
+        for actions, option, needed in self._some:
+            value = getattr(args, option.dest)
+            name = option.option_strings[0] if option.option_strings else option.metavar
+            if needed and action in actions and value is None:
+                self.error(f"{action} needs {name}")
+            if action not in actions and value != option.default:
+                self.error(f"{name} is for {' and '.join(actions)}, not for {action}")
+        return args
 
     def error(self, message: str) -> NoReturn:
         self.exit(USAGE_ERROR, f"{self.prog}: {message}; `{self.prog} --help` shows the options\n")

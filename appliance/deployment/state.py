@@ -123,7 +123,7 @@ class StoreState:
         if counter <= self.counter and sha != self.highest:
             raise BundleError(
                 f"bundle has counter {counter}, and {self.counter} was committed here before; sign it with a higher one "
-                "(palpate-train sign --counter), or use `palpate rollback` to go back"
+                "(palpate-train sign --counter), or use `palpate bundles rollback` to go back"
             )
 
     def json(self) -> bytes:

@@ -285,7 +285,7 @@ class Store:
         sha = self.state.candidate
         if sha == PACKAGED:
             raise BundleError(
-                "there is no candidate; deploy one with SHADOW=1 (palpate install --shadow)"
+                "there is no candidate; deploy one with SHADOW=1 (palpate bundles install --shadow)"
             )
         signed = self.bundles.get(sha)
         with self._locked() as state:
@@ -382,7 +382,7 @@ class Store:
             return self.bundles.get(sha)
         except BundleError as e:
             raise BundleError(
-                f"{e} (this bundle is committed; `palpate rollback` goes back to the one before)"
+                f"{e} (this bundle is committed; `palpate bundles rollback` goes back to the one before)"
             ) from e
 
     def _on_trial(self, sha: str) -> Choice:

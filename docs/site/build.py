@@ -152,7 +152,10 @@ def training_commands() -> str:
     parts = []
     for heading, commands in PROGRAM.groups.items():
         parts.append(f"## {heading[:1].upper()}{heading[1:]}\n")
-        parts += [manual.command_sections(PROGRAM.parser(name), "###") for name in commands]
+        parts += [
+            manual.command_sections(list(manual.leaves(PROGRAM.parser(name))), "###")
+            for name in commands
+        ]
     return "\n".join(parts)
 
 

@@ -23,7 +23,7 @@ from types import MappingProxyType
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import SCHEMA
-from appliance.cli import commands
+from appliance.cli import enrol_command
 from appliance.cli.main import main
 from appliance.core import storage
 from appliance.core.config import Config
@@ -117,29 +117,32 @@ class Shop:
         short."""
         do = self.palpate
         yield "packaged", self.copy("first")
-        yield "packaged first", do("install the first ever", "install", "@first")
+        yield "packaged first", do("install the first ever", "bundles", "install", "@first")
         yield "first", do("start and commit it", *START_AND_COMMIT)
         yield "first", self.copy("second")
-        yield "first second", do("install another", "install", "@second")
+        yield "first second", do("install another", "bundles", "install", "@second")
         yield "second", do("start it, end in order", *START)
         yield "second", do("start and commit it again", *START_AND_COMMIT)
         yield "second", self.copy("third")
-        yield "second third", do("install one that will crash", "install", "@third")
+        yield "second third", do("install one that will crash", "bundles", "install", "@third")
         yield "third", do("start it, crash", *START, way="crash")
         yield "third", do("start it, crash again", *START, way="crash")
         yield "second third", do("start it, crash a third time", *START, way="crash")
         yield "second", do("start a fourth time", *START)
-        yield "second first", do("roll back", "rollback")
+        yield "second first", do("roll back", "bundles", "rollback")
         yield "first", do("start after rolling back", *START)
-        yield "first second", do("roll forward", "rollback")
+        yield "first second", do("roll forward", "bundles", "rollback")
         yield "second", self.copy("fourth")
-        yield "second", do("install as the candidate", "install", "--shadow", "@fourth")
-        yield "second fourth", do("promote the candidate", "promote")
+        yield "second", do("install as the candidate", "bundles", "install", "--shadow", "@fourth")
+        yield "second fourth", do("promote the candidate", "bundles", "promote")
         yield "fourth", self.copy("fifth")
-        yield "fourth fifth", do("install one more while that is on trial", "install", "@fifth")
-        yield "fifth second", do("roll back from the trial", "rollback")
-        yield "second fifth", do("install it again", "install", "@fifth")
-        yield "fifth", do("commit it by hand", "commit")
+        yield (
+            "fourth fifth",
+            do("install one more while that is on trial", "bundles", "install", "@fifth"),
+        )
+        yield "fifth second", do("roll back from the trial", "bundles", "rollback")
+        yield "second fifth", do("install it again", "bundles", "install", "@fifth")
+        yield "fifth", do("commit it by hand", "bundles", "commit")
 
     def scene(self) -> CutScene:
         """All steps, each command of which is cut short."""
@@ -177,13 +180,13 @@ class Shop:
         yield "cork", do("start it and end in order", *START)
         yield "cork", do("start and commit it", *START_AND_COMMIT)
         yield "cork felt", self.enrols("felt")
-        yield "felt cork", do("roll back from the trial", "rollback")
-        yield "cork first", do("roll back", "rollback")
-        yield "first cork", do("roll forward", "rollback")
+        yield "felt cork", do("roll back from the trial", "bundles", "rollback")
+        yield "cork first", do("roll back", "bundles", "rollback")
+        yield "first cork", do("roll forward", "bundles", "rollback")
         yield "cork felt", self.enrols("felt", name="enrol felt again")
         yield "felt", self.copy("second")
-        yield "felt", do("commit it by hand", "commit")
-        yield "felt second", do("install another", "install", "@second")
+        yield "felt", do("commit it by hand", "bundles", "commit")
+        yield "felt second", do("install another", "bundles", "install", "@second")
 
     def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
         """The id that the bundle has with each of the labels: the same sweeps give the same
@@ -208,7 +211,9 @@ class Shop:
 
     def alone(self, way: str) -> CutScene:
         """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
-        step = self.palpate("install another", "install", str(self.at("second")), way=way)
+        step = self.palpate(
+            "install another", "bundles", "install", str(self.at("second")), way=way
+        )
         return self._scene("delivery", self._delivered, [("first second", step)])
 
     def _scene(
@@ -232,7 +237,7 @@ class Shop:
     def _delivered(self, folder: Path) -> None:
         """A box that runs the first bundle."""
         _bare(folder)
-        for words in (("install", self.at("first")), START_AND_COMMIT):
+        for words in (("bundles", "install", self.at("first")), START_AND_COMMIT):
             code, output = _apart(self.words(folder, *words))
             if code:
                 raise NotFollowed(f"{words[0]} ended with {code}: {_end(output)}")
@@ -258,7 +263,7 @@ class Shop:
         """What is wrong with the box when the last bundle is delivered and committed."""
         again = folder / INCOMING / "again"
         shutil.copytree(self.at("last"), again)
-        code, output = _apart(self.words(folder, "install", again))
+        code, output = _apart(self.words(folder, "bundles", "install", again))
         if code:
             return [f"the next delivery ends with {code}: {_end(output)}"]
         left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]
@@ -327,6 +332,6 @@ that."""
 
 
 if __name__ == "__main__":
-    commands._enrolment_key = _signs
+    enrol_command._enrolment_key = _signs
     setattr(*WAYS[sys.argv[1]])
     sys.exit(main(sys.argv[2:]))

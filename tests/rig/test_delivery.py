@@ -204,7 +204,9 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
         )
         cell.lines.wait("READY", False, BACK_S)
         answered_by(cell, first)
-        note("power cut in the trial, then palpate rollback", "the bundle before answers", 1)
+        note(
+            "power cut in the trial, then palpate bundles rollback", "the bundle before answers", 1
+        )
     sound(box)
 
 

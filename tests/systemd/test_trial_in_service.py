@@ -69,8 +69,8 @@ class DeliveredStore:
         self.do("commit")
 
     def do(self, *command: str) -> str:
-        """A command of the box, as its user."""
-        return self.machine.get(*AS_PALPATE, *command)
+        """`palpate bundles`, as its user."""
+        return self.machine.get(*AS_PALPATE, "bundles", *command)
 
     def deploy(self, *options: str, **changes: Any) -> str:
         """Copy a new bundle, A with changes to its manifest, to the box and install it; its
@@ -215,8 +215,8 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """Exit 78, no restarts, and the remedy in the journal; after `palpate rollback` and a start, A
-    serves."""
+    """Exit 78, no restarts, and the remedy in the journal; after `palpate bundles rollback` and a
+    start, A serves."""
     new = store.deploy()
     store.do("commit")
     model = f"/var/lib/palpate/bundles/{new}/model.onnx"
@@ -228,7 +228,7 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     service.until("ActiveState", "failed")
     assert (service["ExecMainStatus"], service["NRestarts"]) == ("78", "0")
     assert any(
-        "model.onnx was altered" in line and "palpate rollback" in line
+        "model.onnx was altered" in line and "palpate bundles rollback" in line
         for line in service.log_lines()
     )
     store.do("rollback")

@@ -216,7 +216,7 @@ def test_align_with_what_is_simulated(
     )
     turns = iter(range(1200))
     monkeypatch.setattr(
-        "appliance.cli.commands.stop_flag", lambda: lambda: next(turns, None) is None
+        "appliance.cli.look_commands.stop_flag", lambda: lambda: next(turns, None) is None
     )
     name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
     assert main(["align", "--sim", name, "--virtual"]) == 0

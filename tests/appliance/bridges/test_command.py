@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from appliance.bridges import command
-from appliance.bridges.options import LINKS, add_arguments
+from appliance.bridges.options import LINKS, add_arguments, parse
 from appliance.core import config
 from appliance.core.errors import ConfigError
+from appliance.core.menu import CommandParser
 from tests.factories.paths import NO_SITE
 
 
 def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Namespace:
     """The options of a bridge, once the settings have filled them in."""
-    parser = argparse.ArgumentParser()
-    commands = parser.add_subparsers()
-    add_arguments(lambda name, text: commands.add_parser(name))
-    args = parser.parse_args([kind, *options])
+    parser = CommandParser("bridge")
+    add_arguments(parser)
+    args = parse(parser, [kind, *options])
     command.settle(kind, args, config.load(None, sets, site=NO_SITE))
     return args
 
@@ -81,3 +81,24 @@ def test_no_way_to_the_box(sets: tuple[str, ...]):
         match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"',
     ):
         settled("modbus", sets=sets)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("tcp", "--feed", "x"), "--feed is for modbus, not for tcp"),
+        (("ros", "--port", "x"), "--port is for tcp and modbus, not for ros"),
+        (("modbus", "--feed", "x", "--port", "y"), "--port and --feed both name a way to the box"),
+        (("modbuss",), "there is no kind 'modbuss'; did you mean 'modbus'?"),
+    ],
+)
+def test_options_that_do_not_fit(
+    options: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+):
+    """An option of another kind, or two ways to the box: one line, exit code 2."""
+    with pytest.raises(SystemExit) as ended:
+        settled(*options)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""`palpate install` beside a service that runs: a bundle for another skin than the one that streams
+"""`palpate bundles install` beside a service that runs: a bundle for another skin than the one that streams
 is refused."""
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
 def test_the_command_refuses_it_unless_it_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """`palpate install` beside a service whose skin streams: nothing is changed; with
+    """`palpate bundles install` beside a service whose skin streams: nothing is changed; with
     `--other-skin` it is on trial."""
     box = Delivery(tmp_path)
     held = toy_bundle.files()
@@ -103,6 +103,7 @@ def test_the_command_refuses_it_unless_it_is_told(
     how = {"folder": box.how.folder, "keys": box.how.keys, "runtime": tmp_path}
     StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
     command = [
+        "bundles",
         "install",
         str(folder),
         *(word for name in how for word in ("--set", f"store.{name}={how[name]}")),

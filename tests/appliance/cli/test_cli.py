@@ -18,8 +18,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from appliance.bridges import command as bridges
+from appliance.bridges import options
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Early
+from appliance.cli import bundle_commands, parser, skin_commands
+from appliance.cli import devices as cli_devices
 from appliance.cli import main as main_module
 from appliance.cli.main import main
 from appliance.core import config, statistics
@@ -353,13 +357,13 @@ def test_record_on_a_machine_without_gpio(
 ):
     """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are
     recorded, in the form that the skin announces, or that a person describes."""
-    simulated = main_module._simulated(
+    simulated = cli_devices.simulated(
         "skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True), config.load(None)
     )
     plain = Devices(simulated.clock, None, simulated.backend, "sim")
-    monkeypatch.setattr(main_module, "Devices", lambda clock: plain)
+    monkeypatch.setattr(cli_devices, "Devices", lambda clock: plain)
     monkeypatch.setitem(sys.modules, "gpiod", None)
-    monkeypatch.setattr("appliance.cli.commands.load_bundle", None)
+    monkeypatch.setattr("appliance.runtime.assembly.running", None)
     if form:
         monkeypatch.setattr("appliance.io.skins.announced", None)
     described = ["--format", form] if form else []
@@ -621,10 +625,33 @@ def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "4x4 uint8 at 750 Hz" in err
 
 
+@pytest.mark.parametrize("words", [[], ["--help"], ["skin", "--help"], ["stauts"]])
+def test_help_loads_neither_numpy_nor_devices(words: list[str]):
+    """Help and advice answer at once, because nothing slow is imported for them."""
+    code = (
+        "import contextlib, sys\n"
+        "from appliance.__main__ import main\n"
+        f"with contextlib.suppress(SystemExit): main({words})\n"
+        "print([m for m in ('numpy', 'onnxruntime', 'usb', 'serial', 'gpiod') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_each_command_and_action_has_a_function():
+    """The menu, the table of functions and the actions agree."""
+    assert set(main_module.COMMANDS) == set(parser.MENU.commands)
+    assert all(callable(main_module._function(name)) for name in main_module.COMMANDS)
+    assert set(bundle_commands.RUNS) == set(parser.BUNDLE_ACTIONS)
+    assert set(skin_commands.RUNS) == set(parser.SKIN_ACTIONS)
+    assert set(bridges.RUNS) == set(options.TEXTS)
+
+
 def test_unknown_arguments_are_usage_errors():
-    """argparse's own exit code."""
+    """argparse's own exit code, for commands and options alike."""
+    assert main(["fly"]) == 2
     with pytest.raises(SystemExit) as e:
-        main(["fly"])
+        main(["run", "--fly"])
     assert e.value.code == 2
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from appliance.bundle import bundle
-from appliance.cli import main as cli
-from appliance.cli.commands import load_settings
+from appliance.cli import devices as cli_devices
+from appliance.cli.common import load_settings
 from appliance.cli.main import main
 from appliance.core.devices import Devices
 from appliance.core.types import SweepFormat
@@ -118,9 +118,11 @@ def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def played(args: argparse.Namespace, format: Callable[[], SweepFormat]) -> Devices:
         args.virtual = True
-        return cli._simulated("skin:wood", format(), args, load_settings(args), remember=False)
+        return cli_devices.simulated(
+            "skin:wood", format(), args, load_settings(args), remember=False
+        )
 
-    monkeypatch.setattr(cli, "_open_devices", played)
+    monkeypatch.setattr("appliance.cli.enrol_command.open_devices", played)
 
 
 @pytest.mark.slow
@@ -147,13 +149,13 @@ def test_an_enrolled_label_comes_into_the_store(
 def test_an_enrolled_folder_is_signed(
     box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
 ):
-    """--out DIR: `palpate install DIR` takes it."""
+    """--out DIR: `palpate bundles install DIR` takes it."""
     box.committed(1)
     out = box.folder / "with-cork"
     assert main(["enrol", "cork", "--out", str(out), *of(box)]) == 0
-    assert f"use it with palpate install {out}" in capsys.readouterr().err
+    assert f"use it with palpate bundles install {out}" in capsys.readouterr().err
     assert (out / bundle.ENROLMENT_SIGNATURE).is_file()
-    assert main(["verify", str(out), *of(box)]) == 0
+    assert main(["bundles", "verify", str(out), *of(box)]) == 0
     assert "signed by anna@lab, enrolled here; all is well" in capsys.readouterr().out
 
 

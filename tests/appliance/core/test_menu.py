@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+
 import pytest
 
 from appliance.core.menu import CommandParser, Menu, one_of
@@ -64,3 +66,45 @@ def test_a_misspelt_action(word: str, hint: str, capsys: pytest.CaptureFixture[s
         f"feel bundles: argument ACTION: there is no action {word!r}; {hint};"
         " `feel bundles --help` shows the options\n"
     )
+
+
+def chosen(*words: str) -> argparse.Namespace:
+    """The arguments of a command with actions."""
+    parser = CommandParser("feel bundles", description="Bundles.")
+    parser.choose("action", {"list": "show all", "install": "take DIR"}, default="list")
+    parser.only_for("install")("folder", needed=True, nargs="?", metavar="DIR")
+    parser.only_for("list")("--json", action="store_true")
+    parser.add_argument("--board")
+    return parser.parse(words)
+
+
+def test_options_of_actions(capsys: pytest.CaptureFixture[str]):
+    """Each action takes its own options and those of all, in any order; help lists the actions."""
+    assert vars(chosen()) == {"action": "list", "folder": None, "json": False, "board": None}
+    assert chosen("--json", "list").json
+    args = chosen("install", "--board", "b", "here")
+    assert (args.action, args.folder, args.board) == ("install", "here", "b")
+    with pytest.raises(SystemExit) as ended:
+        chosen("--help")
+    assert ended.value.code == 0
+    assert "  install  take DIR\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["install"], "install needs DIR"),
+        (["list", "here"], "DIR is for install, not for list"),
+        (["install", "here", "--json"], "--json is for list, not for install"),
+        (["lst"], "there is no action 'lst'; did you mean 'list'?"),
+        (["list", "--jsn"], "unrecognized arguments: --jsn"),
+    ],
+)
+def test_options_of_another_action(words: list[str], text: str, capsys: pytest.CaptureFixture[str]):
+    """One line that names the option, exit code 2."""
+    with pytest.raises(SystemExit) as ended:
+        chosen(*words)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert text in err
+    assert err.count("\n") == 1

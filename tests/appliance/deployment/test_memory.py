@@ -69,11 +69,11 @@ MEASURE = """
 import sys
 from pathlib import Path
 from appliance.bundle import bundle
-from appliance.cli.commands import load_bundle, load_settings
+from appliance.cli.common import load_bundle, load_settings
 from appliance.core.clock import SystemClock
 from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
-import appliance.runtime.loop, appliance.runtime.assembly, appliance.cli.main
+import appliance.runtime.loop, appliance.runtime.assembly, appliance.cli.run_command
 made = bundle.load(Path(sys.argv[1]))
 run = Classifier(made, SystemClock())
 for golden in made.golden:

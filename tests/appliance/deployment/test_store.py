@@ -335,7 +335,7 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
     """No other bundle is chosen by itself: the error names the way back, and that way works."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
-    with pytest.raises(BundleError, match="committed; `palpate rollback` goes back"):
+    with pytest.raises(BundleError, match="committed; `palpate bundles rollback` goes back"):
         box.start()
     assert box.store.rollback() == one == box.start()
 

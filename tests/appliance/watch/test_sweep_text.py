@@ -152,7 +152,7 @@ def test_a_terminal_that_stands_still_keeps_nobody_waiting(screen: tuple[int, Te
 
 def test_record_prints_nothing_of_it_into_a_file(tmp_path: Path) -> None:
     """Without a terminal there is no printer: standard output holds sentences alone."""
-    from appliance.cli import commands
+    from appliance.cli import record_command
 
     assert not io.StringIO().isatty()
-    assert commands._printer(skin.FORMAT, None) == []  # type: ignore[arg-type]
+    assert record_command._printer(skin.FORMAT, None) == []  # type: ignore[arg-type]

@@ -1,0 +1,82 @@
+"""Steps that several commands share: settings, bundle, signals, a local page."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.bundle.bundle import Bundle
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import ConfigError
+from appliance.core.types import SweepFormat
+from appliance.runtime import assembly
+
+if TYPE_CHECKING:
+    from appliance.watch.server import PageServer
+
+Facts = Mapping[str, Callable[[], object]]
+"""Further facts of the status and the feed, by their names; a text is shown to a person."""
+OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
+"""Opens the devices. Its argument gives the format that a simulated skin has to send; None for
+whatever its script has."""
+
+
+def load_settings(args: argparse.Namespace) -> Config:
+    """The settings that a command's options ask for. --every and --sweep are settings of the
+    trigger by the clock."""
+    sets = list(args.set)
+    for key, option in (("profile", "skin"), ("port", "skin_port")):
+        if value := getattr(args, option, None):
+            sets.append(f"skin.{key}={value}")
+    every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
+    mode = getattr(args, "trigger", None)
+    if every is not None or sweep is not None:
+        if mode not in (None, "timed"):
+            raise ConfigError(
+                f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
+            )
+        mode = "timed"
+    sets += [f"trigger.mode={mode}"] if mode else []
+    settings = config.load(args.board, sets, folder=args.config_dir)
+    times = {name: s for name, s in (("every_s", every), ("sweep_s", sweep)) if s is not None}
+    return replace(settings, trigger=replace(settings.trigger, **times)) if times else settings
+
+
+def status_file(settings: Config) -> Path:
+    """The file with the state of the service. Raises ConfigError if the settings name none."""
+    if not settings.store.status:
+        raise ConfigError(
+            'store.runtime = "" turns the status file off; set it to a folder, and restart the service'
+        )
+    return settings.store.status
+
+
+def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
+    """The bundle that the settings ask for; see assembly.running."""
+    return assembly.running(settings, answers=answers).bundle
+
+
+def stop_flag() -> Callable[[], bool]:
+    """True once SIGTERM or SIGINT has come: the loop then ends within one turn."""
+    received: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, frame: received.append(n))
+    return lambda: bool(received)
+
+
+def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:
+    """The server of a page for browsers on this machine, where a port is given."""
+    if port is None:
+        return []
+    from appliance.watch.access import Access
+    from appliance.watch.server import PageServer
+
+    return [stack.enter_context(PageServer(name, Access(port), SystemClock().now_ns))]

@@ -1,0 +1,63 @@
+"""The devices of a command.
+
+Simulated devices are chosen by name, here and nowhere else, and every sentence they cause says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from appliance.cli.common import load_settings
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import ConfigError
+from appliance.core.types import SweepFormat
+from appliance.io import skins
+
+if TYPE_CHECKING:
+    from appliance.sim.devices import RobotDevices
+
+
+def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | None) -> Devices:
+    """The real devices, or simulated ones where `--sim` names them; `format` gives what the simulated
+    skin has to send."""
+    if args.sim:
+        return simulated(
+            args.sim, format() if format else None, args, load_settings(args), remember=False
+        )
+    if args.virtual:
+        raise ConfigError("--virtual needs --sim: real devices run in real time")
+    return Devices(SystemClock())
+
+
+def simulated(
+    name: str,
+    format: SweepFormat | None,
+    args: argparse.Namespace,
+    settings: Config,
+    *,
+    remember: bool = True,
+    spread: bool = False,
+) -> RobotDevices:
+    """A simulated robot with the skin that the settings name: a readout board on USB, or one on a
+    terminal."""
+    from appliance.sim import devices, rig, script
+
+    clock = rig.VirtualClock() if args.virtual else SystemClock()
+    profile = skins.profile(settings)
+    if profile.codec == "palpate":
+        acts, source, format = script.named(name, format, args.seed, spread=spread)
+        return devices.build(format, islice(acts, args.sweeps), clock, source, remember=remember)
+    from appliance.sim.skins import devices as terminal
+    from appliance.sim.skins import sweeps
+
+    seen = sweeps.view(settings.skin.profile, profile.format)
+    acts, source, format = script.named(name, format, args.seed, spread=spread, seen=seen)
+    acts = islice(acts, args.sweeps)
+    return terminal.build(
+        settings.skin.profile, profile, format, acts, clock, source, remember=remember
+    )

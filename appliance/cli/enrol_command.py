@@ -1,0 +1,97 @@
+"""The command `palpate enrol`."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from appliance.bundle.bundle import Bundle
+from appliance.cli.common import load_settings, stop_flag
+from appliance.cli.devices import open_devices
+from appliance.core.config import Config
+from appliance.core.errors import BundleError, ConfigError
+from appliance.core.log import log
+from appliance.deployment.enrolment_key import EnrolmentKey
+from appliance.inference import enrolment
+from appliance.inference.enrolment import SweepCollector
+from appliance.runtime import assembly
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate enrol`: the box takes sweeps as always; of the good ones it learns one label
+    more."""
+    settings = load_settings(args)
+    start = assembly.running(settings, answers=not args.sim)
+    key = _enrolment_key(args, settings)
+    enrolment.admit(start.bundle, args.label)
+    if args.out:
+        enrolment.check_target(args.out, args.replace)
+    new = enrolment.enrol(start.bundle, args.label, _good_sweeps(args, settings, start.bundle))
+    if new.disagreement and not args.scattered:
+        raise BundleError(
+            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written"
+        )
+    for warning in filter(None, (new.disagreement, *new.warnings)):
+        log.warning(f"warning: {warning}")
+    files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
+    if args.out:
+        enrolment.write(files, args.out, args.replace)
+    else:
+        assembly.store(settings).enrol(files)
+    m = new.bundle.manifest
+    use = f"palpate bundles install {args.out}" if key else "classifier.bundle; it is not signed"
+    how = (
+        f"use it with {use}"
+        if args.out
+        else "it runs on trial from the next start on: systemctl restart palpate"
+    )
+    log.info(
+        f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; {how}"
+    )
+    return 0
+
+
+def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
+    """The key that signs what is enrolled, checked before the robot sweeps. None where it is not
+    signed: what a simulated skin taught, and on a bench that allows unsigned bundles. Raises
+    ConfigError."""
+    unsigned = (
+        "--sim"
+        if args.sim
+        else "classifier.allow_unsigned"
+        if settings.classifier.allow_unsigned
+        else ""
+    )
+    if unsigned:
+        if not args.out:
+            raise ConfigError(
+                f"with {unsigned} what is enrolled is not signed, and a box takes none such; give --out DIR"
+            )
+        return None
+    if not args.out and settings.classifier.early:
+        raise ConfigError(
+            "early answers end with an enrolment, whose labels they do not know; set classifier.early = false"
+        )
+    key = EnrolmentKey(settings.store.enrolment_key)
+    key.check()
+    return key
+
+
+def _good_sweeps(args: argparse.Namespace, settings: Config, current: Bundle) -> NDArray[Any]:
+    """The windows of as many good sweeps as are asked for. Raises ApplianceError where there are
+    too few."""
+    settings = replace(settings, classifier=replace(settings.classifier, early=False))
+    devices = open_devices(args, lambda: current.format)
+    stopped = stop_flag()
+    taken = SweepCollector(args.good)
+    with ExitStack() as stack:
+        port = assembly.port(settings, devices)
+        box = assembly.box(
+            settings, current, devices, port, stack, observers=[taken], labels=(args.label,)
+        )
+        box.run(lambda: taken.enough or stopped() or devices.finished(box.answered))
+    return taken.windows()

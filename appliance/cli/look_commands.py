@@ -1,0 +1,147 @@
+"""The commands with which a person looks at the box: check, status, watch, align, replay, config."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import ExitStack
+
+from appliance.alignment import live
+from appliance.alignment.live import Expected
+from appliance.alignment.terminal import Screen
+from appliance.alignment.view import Display
+from appliance.cli.common import (
+    load_bundle,
+    load_settings,
+    local_page,
+    status_file,
+    stop_flag,
+)
+from appliance.cli.devices import open_devices
+from appliance.core import config
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import BundleError, ConfigError, FormatError, SensorError
+from appliance.core.log import TroubleLog, log
+from appliance.io import skins
+from appliance.io.usb_sensor import fits
+from appliance.runtime.replay import replay
+from appliance.runtime.selftest import check
+from appliance.service import status
+
+
+def _open_any(args: argparse.Namespace, settings: Config) -> Devices:
+    """The devices; a simulated skin sends what the bundle wants, where there is one and the skin
+    can."""
+    try:
+        return open_devices(args, lambda: load_bundle(settings, answers=False).format)
+    except (BundleError, FormatError):
+        return open_devices(args, None)
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """`palpate check`: each component by itself, one line each; 1 where any fails."""
+    settings = load_settings(args)
+    devices = _open_any(args, settings)
+    failed = 0
+    for result in check(
+        devices.wire(settings), lambda: load_bundle(settings, answers=not args.sim), devices
+    ):
+        print(
+            f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True
+        )
+        failed += not result.ok
+    return 1 if failed else 0
+
+
+def run_align(args: argparse.Namespace) -> int:
+    """`palpate align`: where the contact lies, until Ctrl-C."""
+
+    if args.sim == "skin":  # its sweeps lift the finger for a tenth of a second; for this it rests
+        args.sim = "rest"
+    settings = load_settings(args)
+    devices = _open_any(args, settings)
+    expected = _expected(devices.wire(settings), devices)
+    stopped = stop_flag()  # before anybody can read the page's address
+    with ExitStack() as stack:
+        pages = local_page("watch.html", args.web, stack)
+        screen = stack.enter_context(
+            Screen(sys.stdout, devices.clock, *(page.address for page in pages))
+        )
+        displays: list[Display] = [screen, *pages]
+        live.run(devices.wire(settings), expected, devices, displays, stopped)
+    return 0
+
+
+def _expected(settings: Config, devices: Devices) -> Expected:
+    """What is known of the skin: by the bundle, where there is one that fits it or no skin yet."""
+    from appliance.alignment.live import Expected
+
+    current, fingertip = None, settings.skin.fingertip
+    try:
+        current = load_bundle(settings, answers=False)
+    except BundleError as e:
+        log.warning(f"no bundle: {e}")
+    try:
+        format = devices.format or skins.announced(settings, devices)
+    except SensorError:
+        if not current:
+            raise
+        return Expected.by(current, fingertip)  # the skin is waited for
+    if current and fits(format, current.format):
+        return Expected.by(current, fingertip)
+    return Expected(format, fingertip=fingertip)
+
+
+def run_replay(args: argparse.Namespace) -> int:
+    """`palpate replay`: the sentences of a capture, a kept sweep or a folder of them; 1 where a
+    verdict differs."""
+
+    settings = load_settings(args)
+    bundle = load_bundle(settings, answers=False)
+    return replay(args.file, settings, bundle, lambda text: print(text, end="", flush=True))
+
+
+def run_config(args: argparse.Namespace) -> int:
+    """`palpate config`: each value with its source."""
+    print(config.describe(load_settings(args)))
+    return 0
+
+
+def run_status(args: argparse.Namespace) -> int:
+    """`palpate status`: the state of the service; 69 where it waits for the skin, 1 where it does
+    not run."""
+
+    now_ns = SystemClock().now_ns()
+    report = status.read(status_file(load_settings(args)), now_ns)
+    print(json.dumps(report, indent=1) if args.json else "\n".join(status.lines(report, now_ns)))
+    return status.exit_code(report)
+
+
+def run_watch(args: argparse.Namespace) -> int:
+    """`palpate watch`: until Ctrl-C or SIGTERM."""
+    settings, clock = load_settings(args), SystemClock()
+    socket, stopped = settings.store.feed, stop_flag()
+    if not socket:
+        raise ConfigError(
+            'store.runtime = "" turns the feed off, so there is nothing to watch; set it to a folder'
+        )
+    path = str(socket)
+    if args.web is not None:
+        from appliance.watch.access import Access
+        from appliance.watch.web import PageWatcher
+
+        watcher = PageWatcher(path, Access.configured(settings.watch, args.web), clock.now_ns)
+        log.info(f"page: {watcher.server.address}")
+        watcher.run(stopped)
+        return 0
+    from appliance.watch import terminal
+
+    if args.json:
+        trouble = TroubleLog("feed", end="feed: it is read", known=False)
+        terminal.pass_on(path, sys.stdout, clock, stopped, trouble.update)
+    else:
+        terminal.TerminalWatch(path, sys.stdout, clock).run(stopped)
+    return 0

@@ -1,0 +1,163 @@
+"""The command `palpate record`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.cli.common import Facts, load_settings, stop_flag
+from appliance.cli.devices import open_devices
+from appliance.cli.reporting import capture, done, feed, status
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import ConfigError, SensorError
+from appliance.core.log import log
+from appliance.core.observer import Observer
+from appliance.core.types import SweepFormat
+from appliance.io import skin_profile, skins
+from appliance.io.robot_link import Command, Port
+from appliance.recording.recording import Labels, RecordingSession
+from appliance.runtime import assembly
+from appliance.service.systemd import Notifier
+
+if TYPE_CHECKING:
+    from appliance.watch.record import RecordPage
+
+
+def run(args: argparse.Namespace) -> int:
+    """Keep each sweep with its label. It needs no bundle: the skin announces its format."""
+    labels = Labels(args.material, args.position, args.session)
+    settings, stopped = load_settings(args), stop_flag()
+    with ExitStack() as stack:
+        devices, format = _skin(args, settings)
+        # a person at a terminal reads the log; sentences are for a robot, or for a program that
+        # reads the output
+        sentences = settings.serial.port or not sys.stdout.isatty()
+        port = assembly.port(settings, devices) if sentences else None
+        folder = args.out or Path(settings.store.folder) / "sweeps"
+        recording = RecordingSession(
+            folder, format, labels, devices.clock, _sentences(port), args.target
+        )
+        stack.callback(recording.close)
+        page = _record_page(
+            args, settings, format, devices, recording, lambda command: box.obey(command)
+        )
+        _announce(format, folder)
+        box = assembly.recorder(
+            settings,
+            format,
+            devices,
+            port,
+            stack,
+            capture=capture(args, settings, format, stack),
+            observers=[*_observers(settings, format, devices.source, recording), *page],
+            commands=recording.commands,
+            ordered=bool(page),
+        )
+        for shown in page:
+            stack.enter_context(shown)
+        box.run(done(args, box, devices, stopped))
+    return 0
+
+
+def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
+    """The devices, and the format of the sweeps that are kept. Raises ConfigError if no sweep can be
+    as long as the window."""
+    asked = skins.described(args.format) if args.format else None
+    devices = open_devices(args, (lambda: asked) if asked else None)
+    format = asked or devices.format or _announced(devices.wire(settings), devices)
+    if args.window is not None:
+        format = replace(format, window=round(args.window * format.rate_hz))
+    _check_length(format, settings)
+    return devices, format
+
+
+def _announce(format: SweepFormat, folder: Path) -> None:
+    """Say what is recorded, and warn if the skin is too slow for textures."""
+    window_s = format.window / format.rate_hz
+    log.info(f"record: {format}, to {folder}; slide for longer than {window_s:.3g} s")
+    if slow := skin_profile.warning(format):
+        log.warning(f"record: {slow}")
+
+
+def _observers(
+    settings: Config, format: SweepFormat, source: str, recording: RecordingSession
+) -> list[Observer]:
+    facts: Facts = {
+        "model": lambda: "none: sweeps are recorded",
+        "recorded": lambda: recording.about()["missing"],
+        "recording": recording.about,
+    }
+    return [
+        Notifier(SystemClock()),
+        recording,
+        *_printer(format, recording),
+        *status(settings, facts),
+        *feed(settings, format, source, {"bundle": "", "labels": []}, facts),
+    ]
+
+
+def _printer(format: SweepFormat, recording: RecordingSession) -> list[Observer]:
+    """What shows each sweep to a person at a terminal."""
+    if not sys.stdout.isatty():
+        return []
+    from appliance.watch.sweep_text import SweepPrinter
+
+    return [SweepPrinter(sys.stdout, format.rate_hz, recording.about)]
+
+
+def _record_page(
+    args: argparse.Namespace,
+    settings: Config,
+    format: SweepFormat,
+    devices: Devices,
+    recording: RecordingSession,
+    obey: Callable[[Command], list[object]],
+) -> list[RecordPage]:
+    """The page on which a person sees the recording and sets its labels, where one is asked for."""
+    if args.web is None:
+        return []
+    from appliance.watch.access import Access
+    from appliance.watch.record import RecordPage
+
+    access = Access.configured(settings.watch, args.web)
+    page = RecordPage(
+        access,
+        format,
+        devices.source,
+        devices.wire(settings).trigger,
+        recording.about,
+        obey,
+        SystemClock(),
+    )
+    log.info(f"page: {page.server.address}")
+    return [page]
+
+
+def _announced(settings: Config, devices: Devices) -> SweepFormat:
+    """The format that the skin announces. Raises SensorError, with what else would do."""
+    try:
+        return skins.announced(settings, devices)
+    except SensorError as e:
+        raise type(e)(
+            f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for"
+        ) from e
+
+
+def _check_length(format: SweepFormat, settings: Config) -> None:
+    """Raises ConfigError if no sweep could be as long as the window."""
+    if format.window * format.period_ns > settings.sweep.max_duration_s * 1e9:
+        raise ConfigError(
+            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last "
+            f"({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise sweep.max_duration_s"
+        )
+
+
+def _sentences(port: Port | None) -> Callable[[bytes], None]:
+    return port.say if port else lambda line: None

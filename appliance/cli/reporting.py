@@ -1,0 +1,73 @@
+"""Observers that `run` and `record` share: status file, feed, capture; and the end of both."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+from appliance.cli.common import Facts
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.observer import Observer
+from appliance.core.types import SweepFormat
+from appliance.io import skins
+from appliance.recording.capture import CaptureWriter
+from appliance.service.status import StatusFile
+
+if TYPE_CHECKING:
+    from appliance.runtime.loop import Box
+
+
+def capture(
+    args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
+) -> CaptureWriter | None:
+    capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
+    if capture:
+        stack.callback(capture.close)
+    return capture
+
+
+def done(
+    args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
+) -> Callable[[], bool]:
+    """True when the loop is to end: by a signal, after --sweeps answers, at the end of a script."""
+    return lambda: (
+        (args.sweeps is not None and box.answered >= args.sweeps)
+        or stopped()
+        or devices.finished(box.answered)
+    )
+
+
+def status(settings: Config, facts: Facts) -> list[Observer]:
+    """The file that `palpate status` reads, where the settings name one that can be written."""
+    path = settings.store.status
+    if not path or not os.access(path.parent, os.W_OK):
+        return []
+    return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
+
+
+def feed(
+    settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
+) -> list[Observer]:
+    """What programs that watch the box read, where the settings name a socket; its default is for a
+    service, whose folder is there. model: what the feed's first line says of it."""
+    path = settings.store.feed
+    default = settings.sources["store.runtime"] == "code"
+    if not path or (default and not os.access(path.parent, os.W_OK)):
+        return []
+    from appliance.service.feed import FeedServer
+
+    known = {"source": source, "skin": settings.skin.profile, **model}
+    return [
+        FeedServer(
+            path,
+            format,
+            known,
+            SystemClock(),
+            lambda: {name: fact() for name, fact in facts.items()},
+        )
+    ]

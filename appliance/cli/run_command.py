@@ -1,0 +1,120 @@
+"""The command `palpate run`."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from appliance.bundle.bundle import Bundle
+from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
+from appliance.cli.devices import open_devices
+from appliance.cli.reporting import capture, done, feed, status
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.errors import ApplianceError
+from appliance.core.log import in_journal, log
+from appliance.core.observer import Observer
+from appliance.runtime import assembly
+from appliance.service.systemd import Notifier, VerdictLog
+
+if TYPE_CHECKING:
+    from appliance.deployment.shadow import Shadow
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was
+    answered."""
+    settings, stopped = load_settings(args), stop_flag()
+    choice = None if settings.classifier.bundle else assembly.store(settings).choose()
+    with ExitStack() as stack:
+        trial = stack.enter_context(choice.trial) if choice and choice.trial else None
+        current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
+        if settings.classifier.allow_unsigned:
+            log.warning(f"unsigned {assembly.UNSIGNED}")
+        devices = open_devices(args, lambda: current.format)
+        port = assembly.port(settings, devices)
+        # not beside a trial: where the program dies, it must be clear which bundle it was
+        shadow = None if trial else _shadow(args, settings, current, devices)
+        facts = {
+            "trial": lambda: trial.text if trial else "",
+            "shadow": lambda: shadow.agreement.text if shadow else "",
+            "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
+        }
+        observers: list[Observer | None] = [
+            Notifier(SystemClock()),
+            trial,
+            shadow,
+            *_reports(settings, current, devices.source, facts, stack),
+        ]
+        box = assembly.box(
+            settings,
+            current,
+            devices,
+            port,
+            stack,
+            capture=capture(args, settings, current.format, stack),
+            observers=[o for o in observers if o],
+        )
+        box.run(done(args, box, devices, stopped))
+    return 0
+
+
+def _reports(
+    settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack
+) -> list[Observer]:
+    """What reports to a person and keeps sweeps, as the settings say: the log, the black box,
+    status and feed with `facts`. source: where the frames come from."""
+    observers: list[Observer] = [VerdictLog()] if in_journal() else []
+    if settings.store.black_box:
+        from appliance.recording.black_box import BlackBox
+
+        black_box = BlackBox(
+            Path(settings.store.folder) / "black-box", current.format, settings.store.black_box
+        )
+        stack.callback(black_box.close)
+        observers.append(black_box)
+    m = current.manifest
+    model = f"{m.name} {m.version}, {len(m.labels)} labels"
+    facts = {"model": lambda: model, **facts}
+    from appliance.alignment.live import Expected
+
+    expected = Expected.by(current, settings.skin.fingertip)
+    known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
+    return [
+        *observers,
+        *status(settings, facts),
+        *feed(settings, current.format, source, known, facts),
+    ]
+
+
+def _shadow(
+    args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices
+) -> Shadow | None:
+    """A candidate that classifies beside the current bundle, where one is asked for and there is
+    one."""
+    try:
+        candidate = None
+        if args.shadow:
+            candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
+        elif args.shadow is not None:
+            candidate = assembly.store(settings).candidate()
+        if candidate is None:
+            return None
+        from appliance.deployment.shadow import Shadow
+
+        return Shadow(
+            candidate,
+            current,
+            Path(settings.store.folder) / "shadow",
+            devices.clock,
+            lambda judged: assembly.classifier(settings, judged, devices.clock),
+        )
+    except (
+        ApplianceError,
+        OSError,
+    ) as e:  # the box serves the robot, the candidate is for a person
+        log.warning(f"no shadow: {e}")
+        return None

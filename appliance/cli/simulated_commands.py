@@ -1,0 +1,96 @@
+"""The commands that show and measure the box on simulated devices: demo, bench."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from appliance.bundle import bundle as bundles
+from appliance.bundle.bundle import Bundle
+from appliance.cli.common import load_bundle, load_settings, stop_flag
+from appliance.cli.devices import simulated
+from appliance.core.config import Config
+from appliance.core.log import log
+from appliance.core.observer import Observer
+from appliance.io.robot_link import SerialSink
+from appliance.runtime import assembly
+from appliance.runtime.loop import Box
+
+if TYPE_CHECKING:
+    from appliance.sim.devices import SimDevices
+
+
+def _played_bundle(settings: Config) -> Bundle:
+    """The bundle for simulated sweeps: that of the settings, or the packaged one where only others
+    may read what was deployed."""
+    try:
+        return load_bundle(settings, answers=False)
+    except PermissionError as e:
+        log.warning(
+            f"{e.filename}: {e.strerror}, so the packaged bundle plays; the deployed one with sudo -u palpate"
+        )
+        return bundles.load(bundles.DEFAULT)
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
+    from appliance.tools import demo, pseudo_terminal
+
+    settings = load_settings(args)
+    bundle = _played_bundle(settings)
+    args.sweeps = args.sweeps or 12
+    devices = simulated(args.sim or "skin", bundle.format, args, settings, spread=True)
+    stopped = stop_flag()
+    with ExitStack() as stack:
+        far_end, name = stack.enter_context(pseudo_terminal.pair())
+        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        show = demo.Demo(
+            devices.robot.played,
+            far_end,
+            devices.clock,
+            sys.stdout,
+            bundle.manifest.labels,
+            raw=args.raw,
+        )
+        box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
+        show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
+    return 0
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """`palpate bench`: see appliance/tools/bench.py."""
+    from appliance.tools import bench_process, pseudo_terminal
+
+    settings = load_settings(args)
+    bundle = _played_bundle(settings)
+
+    def build(
+        devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()
+    ) -> tuple[Box, int]:
+        far_end, name = stack.enter_context(pseudo_terminal.pair())
+        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        return assembly.box(
+            _on_lines(settings), bundle, devices, port, stack, observers=observers
+        ), far_end
+
+    if args.part:
+        print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))
+        return 0
+    from appliance.tools import bench
+
+    figures = bench.run(
+        bundle, build, args.references, args.seed, lambda line: print(line, flush=True)
+    )
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+    return 0
+
+
+def _on_lines(settings: Config) -> Config:
+    """The settings with the trigger on lines, which the simulated robot drives."""
+    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
