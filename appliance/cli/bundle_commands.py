@@ -1,8 +1,4 @@
-"""The commands of `palpate` for the bundles in the store: list, install, verify, commit, roll back,
-promote.
-
-In: arguments. Out: lines on standard output, exit codes.
-"""
+"""The command `palpate bundles`: list, install, verify, commit, roll back, promote."""
 
 from __future__ import annotations
 
@@ -33,10 +29,10 @@ NEXT = "from the next start on: systemctl restart palpate"
 
 @dataclass(frozen=True, slots=True)
 class ListedBundle:
-    """One bundle of the store; sha "" for the packaged one, which nobody signed.
+    """One bundle of the store. sha and signature are empty for the packaged bundle.
 
-    role: current, on trial, previous (what `palpate bundles rollback` goes back to), candidate, left, kept,
-    or damaged. detail: the progress of its trial, why it was left, or what is wrong with it.
+    role: current, on trial, previous (`rollback` returns to it), candidate, left, kept, or damaged.
+    detail: progress of the trial, reason for leaving the bundle, or its damage.
     """
 
     sha: str
@@ -50,7 +46,7 @@ class ListedBundle:
 
 
 def entries(store: Store) -> list[ListedBundle]:
-    """The bundles of the store, those that matter most first."""
+    """The bundles of the store, in the order of their roles."""
     current, state = store.current, store.state
     names = (
         sorted(p.name for p in store.bundles.folder.iterdir())
@@ -65,7 +61,7 @@ def entries(store: Store) -> list[ListedBundle]:
 
 
 def lines(listed: Iterable[ListedBundle]) -> list[str]:
-    """A table for a person."""
+    """The list as a table."""
     rows = [
         (e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in listed
     ]
@@ -106,8 +102,9 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
         return "current", ""
     if sha == current:
         return "on trial", (
-            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of {settings.trial_sweeps} sweeps, "
-            f"{standing.streamed_s:.0f} of {settings.trial_s:.0f} s, as of its last start or end"
+            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of"
+            f" {settings.trial_sweeps} sweeps, {standing.streamed_s:.0f} of {settings.trial_s:.0f} s,"
+            " as of its last start or end"
         )
     if sha == state.of(current).previous:
         return "previous", ""
@@ -117,7 +114,7 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """`palpate bundles`: which bundle runs, and what it goes back to."""
+    """Print the bundles of the store."""
     from appliance.deployment import shadow
 
     settings = load_settings(args)
@@ -131,7 +128,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_install(args: argparse.Namespace) -> int:
-    """`palpate bundles install`: a signed bundle comes into the store."""
+    """Put a signed bundle into the store."""
     settings = load_settings(args)
     store = assembly.store(settings)
     skin = None if args.other_skin else streaming(settings, store)
@@ -144,8 +141,8 @@ def run_install(args: argparse.Namespace) -> int:
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:
-    """The format of the skin that streams into the service now: that of the bundle that runs. None
-    where that is not known."""
+    """The format of the skin that streams into the service, which is the format of the running
+    bundle. None if it is not known."""
     try:
         report = status.read(status_file(settings), SystemClock().now_ns())
         running = store.running().bundle
@@ -159,40 +156,42 @@ def streaming(settings: Config, store: Store) -> SweepFormat | None:
 
 
 def suits(new: Bundle, skin: SweepFormat | None) -> None:
-    """Raises BundleError where `new` is for another skin than the one that streams; None: nothing
-    is known of it."""
+    """Raise BundleError if `new` is for another skin than the streaming skin. None: the skin is not
+    known."""
     if skin and not fits(skin, new.format):
         raise BundleError(
-            f"bundle {new.id} is for a skin of {new.format}, and the one that streams has {skin}: it would answer no "
-            "sweep; if another skin comes with it, use --other-skin (make deploy OTHER_SKIN=1)"
+            f"bundle {new.id} is for a skin of {new.format}, and the skin that streams has {skin}: it"
+            " would answer no sweep; if another skin comes with it, use --other-skin (make deploy"
+            " OTHER_SKIN=1)"
         )
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """`palpate bundles verify`: whether a bundle would be taken, but for its counter."""
+    """Examine a bundle as `install` does, without its counter."""
     signed = assembly.store(load_settings(args)).examine(args.folder)
     m = signed.bundle.manifest
     print(
-        f"bundle {signed.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by {signed.signer}; all is well"
+        f"bundle {signed.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by"
+        f" {signed.signer}; all is well"
     )
     return 0
 
 
 def run_commit(args: argparse.Namespace) -> int:
-    """`palpate bundles commit`: the trial is over."""
+    """End the trial."""
     print("committed" if assembly.store(load_settings(args)).commit() else "nothing is on trial")
     return 0
 
 
 def run_rollback(args: argparse.Namespace) -> int:
-    """`palpate bundles rollback`: back to the bundle before."""
+    """Go back to the previous bundle."""
     sha = assembly.store(load_settings(args)).rollback()
     print(f"{f'bundle {sha[:8]}' if sha else 'the packaged bundle'} runs {NEXT}")
     return 0
 
 
 def run_promote(args: argparse.Namespace) -> int:
-    """`palpate bundles promote`: the candidate becomes the current bundle."""
+    """Run the candidate on trial."""
     print(f"bundle {assembly.store(load_settings(args)).promote()[:8]} runs on trial {NEXT}")
     return 0
 

@@ -23,15 +23,14 @@ if TYPE_CHECKING:
     from appliance.watch.server import PageServer
 
 Facts = Mapping[str, Callable[[], object]]
-"""Further facts of the status and the feed, by their names; a text is shown to a person."""
+"""Additional facts of status and feed, by name. A text is shown to a person."""
 OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
 """Opens the devices. Its argument gives the format that a simulated skin has to send; None for
 whatever its script has."""
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings that a command's options ask for. --every and --sweep are settings of the
-    trigger by the clock."""
+    """The settings with the changes that a command's options make."""
     sets = list(args.set)
     for key, option in (("profile", "skin"), ("port", "skin_port")):
         if value := getattr(args, option, None):
@@ -51,7 +50,7 @@ def load_settings(args: argparse.Namespace) -> Config:
 
 
 def status_file(settings: Config) -> Path:
-    """The file with the state of the service. Raises ConfigError if the settings name none."""
+    """The file with the state of the service. Raises ConfigError if it is turned off."""
     if not settings.store.status:
         raise ConfigError(
             'store.runtime = "" turns the status file off; set it to a folder, and restart the service'
@@ -60,12 +59,12 @@ def status_file(settings: Config) -> Path:
 
 
 def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
-    """The bundle that the settings ask for; see assembly.running."""
+    """The bundle of the settings; see assembly.running."""
     return assembly.running(settings, answers=answers).bundle
 
 
 def stop_flag() -> Callable[[], bool]:
-    """True once SIGTERM or SIGINT has come: the loop then ends within one turn."""
+    """A function that is true once SIGTERM or SIGINT came. The loop then ends within one turn."""
     received: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda n, frame: received.append(n))
@@ -73,7 +72,7 @@ def stop_flag() -> Callable[[], bool]:
 
 
 def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:
-    """The server of a page for browsers on this machine, where a port is given."""
+    """The server of a page for browsers on this machine, if there is a port."""
     if port is None:
         return []
     from appliance.watch.access import Access

@@ -1,6 +1,6 @@
-"""The devices of a command.
+"""The devices of a command, real or simulated.
 
-Simulated devices are chosen by name, here and nowhere else, and every sentence they cause says so.
+Simulated devices are chosen by name, and only in this module. Each of their sentences says so.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | None) -> Devices:
-    """The real devices, or simulated ones where `--sim` names them; `format` gives what the simulated
-    skin has to send."""
+    """The real devices, or simulated devices with `--sim`. format: gives the format of a simulated
+    skin; None for the format of its script."""
     if args.sim:
         return simulated(
             args.sim, format() if format else None, args, load_settings(args), remember=False
@@ -43,7 +43,7 @@ def simulated(
     remember: bool = True,
     spread: bool = False,
 ) -> RobotDevices:
-    """A simulated robot with the skin that the settings name: a readout board on USB, or one on a
+    """A simulated robot with the skin of the settings: a readout board on USB, or a skin on a
     terminal."""
     from appliance.sim import devices, rig, script
 

@@ -22,8 +22,8 @@ from appliance.runtime import assembly
 
 
 def run(args: argparse.Namespace) -> int:
-    """`palpate enrol`: the box takes sweeps as always; of the good ones it learns one label
-    more."""
+    """Learn one more label from sweeps of it, and install the new bundle or write it to a
+    folder."""
     settings = load_settings(args)
     start = assembly.running(settings, answers=not args.sim)
     key = _enrolment_key(args, settings)
@@ -56,9 +56,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
-    """The key that signs what is enrolled, checked before the robot sweeps. None where it is not
-    signed: what a simulated skin taught, and on a bench that allows unsigned bundles. Raises
-    ConfigError."""
+    """The key of this box that signs the enrolment, checked before the robot sweeps.
+
+    None if the enrolment stays unsigned: sweeps of a simulated skin, and a bench that allows
+    unsigned bundles. Raises ConfigError if the box would refuse the new bundle.
+    """
     unsigned = (
         "--sim"
         if args.sim
@@ -69,21 +71,18 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
     if unsigned:
         if not args.out:
             raise ConfigError(
-                f"with {unsigned} what is enrolled is not signed, and a box takes none such; give --out DIR"
+                f"with {unsigned} the enrolment is not signed, and a box refuses it; give --out DIR"
             )
         return None
     if not args.out and settings.classifier.early:
-        raise ConfigError(
-            "early answers end with an enrolment, whose labels they do not know; set classifier.early = false"
-        )
+        raise ConfigError("early answers cannot name enrolled labels; set classifier.early = false")
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key
 
 
 def _good_sweeps(args: argparse.Namespace, settings: Config, current: Bundle) -> NDArray[Any]:
-    """The windows of as many good sweeps as are asked for. Raises ApplianceError where there are
-    too few."""
+    """The windows of `--sweeps` good sweeps. Raises ApplianceError if there are too few."""
     settings = replace(settings, classifier=replace(settings.classifier, early=False))
     devices = open_devices(args, lambda: current.format)
     stopped = stop_flag()

@@ -33,8 +33,8 @@ from appliance.service import status
 
 
 def _open_any(args: argparse.Namespace, settings: Config) -> Devices:
-    """The devices; a simulated skin sends what the bundle wants, where there is one and the skin
-    can."""
+    """The devices. A simulated skin has the format of the bundle, if there is a bundle and the skin
+    can send this format."""
     try:
         return open_devices(args, lambda: load_bundle(settings, answers=False).format)
     except (BundleError, FormatError):
@@ -42,7 +42,7 @@ def _open_any(args: argparse.Namespace, settings: Config) -> Devices:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """`palpate check`: each component by itself, one line each; 1 where any fails."""
+    """Check each component by itself; 1 if any fails."""
     settings = load_settings(args)
     devices = _open_any(args, settings)
     failed = 0
@@ -57,9 +57,11 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_align(args: argparse.Namespace) -> int:
-    """`palpate align`: where the contact lies, until Ctrl-C."""
+    """Show where the contact lies, until Ctrl-C."""
 
-    if args.sim == "skin":  # its sweeps lift the finger for a tenth of a second; for this it rests
+    if (
+        args.sim == "skin"
+    ):  # a sweep lifts the finger for a tenth of a second; here the finger rests
         args.sim = "rest"
     settings = load_settings(args)
     devices = _open_any(args, settings)
@@ -76,7 +78,7 @@ def run_align(args: argparse.Namespace) -> int:
 
 
 def _expected(settings: Config, devices: Devices) -> Expected:
-    """What is known of the skin: by the bundle, where there is one that fits it or no skin yet."""
+    """The expected contact: by the bundle if it fits the skin, or if there is no skin yet."""
     from appliance.alignment.live import Expected
 
     current, fingertip = None, settings.skin.fingertip
@@ -89,15 +91,15 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except SensorError:
         if not current:
             raise
-        return Expected.by(current, fingertip)  # the skin is waited for
+        return Expected.by(current, fingertip)  # the command waits for the skin
     if current and fits(format, current.format):
         return Expected.by(current, fingertip)
     return Expected(format, fingertip=fingertip)
 
 
 def run_replay(args: argparse.Namespace) -> int:
-    """`palpate replay`: the sentences of a capture, a kept sweep or a folder of them; 1 where a
-    verdict differs."""
+    """Print the sentences of a capture, a kept sweep or a folder of them; 1 if a verdict
+    differs."""
 
     settings = load_settings(args)
     bundle = load_bundle(settings, answers=False)
@@ -105,14 +107,13 @@ def run_replay(args: argparse.Namespace) -> int:
 
 
 def run_config(args: argparse.Namespace) -> int:
-    """`palpate config`: each value with its source."""
+    """Print each value with its source."""
     print(config.describe(load_settings(args)))
     return 0
 
 
 def run_status(args: argparse.Namespace) -> int:
-    """`palpate status`: the state of the service; 69 where it waits for the skin, 1 where it does
-    not run."""
+    """Print the state of the service; 69 if it waits for the skin, 1 if it does not run."""
 
     now_ns = SystemClock().now_ns()
     report = status.read(status_file(load_settings(args)), now_ns)
@@ -121,7 +122,7 @@ def run_status(args: argparse.Namespace) -> int:
 
 
 def run_watch(args: argparse.Namespace) -> int:
-    """`palpate watch`: until Ctrl-C or SIGTERM."""
+    """Show the running box until Ctrl-C or SIGTERM."""
     settings, clock = load_settings(args), SystemClock()
     socket, stopped = settings.store.feed, stop_flag()
     if not socket:

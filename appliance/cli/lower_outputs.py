@@ -1,10 +1,10 @@
-"""`python -m appliance.cli.lower_outputs`: sets the output lines low after a program that could
-not. In: its settings.
+"""`python -m appliance.cli.lower_outputs`: set the output lines low after a program that could not
+do it.
 
-systemd runs it whenever `palpate run` has ended (ExecStopPost=). A program that was killed leaves
-its lines to the driver of the chip, and some drivers keep the levels: READY stays high without a
-box behind it. It loads neither numpy nor onnxruntime, so that the lines are low before the robot
-acts on them.
+systemd runs it after each end of `palpate run` (ExecStopPost=). If a program is killed, the driver
+of the chip keeps its lines, and some drivers keep their levels: READY then stays high without a box
+behind it. This command imports neither numpy nor onnxruntime, so that the lines are low before the
+robot acts on them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from appliance.io.gpio_lines import Lines
 
 
 def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
-    """Drive all configured outputs low and release them; the exit code, as those of `palpate`."""
+    """Drive all configured outputs low and release them. Exit codes as of `palpate`."""
     about = "Sets all output lines low. Options as for palpate run."
     parser = CommandParser("python -m appliance.cli.lower_outputs", description=about)
     add_settings(parser)

@@ -29,7 +29,7 @@ COMMANDS: Mapping[str, str] = {
     "skin": "cli.skin_commands.run",
     "bridge": "bridges.command.run",
 }
-"""Functions of the commands below `appliance`. They are imported when they are wanted."""
+"""The functions of the commands, below `appliance`. They are imported when they are needed."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("palpate: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # nobody reads standard output any more, so nothing must be written to it, not even at exit
+        # the reader of standard output has closed it: write nothing more to it, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as e:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Keep each sweep with its label. It needs no bundle: the skin announces its format."""
+    """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
     labels = Labels(args.material, args.position, args.session)
     settings, stopped = load_settings(args), stop_flag()
     with ExitStack() as stack:
@@ -79,7 +79,7 @@ def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFor
 
 
 def _announce(format: SweepFormat, folder: Path) -> None:
-    """Say what is recorded, and warn if the skin is too slow for textures."""
+    """Log format and folder, and warn if the skin is too slow for textures."""
     window_s = format.window / format.rate_hz
     log.info(f"record: {format}, to {folder}; slide for longer than {window_s:.3g} s")
     if slow := skin_profile.warning(format):
@@ -104,7 +104,7 @@ def _observers(
 
 
 def _printer(format: SweepFormat, recording: RecordingSession) -> list[Observer]:
-    """What shows each sweep to a person at a terminal."""
+    """The printer of sweeps for a person at a terminal."""
     if not sys.stdout.isatty():
         return []
     from appliance.watch.sweep_text import SweepPrinter
@@ -120,7 +120,7 @@ def _record_page(
     recording: RecordingSession,
     obey: Callable[[Command], list[object]],
 ) -> list[RecordPage]:
-    """The page on which a person sees the recording and sets its labels, where one is asked for."""
+    """The page of `--web`, which shows the recording and sets its labels."""
     if args.web is None:
         return []
     from appliance.watch.access import Access
@@ -141,12 +141,12 @@ def _record_page(
 
 
 def _announced(settings: Config, devices: Devices) -> SweepFormat:
-    """The format that the skin announces. Raises SensorError, with what else would do."""
+    """The format that the skin announces. Raises SensorError with advice if it announces none."""
     try:
         return skins.announced(settings, devices)
     except SensorError as e:
         raise type(e)(
-            f"{e}; or say what it sends, with --format 4x4:uint8:750, and it is waited for"
+            f"{e}; or name its format with --format 4x4:uint8:750; then the command waits for it"
         ) from e
 
 
@@ -154,8 +154,9 @@ def _check_length(format: SweepFormat, settings: Config) -> None:
     """Raises ConfigError if no sweep could be as long as the window."""
     if format.window * format.period_ns > settings.sweep.max_duration_s * 1e9:
         raise ConfigError(
-            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last "
-            f"({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise sweep.max_duration_s"
+            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last"
+            f" ({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise"
+            " sweep.max_duration_s"
         )
 
 

@@ -1,4 +1,4 @@
-"""Observers that `run` and `record` share: status file, feed, capture; and the end of both."""
+"""Parts that `run` and `record` share: status file, feed, capture, and the end of the loop."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def capture(
 def done(
     args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
 ) -> Callable[[], bool]:
-    """True when the loop is to end: by a signal, after --sweeps answers, at the end of a script."""
+    """True after a signal, after `--sweeps` answers, and at the end of a script."""
     return lambda: (
         (args.sweeps is not None and box.answered >= args.sweeps)
         or stopped()
@@ -43,7 +43,7 @@ def done(
 
 
 def status(settings: Config, facts: Facts) -> list[Observer]:
-    """The file that `palpate status` reads, where the settings name one that can be written."""
+    """The writer of the status file, if the settings name a file that can be written."""
     path = settings.store.status
     if not path or not os.access(path.parent, os.W_OK):
         return []
@@ -53,8 +53,8 @@ def status(settings: Config, facts: Facts) -> list[Observer]:
 def feed(
     settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
 ) -> list[Observer]:
-    """What programs that watch the box read, where the settings name a socket; its default is for a
-    service, whose folder is there. model: what the feed's first line says of it."""
+    """The server of the feed, if the settings name its folder. The default folder exists in a
+    service only. model: facts about the bundle for the first line of the feed."""
     path = settings.store.feed
     default = settings.sources["store.runtime"] == "code"
     if not path or (default and not os.access(path.parent, os.W_OK)):

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    """`palpate run`: until SIGTERM, or with --sim until the script has ended and everything was
-    answered."""
+    """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
     settings, stopped = load_settings(args), stop_flag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
@@ -36,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
             log.warning(f"unsigned {assembly.UNSIGNED}")
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
-        # not beside a trial: where the program dies, it must be clear which bundle it was
+        # not beside a trial: if the program dies, it must be clear which bundle was the cause
         shadow = None if trial else _shadow(args, settings, current, devices)
         facts = {
             "trial": lambda: trial.text if trial else "",
@@ -65,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
 def _reports(
     settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack
 ) -> list[Observer]:
-    """What reports to a person and keeps sweeps, as the settings say: the log, the black box,
-    status and feed with `facts`. source: where the frames come from."""
+    """The observers that the settings ask for: log, black box, status file, feed with `facts`.
+    source: origin of the frames."""
     observers: list[Observer] = [VerdictLog()] if in_journal() else []
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
@@ -93,8 +92,8 @@ def _reports(
 def _shadow(
     args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices
 ) -> Shadow | None:
-    """A candidate that classifies beside the current bundle, where one is asked for and there is
-    one."""
+    """The candidate of `--shadow`, which classifies beside the current bundle. None if there is no
+    candidate, or if it cannot run."""
     try:
         candidate = None
         if args.shadow:

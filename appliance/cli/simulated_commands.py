@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 def _played_bundle(settings: Config) -> Bundle:
-    """The bundle for simulated sweeps: that of the settings, or the packaged one where only others
-    may read what was deployed."""
+    """The bundle for simulated sweeps: the bundle of the settings, or the packaged bundle if this
+    user may not read the deployed bundle."""
     try:
         return load_bundle(settings, answers=False)
     except PermissionError as e:
@@ -38,7 +38,7 @@ def _played_bundle(settings: Config) -> Bundle:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """`palpate demo`: a dozen sweeps through a pseudo-terminal, seen from both ends."""
+    """Show a dozen sweeps through a pseudo-terminal, from both ends."""
     from appliance.tools import demo, pseudo_terminal
 
     settings = load_settings(args)
@@ -63,7 +63,7 @@ def run_demo(args: argparse.Namespace) -> int:
 
 
 def run_bench(args: argparse.Namespace) -> int:
-    """`palpate bench`: see appliance/tools/bench.py."""
+    """Measure this machine; see appliance/tools/bench.py."""
     from appliance.tools import bench_process, pseudo_terminal
 
     settings = load_settings(args)
@@ -92,5 +92,5 @@ def run_bench(args: argparse.Namespace) -> int:
 
 
 def _on_lines(settings: Config) -> Config:
-    """The settings with the trigger on lines, which the simulated robot drives."""
+    """The settings with the trigger on GPIO lines, which the simulated robot drives."""
     return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))

@@ -1,8 +1,4 @@
-"""The commands `palpate skin ...`: the skin by itself, without a bundle.
-
-In: arguments, and a way to the devices, which `main` chooses. Out: lines on standard output, exit
-codes.
-"""
+"""The command `palpate skin`: the skin by itself, without a bundle."""
 
 from __future__ import annotations
 
@@ -37,7 +33,7 @@ NEW_S = 3.0
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """`palpate skin check`: each part of PROTOCOL.md, one line each; 1 where any fails."""
+    """Check each part of PROTOCOL.md; 1 if any fails."""
     from appliance.tools import skin_check
 
     devices = open_devices(args, None)
@@ -47,7 +43,7 @@ def run_check(args: argparse.Namespace) -> int:
     with closing(skins.open_board(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
         log.info(
-            f"frames are listened to for {seconds:g} s; stopping, requests and overflow take {more} more"
+            f"listening to frames for {seconds:g} s; stopping, requests and overflow take {more} more"
         )
         for found in skin_check.check(link, devices.clock, seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
@@ -56,7 +52,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """`palpate skin list`: all profiles, one line each; 1 where one cannot be read."""
+    """Print all profiles, one line each; 1 if a profile cannot be read."""
     from appliance.tools import skin_detect
 
     broken = 0
@@ -71,13 +67,11 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_detect(args: argparse.Namespace) -> int:
-    """`palpate skin detect`: what is plugged in, and which profile fits; 1 if none does."""
+    """Print the connected skins and the profiles that fit; 1 if none fits."""
     from appliance.tools import skin_detect
 
     if args.write and not args.skin_port:
-        raise ConfigError(
-            "--write writes commands to a port, so it has to be named: add --port /dev/..."
-        )
+        raise ConfigError("--write sends commands to a port; name the port with --port /dev/...")
     settings, port = load_settings(args), args.skin_port
     there = serial_port.ports()
     if port:
@@ -119,7 +113,7 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
 
 
 def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:
-    """All profiles by name; the error of one that cannot be read."""
+    """All profiles by name, or the error of a profile that cannot be read."""
     folders = skins.folders(settings)
     for name in sorted({DEFAULT, *skin_profile.names(folders)}):
         try:
@@ -129,7 +123,7 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """`palpate skin show`: the skin live, in the terminal and on a page, until Ctrl-C."""
+    """Show the skin live, in the terminal and on a page, until Ctrl-C."""
     from appliance.tools import skin_show
     from appliance.tools.skin_screen import SkinScreen
 
@@ -153,7 +147,7 @@ def run_show(args: argparse.Namespace) -> int:
 
 
 def run_new(args: argparse.Namespace) -> int:
-    """`palpate skin new`: listen to a port and propose profiles; with a grid, write a profile."""
+    """Listen to a port and propose profiles; with a grid, write a profile."""
     from appliance.io.serial_link import SerialLink
     from appliance.tools import skin_new
 
@@ -195,11 +189,11 @@ def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
         if args.out
         else f'--skin {path.stem} (skin.profile = "{path.stem}")'
     )
-    print(f"{path}: {frames} frames of what was heard, {garbage} bytes in none; use it with {use}")
+    print(f"{path}: decodes {frames} frames, {garbage} bytes are left over; use it with {use}")
 
 
 def _make(folder: Path) -> None:
-    """Make the folder of a profile. Raises ConfigError where it cannot be written."""
+    """Make the folder of a profile. Raises ConfigError if it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -213,7 +207,7 @@ def _make(folder: Path) -> None:
 
 
 def _new_name(args: argparse.Namespace, settings: Config) -> str:
-    """The name of the new profile. Raises ConfigError where it cannot be used."""
+    """The name of the new profile. Raises ConfigError if it cannot be used."""
     name: str = args.name
     if not skin_profile.NAME.fullmatch(name):
         raise ConfigError(

@@ -1,9 +1,8 @@
-"""The settings of the box. In: TOML files and `--set` options. Out: one frozen `Config` that knows
-each value's source.
+"""The settings of the box, from TOML files and `--set` options.
 
-Layers, each overriding those before it: the defaults below, `skin.toml`, `board-NAME.toml`,
-`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: a field's type and limits say
-what a file may hold.
+Layers, each overriding the layers before it: the defaults below, `skin.toml`, `board-NAME.toml`,
+`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: types and limits of their
+fields are those of the files. Each value has its source.
 """
 
 from __future__ import annotations
@@ -33,31 +32,31 @@ from appliance.core.schema import (
 SITE = Path("/etc/palpate/palpate.toml")
 """The settings of this robot's installation; the file may be missing."""
 FEED_SCHEMA = 1
-"""Version of the feed's lines (PROTOCOL.md, part 4), for who writes and who reads them."""
+"""Version of the feed's lines (PROTOCOL.md, part 4), for writer and readers."""
 
 
 _USB = re.compile(r"([0-9a-f]{4}):([0-9a-f]{4})(?::(.+))?", re.ASCII | re.IGNORECASE)
 
 
 def _usb(value: Any) -> str | None:
-    """Reader of skin.usb, for `custom`."""
+    """The reader of skin.usb, for `custom`."""
     known = isinstance(value, str) and value.isprintable() and _USB.fullmatch(value)
     return value if known else None
 
 
 @dataclass(frozen=True, slots=True)
 class SkinConfig:
-    """The skin: its kind, its port, and how frames are read.
+    """The skin and the way to read it.
 
-    profile: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" in place of the profile's,
-    "" for that. rate_hz: frames per second in place of the profile's, 0 for that. tare: send the
-    profile's tare command whenever the skin is found; it must be unloaded then. fingertip: the side
-    of the grid that is nearest to the end of the finger, for pictures; "" if unknown. usb: USB ids
-    of the board, and its serial number if several are connected, as in "1209:7ac7:E661"; profiles
-    with ids of their own use the serial number alone. link: "vendor" (bulk transfers), "acm" (a
-    serial port over USB, without the kernel's driver), or "serial" (any serial port, with the
-    kernel's driver). port: path of this serial port; "" finds the port by its USB ids. silence_ms: time without a frame after which the
-    skin counts as silent and is started again.
+    profile: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" if it differs from the
+    profile, else "". rate_hz: frames per second if they differ from the profile, else 0. tare: send
+    the profile's tare command whenever the skin is found; the skin must be unloaded then.
+    fingertip: the side of the grid at the end of the finger, for pictures; "" if unknown. usb: USB
+    ids of the board, and its serial number if several are connected, as in "1209:7ac7:E661";
+    profiles with ids of their own use the serial number alone. link: "vendor" (bulk transfers),
+    "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with
+    the kernel's driver). port: path of this serial port; "" finds the port by its USB ids.
+    silence_ms: after this time without a frame the skin counts as silent and is started again.
     """
 
     profile: str = "palpate"
@@ -99,8 +98,7 @@ class TriggerConfig:
     clock, a sweep of 3 s every 5 s (`run` and `record` have options for other times). start, stop:
     the robot's GPIO lines, by the kernel's names (`gpioinfo` lists them); "" means not wired.
     new_object: a GPIO line whose rising edge announces another object. active_low: inverts all
-    three lines, and pulls open inputs up instead of down. glitch_us: time for which a level must
-    hold to count.
+    three lines, and pulls open inputs up instead of down. glitch_us: shorter pulses do not count.
     """
 
     mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"
@@ -144,9 +142,9 @@ class SweepConfig:
     """
 
     max_duration_s: float = number(12.0, 0.1, 3600.0)
-    late_ms: int = fixed(500)  # frames of a window are waited for so long after the stop edge
-    lead_ms: int = fixed(500)  # early answers: from the start edge to the window; with 500 ms it is
-    # the middle of the paper's three seconds
+    late_ms: int = fixed(500)  # longest wait for frames after the stop edge
+    lead_ms: int = fixed(500)  # early answers: from the start edge to the window
+    # (with 500 ms the window is the middle of the paper's three seconds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,10 +184,10 @@ class ClassifierConfig:
 class StoreConfig:
     """The folders of the box.
 
-    folder: bundles, recordings and black box (layout: deployment/store.py). keys: `allowed_signers`
-    (keys whose bundles are accepted, in the format of ssh-keygen) and `enrolment/` (the key that
-    signs what this box enrolled). runtime: the status file and the socket of the feed (PROTOCOL.md,
-    part 4); "" for neither. black_box: number of latest sweeps to keep, 0 for none.
+    folder: bundles, recordings and black box (layout: deployment/store.py). keys: folder of
+    `allowed_signers`, the accepted keys in the format of ssh-keygen, and of `enrolment/`, this
+    box's key for its own labels. runtime: folder of the status file and of the feed's socket
+    (PROTOCOL.md, part 4); "" for neither. black_box: number of latest sweeps to keep, 0 for none.
     trial_sweeps: a new bundle is committed once it has given a label to this many sweeps, or the
     skin has streamed for 600 s.
     """
@@ -199,7 +197,7 @@ class StoreConfig:
     runtime: str = "/run/palpate"
     black_box: int = number(0, 0, 100_000)
     trial_sweeps: int = number(20, 1, 100_000)
-    trial_s: float = fixed(600.0)  # the skin has streamed for so long: the trial ends as well
+    trial_s: float = fixed(600.0)  # streaming time after which the trial ends as well
 
     @property
     def signers(self) -> Path:
@@ -249,11 +247,8 @@ class BridgeConfig:
 @dataclass(frozen=True, slots=True)
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
-    among them.
-
-    sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the file's name
-    or "--board".
-    """
+    among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
+    file's name or "--board"."""
 
     board: str
     skin: SkinConfig
@@ -286,11 +281,11 @@ def load(
 ) -> Config:
     """All layers as one Config.
 
-    board: NAME of a `board-NAME.toml`; None or "" takes `board = "NAME"` in `site`, and without
-    that no line is wired. sets: "section.key=value", the value in TOML or a bare string. folder:
-    where `skin.toml` and the boards' files are; None means `firmware_config/` beside the package,
-    in an installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError naming
-    the file, the key, the value and what is allowed.
+    board: NAME of a `board-NAME.toml`. None or "" takes `board = "NAME"` in `site`; without it no
+    GPIO line is wired. sets: "section.key=value", the value in TOML or a bare string. folder: where
+    `skin.toml` and the boards' files are; None means `firmware_config/` beside the package, in an
+    installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError with file,
+    key, value and the allowed values.
     """
     folder = folder or _folder()
     of_site = _read(site, needed=site != SITE)
@@ -317,8 +312,8 @@ def load(
 
 
 def describe(config: Config) -> str:
-    """One line per value, `section.key = value   # source`; the text is TOML that can be loaded as
-    a site file."""
+    """One line per value, `section.key = value # source`. The text is TOML that can be loaded as a
+    site file."""
     values = {"board": json.dumps(config.board)}
     for name in _KEYS:
         section, _, last = name.partition(".")
@@ -384,7 +379,7 @@ def _parse_set(text: str) -> dict[str, Any]:
 
 
 def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
-    """Each value of a layer with its full name, converted to its field's type."""
+    """Each value of a layer with its full name, as its field's type."""
     for section, content in table.items():
         if section not in _SECTIONS:
             if section == "board":
@@ -416,14 +411,14 @@ def _unknown(name: str, known: list[str], where: str) -> ConfigError:
 
 
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
-    """Raises ConfigError where one line is given two meanings."""
+    """Raise ConfigError if one GPIO line has two meanings."""
     taken: dict[str, str] = {}
     for name in (n for n, key in _KEYS.items() if "line" in key.limits):
         for line in filter(None, [values[name]] if isinstance(values[name], str) else values[name]):
             if line in taken:
                 first = f"{taken[line]} ({sources[taken[line]]})"
                 raise ConfigError(
-                    f"{sources[name]}: {name} = {line!r} is the line of {first} already; give "
+                    f"{sources[name]}: {name} = {line!r} is the GPIO line of {first} already; give "
                     'each its own line, or ""'
                 )
             taken[line] = name

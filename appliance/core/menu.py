@@ -82,8 +82,8 @@ class CommandParser(argparse.ArgumentParser):
     def choose(self, kind: str, actions: Mapping[str, str], default: str | None = None) -> None:
         """Let the first word choose one of the `actions`, which have descriptions.
 
-        kind: what the actions are called, and their name among the arguments. default: the action
-        without a word; None if the word is required.
+        kind: "action" or another name for all of them; also the name of the argument. default: the
+        action without a word; None if the word is required.
         """
         self._kind, self.actions = kind, actions
         self.add_argument(

@@ -25,7 +25,7 @@ def number(default: _Number, least: _Number, most: _Number) -> _Number:
 
 
 def fixed(value: _Kind) -> _Kind:
-    """A field that files cannot set: a constant that stands beside the settings it belongs to."""
+    """A field that files cannot set: a constant beside the settings it belongs to."""
     return field(default=value, metadata={"fixed": True})
 
 

@@ -684,7 +684,7 @@ def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture
     lines = told.out.splitlines()
     assert len(lines) == 12
     assert (
-        "frames are listened to for 10 s" in told.err
+        "listening to frames for 10 s" in told.err
     )  # before anything is printed, a person knows how long it takes
     assert all(line.startswith("ok       ") for line in lines)
 

@@ -163,11 +163,11 @@ def test_an_enrolled_folder_is_signed(
     ("options", "why"),
     [
         ((), "key: No such file or directory, so nothing can be enrolled"),
-        (("--set", "classifier.early=true"), "early answers end with an enrolment"),
-        (ALLOWED, "with classifier.allow_unsigned what is enrolled is not signed"),
+        (("--set", "classifier.early=true"), "early answers cannot name enrolled labels"),
+        (ALLOWED, "with classifier.allow_unsigned the enrolment is not signed"),
         (
             VIRTUAL[:3],
-            "with --sim what is enrolled is not signed, and a box takes none such; give --out DIR",
+            "with --sim the enrolment is not signed, and a box refuses it; give --out DIR",
         ),
     ],
 )

@@ -208,11 +208,12 @@ def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
     """Across layers and inside class_bits; both roles and both sources are named."""
     with pytest.raises(ConfigError) as e:
         _load(folder, "a", "output.busy=L1")
-    assert "--set: output.busy = 'L1' is the line of trigger.start (board-a.toml) already" in str(
-        e.value
+    assert (
+        "--set: output.busy = 'L1' is the GPIO line of trigger.start (board-a.toml) already"
+        in str(e.value)
     )
     with pytest.raises(
-        ConfigError, match=r"output\.class_bits = 'X' is the line of output\.class_bits"
+        ConfigError, match=r"output\.class_bits = 'X' is the GPIO line of output\.class_bits"
     ):
         _load(folder, None, "output.class_bits=['X', 'X']")
 
