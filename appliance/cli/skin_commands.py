@@ -40,7 +40,7 @@ def run_check(args: argparse.Namespace) -> int:
     settings = devices.wire(load_settings(args))
     failed, port = 0, settings.skin.link == "serial"
     seconds = args.seconds or CHECK_S
-    with closing(skins.open_board(settings, devices)) as link:
+    with closing(skins.open_readout(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
         log.info(
             f"listening to frames for {seconds:g} s; stopping, requests and overflow take {more} more"

@@ -96,7 +96,7 @@ class SerialLink:
         serial_port.close(self._port)
 
 
-class BoardLink(SerialLink):
+class ReadoutLink(SerialLink):
     """The serial port of a readout board that speaks PROTOCOL.md."""
 
     def close(self) -> None:
@@ -106,12 +106,12 @@ class BoardLink(SerialLink):
         super().close()
 
 
-def open_board(
+def open_readout(
     config: SkinConfig, clock: Clock, ports: Callable[[], Iterable[PortInfo]] = serial_port.ports
-) -> BoardLink:
+) -> ReadoutLink:
     """Open the configured port, or the port with the configured USB ids. Raises SensorError."""
     path = config.port or find(((config.vendor_id, config.product_id),), config.serial, ports())
-    return BoardLink(path, config.baud or BAUD, clock)
+    return ReadoutLink(path, config.baud or BAUD, clock)
 
 
 def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:

@@ -52,7 +52,7 @@ def sensor(
     return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
 
 
-def open_board(settings: Config, devices: Devices) -> SkinLink:
+def open_readout(settings: Config, devices: Devices) -> SkinLink:
     """The opened readout board of a skin that speaks PROTOCOL.md. Raises ConfigError for another
     skin, SensorError if there is none."""
     chosen = profile(settings)
@@ -79,7 +79,7 @@ def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = N
             replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
         )
     try:
-        board = open_board(settings, devices)
+        board = open_readout(settings, devices)
     except SensorAbsent as e:
         raise SensorAbsent(
             f"{e}, or name another skin with --skin; `palpate skin detect` says which"

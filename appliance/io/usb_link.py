@@ -37,7 +37,7 @@ class Context(libusb1._LibUSB):  # type: ignore[misc]
 
     libusb removes a device from its context's list when it fails with ENODEV. It lists the device
     again when it is plugged in, but not when only its driver was detached and attached. So
-    `open_board` searches through a new context after each failure. pyusb alone keeps one context
+    `open_readout` searches through a new context after each failure. pyusb alone keeps one context
     for ever.
     """
 
@@ -147,7 +147,7 @@ class AcmLink(VendorLink):
         return reply_to(request, self.read, self._clock) if length else b""
 
 
-def open_board(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
+def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
     """Find and claim the configured readout board. Raises SensorError if it is absent, held,
     refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"

@@ -456,7 +456,7 @@ def open_link(config: SkinConfig, backend: Any, clock: Clock) -> SkinLink:
     if config.link == "serial":
         from appliance.io import serial_link
 
-        return serial_link.open_board(config, clock)
+        return serial_link.open_readout(config, clock)
     from appliance.io import usb_link
 
-    return usb_link.open_board(config, backend, clock)
+    return usb_link.open_readout(config, backend, clock)

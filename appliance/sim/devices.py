@@ -99,7 +99,7 @@ def build(
     grow.
     """
     robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
-    backend = usb.RigBackend(rig.Board(format, robot, clock), clock, acm=acm)
+    backend = usb.RigBackend(rig.ReadoutBoard(format, robot, clock), clock, acm=acm)
     return SimDevices(
         clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=format
     )

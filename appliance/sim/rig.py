@@ -193,7 +193,7 @@ class Film:
         return self._frames[first - self._base :][:n]
 
 
-class Board:
+class ReadoutBoard:
     """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO,
     sends packets.
 

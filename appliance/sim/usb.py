@@ -17,7 +17,7 @@ import usb.core
 
 from appliance.core.clock import Clock
 from appliance.io import packets
-from appliance.sim.rig import Board
+from appliance.sim.rig import ReadoutBoard
 
 VENDOR_ID, PRODUCT_ID = 0x1209, 0x7AC7
 MAX_PACKET = 64
@@ -33,7 +33,7 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
     it reads (CDC-ACM).
     """
 
-    def __init__(self, board: Board, clock: Clock, *, acm: bool = False) -> None:
+    def __init__(self, board: ReadoutBoard, clock: Clock, *, acm: bool = False) -> None:
         self.board = board
         self.errors: dict[str, int] = {}
         self.mangle: Callable[[bytes], bytes] = lambda data: data

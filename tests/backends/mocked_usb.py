@@ -71,7 +71,7 @@ class Device:
     All of it runs in the mocks' thread.
     """
 
-    def __init__(self, board: rig.Board) -> None:
+    def __init__(self, board: rig.ReadoutBoard) -> None:
         self.board = board
         self.mangle: Callable[[bytes], bytes] = lambda data: data
         self.gone = False
@@ -191,7 +191,7 @@ class Socket:
         """The device node of the skin that was plugged in last, below /dev."""
         return f"bus/usb/001/{self._number:03}"
 
-    def plug(self, board: rig.Board) -> None:
+    def plug(self, board: rig.ReadoutBoard) -> None:
         """Put a board in, in place of the one before; the kernel's word of it is out when this
         returns."""
         self.unplug()

@@ -34,14 +34,14 @@ class Nowhere:
         """Nothing was planned."""
 
 
-def board(what: Skin, clock: Clock) -> rig.Board:
+def board(what: Skin, clock: Clock) -> rig.ReadoutBoard:
     """A board that answers as `what` and sends numbered frames of that form."""
     format = SweepFormat(
         what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes
     )
     act = rig.Act(numbered(_LENGTH, format), 10**9, 10**9 + 1, "")
     robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
-    made = rig.Board(
+    made = rig.ReadoutBoard(
         format, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz)
     )
     made.identity = replace(made.identity, protocol=what.protocol)

@@ -44,7 +44,7 @@ median."""
 LOST, DROPPED = 7, 10
 """Fields of an STA sentence, counted from the talker."""
 PACKET = 6
-"""Frames of a packet, as rig.Board sends them."""
+"""Frames of a packet, as rig.ReadoutBoard sends them."""
 REAL_TIME = ("chrt", "-f", "10")
 
 

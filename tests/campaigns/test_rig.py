@@ -165,7 +165,7 @@ def test_a_board_keeps_pace_with_a_guest_that_is_starved():
     host = BusyHost(0.05)
     clock = GuestClock(host.ticks, host)
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
-    board = rig.Board(skin.FORMAT, hand, clock, fifo_frames=12)
+    board = rig.ReadoutBoard(skin.FORMAT, hand, clock, fifo_frames=12)
     board.request(packets.Request.START)
     seqs = []
     for _ in range(50):
@@ -234,7 +234,7 @@ def test_a_reply_that_crosses_a_cancellation_comes_again():
     guest = QemuEnd()
     clock = SystemClock()
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
-    board = rig.Board(skin.FORMAT, hand, clock)
+    board = rig.ReadoutBoard(skin.FORMAT, hand, clock)
     guest.peer.plug(board)
     for _ in range(3):
         guest.hear()

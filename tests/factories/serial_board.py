@@ -22,7 +22,7 @@ class SerialBoard:
     """A board behind a port at `path`, there while it is plugged in. board: may be exchanged while
     it is unplugged."""
 
-    def __init__(self, board: rig.Board, stack: ExitStack) -> None:
+    def __init__(self, board: rig.ReadoutBoard, stack: ExitStack) -> None:
         self.board = board
         self.path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "ttySkin"
         self._plugged = ExitStack()

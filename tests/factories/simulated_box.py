@@ -37,7 +37,7 @@ def idle_devices(
     n = min(round(seconds * format.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, format), 10**9, 10**9 + 1, "")]
     simulated = devices.build(format, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
-    simulated.backend.board = rig.Board(
+    simulated.backend.board = rig.ReadoutBoard(
         format, simulated.robot, simulated.clock, **{"packet_frames": 4} | board
     )
     return simulated

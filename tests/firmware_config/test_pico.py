@@ -19,7 +19,7 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets
-from appliance.io.serial_link import BoardLink
+from appliance.io.serial_link import ReadoutLink
 from appliance.io.usb_sensor import UsbSensor
 from tests.factories import pico
 from tests.factories.paths import NO_SITE
@@ -102,7 +102,7 @@ def test_it_is_taken_up_again() -> None:
     with pico.plugged_in(**FORM) as port:
         with PortReader(port) as reader:
             reader.frames(20)
-        died = BoardLink(port, 115200, SystemClock())
+        died = ReadoutLink(port, 115200, SystemClock())
         died.request(packets.Request.START, 0)
         assert died.read(4096, LIMIT_S * 1000)
         died._port.close()  # without STOP
@@ -141,7 +141,7 @@ def test_late_interrupts_cost_frames_and_not_the_clock() -> None:
         )
 
 
-def ask(link: BoardLink, request: packets.Request) -> bytes:
+def ask(link: ReadoutLink, request: packets.Request) -> bytes:
     """A reply; a busy machine may need several tries."""
     end_s = time.monotonic() + LIMIT_S
     while True:
@@ -179,7 +179,7 @@ def test_a_reader_that_stops() -> None:
     """The FIFO overflows: the oldest frames are dropped, a flag shows it, and numbers and content
     go on as if all had been read."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
-        link = BoardLink(port, 115200, SystemClock())
+        link = ReadoutLink(port, 115200, SystemClock())
         format = packets.unpack_format(ask(link, packets.Request.FORMAT))
         link.request(packets.Request.START, 0)
         # 205 kB a second: some 70 kB fit the kernel's buffers, 0.25 s the FIFO
@@ -209,7 +209,7 @@ def test_a_reader_that_stops() -> None:
 def test_stop_ends_the_stream() -> None:
     """After STOP the packet under way is completed, and nothing follows; replies still come."""
     with pico.plugged_in(**FORM) as port:
-        link = BoardLink(port, 115200, SystemClock())
+        link = ReadoutLink(port, 115200, SystemClock())
         ask(link, packets.Request.IDENTITY)
         link.request(packets.Request.START, 0)
         data, end_s = b"", time.monotonic() + LIMIT_S

@@ -105,13 +105,13 @@ class Cell:
         self.acts = script.tubes(seed)
         self.packet_frames = 6
 
-    def board(self, **arguments: Any) -> rig.Board:
-        """A board in the robot's hand; arguments: those of sim.rig.Board (ppm, latency, serial and
+    def board(self, **arguments: Any) -> rig.ReadoutBoard:
+        """A board in the robot's hand; arguments: those of sim.rig.ReadoutBoard (ppm, latency, serial and
         others)."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
-        return rig.Board(skin.FORMAT, self.hand, self.clock, **usual | arguments)
+        return rig.ReadoutBoard(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
-    def plug(self, board: rig.Board | None = None) -> rig.Board:
+    def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard:
         """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs
         has seen it: FAULT."""
         board = board or self.board()

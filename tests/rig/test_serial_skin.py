@@ -57,7 +57,7 @@ class SerialCell(Cell):
         self._playing = threading.Thread(target=self._play, daemon=True)
         self._playing.start()
 
-    def plug(self, board: rig.Board | None = None) -> rig.Board | None:
+    def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard | None:
         """Plug the adapter in; one that is in is pulled first, and a box that runs has seen it:
         FAULT."""
         if self._plugged:

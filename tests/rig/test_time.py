@@ -113,7 +113,7 @@ def kept(cell: Cell, number: int, folder: Path) -> Sweep:
     return load(folder / f"{name}.npy")[0]
 
 
-def errors(sweep: Sweep, board: rig.Board, offset: Offset) -> tuple[float, float]:
+def errors(sweep: Sweep, board: rig.ReadoutBoard, offset: Offset) -> tuple[float, float]:
     """(ns by which the box's stamp of the window's middle frame is later than the truth, ns by
     which that frame was truly taken after the middle of the edges)."""
     half = len(sweep.frames) // 2

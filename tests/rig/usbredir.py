@@ -2,7 +2,7 @@
 protocol's messages.
 
 QEMU's usb-redir device sits on the guest's xHCI port and passes on what the guest's kernel asks of
-a device (messages as in usbredirproto.h of usbredir 0.13); a Board answers, as it does under the
+a device (messages as in usbredirproto.h of usbredir 0.13); a ReadoutBoard answers, as it does under the
 simulated bus.
 """
 
@@ -83,7 +83,7 @@ class UsbRedirPeer:
     """
 
     def __init__(self, connection: socket.socket, clock: Clock) -> None:
-        self.board: rig.Board | None = None
+        self.board: rig.ReadoutBoard | None = None
         self.mangle: Callable[[bytes], bytes] = bytes
         self.silent = self.deaf = self.halted = False
         self.slow_s = 0.0
@@ -104,7 +104,7 @@ class UsbRedirPeer:
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def plug(self, board: rig.Board, descriptors: Descriptors | None = None) -> None:
+    def plug(self, board: rig.ReadoutBoard, descriptors: Descriptors | None = None) -> None:
         """Hang a board on the cable; an old one has been taken off before."""
         self._said_hello.wait(10)
         self.do(lambda: self._connect(board, descriptors or Descriptors()))
@@ -132,7 +132,7 @@ class UsbRedirPeer:
         self._socket.close()
         self._wake.close()
 
-    def _connect(self, board: rig.Board, descriptors: Descriptors) -> None:
+    def _connect(self, board: rig.ReadoutBoard, descriptors: Descriptors) -> None:
         if self.board:
             self._disconnect()
         self.board, self.descriptors = board, descriptors

@@ -130,7 +130,7 @@ def simulated_slides(
     simulated = devices.build(
         FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops
     )
-    simulated.backend.board = rig.Board(
+    simulated.backend.board = rig.ReadoutBoard(
         FMT, simulated.robot, simulated.clock, packet_frames=packet_frames
     )
     return simulated

@@ -28,7 +28,7 @@ from appliance.core.errors import (
 )
 from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
 from appliance.io import packets, serial_link
-from appliance.io.serial_link import BoardLink, SerialLink
+from appliance.io.serial_link import ReadoutLink, SerialLink
 from appliance.io.serial_port import PortInfo
 from appliance.io.usb_sensor import UsbSensor
 from appliance.sim import skin
@@ -126,7 +126,7 @@ def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     far, path = line
     who = packets.Identity(1, (1, 2, 3), "board", "7")
     stream = packets.pack(0, 0, np.zeros((6, 4, 4), np.uint8))
-    with closing(BoardLink(path, 115200, CLOCK)) as link:
+    with closing(ReadoutLink(path, 115200, CLOCK)) as link:
         os.write(
             far,
             stream[50:]
@@ -274,7 +274,7 @@ def test_the_configured_ids_are_looked_for():
     """Without skin.port the ids of the settings choose."""
     config = SkinConfig(link="serial", usb="2e8a:0005")
     with pytest.raises(SensorAbsent, match="2e8a:0005"):
-        serial_link.open_board(config, CLOCK, lambda: [PortInfo("/dev/ttyACM0", 0x1209, 0x7AC7)])
+        serial_link.open_readout(config, CLOCK, lambda: [PortInfo("/dev/ttyACM0", 0x1209, 0x7AC7)])
     with pseudo_terminal.pair() as (_, name):
-        serial_link.open_board(config, CLOCK, lambda: [PortInfo(name, 0x2E8A, 5)]).close()
-        serial_link.open_board(replace(config, port=name), CLOCK, list).close()
+        serial_link.open_readout(config, CLOCK, lambda: [PortInfo(name, 0x2E8A, 5)]).close()
+        serial_link.open_readout(replace(config, port=name), CLOCK, list).close()

@@ -388,7 +388,7 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
     now = simulated.clock.now_ns()
 
     def swap() -> None:
-        simulated.backend.board = rig.Board(FMT, simulated.robot, simulated.clock)
+        simulated.backend.board = rig.ReadoutBoard(FMT, simulated.robot, simulated.clock)
         simulated.backend.board.running = not replugged
 
     if replugged:

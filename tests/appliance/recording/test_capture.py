@@ -89,7 +89,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     acts = list(script.tubes(1010, 8))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
     simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
-    simulated.backend.board = rig.Board(
+    simulated.backend.board = rig.ReadoutBoard(
         skin.FORMAT,
         simulated.robot,
         simulated.clock,

@@ -241,7 +241,7 @@ def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statu
     """A lost packet within the window: two frames are interpolated and counted, four make it a
     `gap`."""
     simulated = simulated_devices(touched(slide()))
-    simulated.backend.board = rig.Board(
+    simulated.backend.board = rig.ReadoutBoard(
         skin.FORMAT, simulated.robot, simulated.clock, packet_frames=packet_frames
     )
     count = itertools.count()

@@ -83,7 +83,7 @@ def of_replies(number: int, change: Callable[[bytes], bytes]) -> Fault:
     return faulty
 
 
-def of_requests(change: Callable[[rig.Board, int], bool]) -> Fault:
+def of_requests(change: Callable[[rig.ReadoutBoard, int], bool]) -> Fault:
     """Requests that `change` deals with itself are not seen by the board."""
 
     def faulty(simulated: SimDevices) -> None:
@@ -113,7 +113,7 @@ def restarting(simulated: SimDevices) -> None:
     of_packets(lambda p: replace(p, seq=p.seq % 1200 + (1 << 20) * (p.seq // 1200 % 2)))(simulated)
 
 
-class NewestDropped(rig.Board):
+class NewestDropped(rig.ReadoutBoard):
     """A board whose full FIFO keeps the oldest frames; it says that it has overflowed."""
 
     cut = resume = -1
