@@ -15,7 +15,7 @@ NO_HOST = $(error name a box with HOST=user@box, or many with HOSTS=inventory.py
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(NO_HOST)))
 # Files of tests are in memory if there is 1 GB for them: a sync to a disk takes as long as a test.
 SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 1000000 { print $$6 }'),/tmp)
-PYTEST = TMPDIR=$(SCRATCH) $(BIN)/python -m pytest -q -n auto
+PYTEST = $(BIN)/python -m pytest -q -n auto
 
 .DEFAULT_GOAL := help
 .PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install clean
@@ -33,10 +33,10 @@ desktop: $(DESKTOP) ## install palpate, palpate-train and all that training need
 	@echo "or first: source $(BIN)/activate"
 
 test: $(TOOLS) ## run the tests, without those marked `thorough`
-	$(PYTEST) --dist worksteal -m "not thorough"
+	TMPDIR=$(SCRATCH) $(PYTEST) --dist worksteal -m "not thorough"
 
 test-fast: $(TOOLS) ## run the tests that are neither `slow` nor `thorough`
-	$(PYTEST) --dist worksteal -m "not slow and not thorough"
+	TMPDIR=$(SCRATCH) $(PYTEST) --dist worksteal -m "not slow and not thorough"
 
 test-all: test ## run all tests; those on real sweeps need their folder in PALPATE_DATA
 	$(PYTEST) --dist loadfile -m thorough

@@ -723,7 +723,8 @@ def test_over_umockdev():
             "no:cacheprovider",
             __file__,
         ],
-        env=os.environ | {backends.VARIABLE: "mocked"},
+        # umockdev takes files below /dev for devices, those of TMPDIR=/dev/shm as well
+        env=os.environ | {backends.VARIABLE: "mocked", "TMPDIR": "/tmp"},
         capture_output=True,
         text=True,
         timeout=300,
