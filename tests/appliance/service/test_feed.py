@@ -395,6 +395,7 @@ def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # sends for seconds until a limit is reached
 def test_one_that_never_reads_costs_no_memory_without_bound(offered: Offered) -> None:
     """Sixty-four readers that requested everything and never read: after thousands of lines and
     windows the box needs less than 2 MiB more."""

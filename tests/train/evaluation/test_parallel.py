@@ -115,6 +115,7 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
             process.wait()
 
 
+@pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_cluster_gives_the_same_bits(cluster):
     """An evaluation there and here: equal logits, of features with an SVM and of a network."""
     plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
@@ -139,6 +140,7 @@ def noted(task: int, folder: str, data: np.ndarray) -> float:
     return float(data[task])
 
 
+@pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
     """Twenty tasks, one worker killed: all are done, none but the killed one's was begun twice."""
     address, workers = cluster
@@ -151,12 +153,14 @@ def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Pa
     assert sum(times.values()) <= 21  # at most the result that was on its way when its worker died
 
 
+@pytest.mark.thorough  # a Dask cluster of two processes
 def test_an_error_on_a_worker_is_the_callers(cluster):
     """It is raised here too."""
     with pytest.raises(IndexError):
         list(parallel.results(add, [99], [np.arange(3.0)], scheduler=cluster[0]))
 
 
+@pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_cluster_without_the_project_is_named(
     cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -176,6 +180,7 @@ def always_dies(task: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_task_that_kills_every_worker_ends_with_a_reason(
     cluster, monkeypatch: pytest.MonkeyPatch
 ):

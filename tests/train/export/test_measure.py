@@ -129,6 +129,7 @@ def test_aeon_runs_what_was_trained(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # runs two commands that train
 def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

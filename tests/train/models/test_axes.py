@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.factories.costly import quick_first
 from tests.factories.sheared import sheared
 from train.data.sets import Dataset
 from train.models import methods
@@ -22,7 +23,7 @@ def sweeps() -> Dataset:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", methods.every())
+@pytest.mark.parametrize("name", quick_first(methods.every()))
 def test_a_method_takes_three_axes(name: str, sweeps: Dataset):
     """Logits are finite, also those of the graph if there is one; other shear gives other
     logits."""

@@ -45,6 +45,7 @@ def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits again for each material
 def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
     """The default recipe: a share that gets a known name, a share of known ones kept, for each
     material."""
@@ -181,6 +182,7 @@ def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: in
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits again for each part of the report
 def test_the_report_of_a_fit_is_that_of_its_bundle(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -289,6 +289,7 @@ def test_touch_time_is_read_or_refused(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole study
 def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
     """A small chart end to end; real sweeps that nobody named are left out; kept, the accuracies
     are the same."""

@@ -480,6 +480,7 @@ def test_networks_of_peers_are_trained_briefly_for_their_time():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # trains and times every method
 def test_all_methods_are_timed_in_one_run(tmp_path: Path):
     """A bundle by the box's classifier, in int8 too, a method of aeon in aeon; one that cannot take
     the sweeps is left out, with why."""
@@ -563,6 +564,7 @@ def test_times_alone_are_measured_again(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole study
 def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Results, pictures and a page that says what it is; --kept with fewer methods makes one of
     these alone."""

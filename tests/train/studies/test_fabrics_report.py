@@ -71,6 +71,8 @@ def results(data: Path) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.thorough  # fits 24 models
 def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.CaptureFixture[str]):
     """Twelve tests, means removed first; a second method joins them, and what lay there of the
     first is as it was."""

@@ -86,6 +86,7 @@ def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # measures the whole simulator
 def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
     """Four figures by five methods of shares, their differences and what they come to; it is
     JSON."""

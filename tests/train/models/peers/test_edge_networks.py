@@ -41,6 +41,7 @@ def test_its_weights_and_work_are_those_of_depthwise_separable_layers():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # trains for seconds
 def test_ds_cnn_has_an_int8_form():
     """The int8 model is smaller, has integer weights, and answers nearly as the float model."""
     s = easy(12)

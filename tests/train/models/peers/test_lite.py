@@ -63,6 +63,7 @@ def test_the_graph_answers_as_the_network(rows: int, window: int):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # trains for seconds
 def test_lite_has_an_int8_form_that_the_box_reads():
     """The int8 model has integer weights and answers nearly as the float model, trained on an easy
     set."""

@@ -157,6 +157,7 @@ def test_the_same_seed_gives_the_same_fit(fitted: Fit):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits with every stage
 def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     """Stages are trained from LEAST_SWEEPS on, if filters are not good enough. Their features come
     first, with a discriminant of their own; a fifth of the sweeps is held out from them, and their

@@ -1,0 +1,32 @@
+"""Methods whose training takes seconds, though a test lets them take few steps.
+
+`make test` tries the others; `make test-all` tries these as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+COSTLY = {
+    "lite",
+    "ds-cnn",
+    "recurrent",
+    "multirocket-hydra",
+    "quant",
+    "compact-1k",
+    "compact-4k",
+    "compact-10k",
+    "compact-20k",
+    "compact-50k",
+    "compact-100k",
+}
+
+
+def quick_first(names: Iterable[str]) -> list[Any]:
+    """The names as parameters of a test; the costly ones are marked thorough."""
+    return [
+        pytest.param(name, marks=pytest.mark.thorough) if name in COSTLY else name for name in names
+    ]
