@@ -168,7 +168,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
         def heard(news: Heard | Mapping[str, Any]) -> None:
             if self._sweeps:
-                self._sweeps.hear(news)
+                self._sweeps.notice(news)
             self._news.append(news)
             guard.trigger()
 

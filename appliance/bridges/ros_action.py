@@ -42,11 +42,11 @@ class SweepAction:
             callback_group=ReentrantCallbackGroup(),
         )
 
-    def hear(self, news: object) -> None:
+    def notice(self, news: object) -> None:
         """Take news of the box."""
         current = self._current
         if current:
-            current.hear(news)
+            current.notice(news)
 
     def interrupt(self) -> None:
         """Abort the current sweep, at the box too, and wait until it has ended."""

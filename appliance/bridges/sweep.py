@@ -51,7 +51,7 @@ class CommandedSweep:
         self._answers: SimpleQueue[Answer] = SimpleQueue()
         self._heard_ns = 0
 
-    def hear(self, news: object) -> None:
+    def notice(self, news: object) -> None:
         """Take news of the source; from any thread."""
         self._heard_ns = self._clock.now_ns()
         if isinstance(news, Answer):
@@ -109,7 +109,7 @@ class CommandedSweep:
                 if terms.slide_s and not stopped:
                     self._close(answer)
                 return answer
-            self._see_that_it_is_there(begin_ns)
+            self._check_box(begin_ns)
             if past_s >= terms.timeout_s:
                 raise NoAnswer(
                     f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was "
@@ -126,7 +126,7 @@ class CommandedSweep:
             with suppress(ApplianceError):
                 self._source.send("STOP")
 
-    def _see_that_it_is_there(self, begin_ns: int) -> None:
+    def _check_box(self, begin_ns: int) -> None:
         """Raises LinkLost or NoAnswer once the box is gone."""
         trouble = self._source.view().trouble
         if trouble:

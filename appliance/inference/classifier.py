@@ -249,7 +249,9 @@ class Classifier:
 
     def _run(self, outputs: tuple[str, ...], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
         """These outputs of the graph for one window, without the leading axis of length 1."""
-        graph_input = features.given(self.bundle.manifest.input, taxels, self.bundle.format.rate_hz)
+        graph_input = features.graph_input(
+            self.bundle.manifest.input, taxels, self.bundle.format.rate_hz
+        )
         return self._model(outputs, graph_input)
 
     def _classify(

@@ -151,7 +151,7 @@ class FeedServer(Observer):
         self._put_frame(now_ns)
         for number, events in self._poll.poll(0, HEARD):
             if number in self._readers:
-                self._hear(
+                self._receive(
                     self._readers[number], gone=bool(events & (select.EPOLLHUP | select.EPOLLERR))
                 )
             else:
@@ -245,11 +245,11 @@ class FeedServer(Observer):
         self._health = self._health or encode("health", self._report(health))
         return self._health
 
-    def _hear(self, reader: Reader, *, gone: bool) -> None:
+    def _receive(self, reader: Reader, *, gone: bool) -> None:
         """Take up a reader's requests. gone: the reader has closed the connection, perhaps after
         sending some."""
         try:
-            asked = reader.hear()
+            asked = reader.receive()
         except FormatError as e:
             self._close(reader, str(e))
             return

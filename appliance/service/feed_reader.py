@@ -32,7 +32,7 @@ _PARTS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class FeedRequest:
     """A request of a reader. frames_hz: frames a second, 0 for none. sweeps: whether the reader
     gets the windows of sweeps. None leaves the earlier request as it is."""
 
@@ -40,7 +40,7 @@ class Asked:
     sweeps: bool | None = None
 
 
-def requests(data: bytes, rest: bytes = b"") -> tuple[list[Asked], bytes]:
+def requests(data: bytes, rest: bytes = b"") -> tuple[list[FeedRequest], bytes]:
     """The requests in `data`, which continues `rest`, and the new unfinished rest.
 
     Raises FormatError for a line that is not a request or is longer than MOST_REQUEST.
@@ -52,7 +52,7 @@ def requests(data: bytes, rest: bytes = b"") -> tuple[list[Asked], bytes]:
     return [_request(line) for line in lines], rest
 
 
-def _request(line: bytes) -> Asked:
+def _request(line: bytes) -> FeedRequest:
     advice = 'send {"frames": HZ} or {"sweeps": true}, as in PROTOCOL.md, part 4'
     try:
         asked = json.loads(line)
@@ -65,7 +65,9 @@ def _request(line: bytes) -> Asked:
         raise FormatError(f"{_shown(line)}: give frames a second as a number from 0 to {MOST_HZ:g}")
     if type(sweeps) is not bool:
         raise FormatError(f"{_shown(line)}: give sweeps as true or false")
-    return Asked(float(hz) if "frames" in asked else None, sweeps if "sweeps" in asked else None)
+    return FeedRequest(
+        float(hz) if "frames" in asked else None, sweeps if "sweeps" in asked else None
+    )
 
 
 def _shown(line: bytes) -> str:
@@ -179,7 +181,7 @@ class Reader:
             self._begun -= len(self._queue[0])
             self._drop_first()
 
-    def hear(self) -> list[Asked]:
+    def receive(self) -> list[FeedRequest]:
         """The requests that have come since the last call.
 
         Raises FormatError for a line that is not a request, EOFError or OSError if the reader is

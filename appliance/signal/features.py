@@ -128,7 +128,9 @@ def compute(
     return kinds[kind](taxels, rate_hz).astype(np.float32)
 
 
-def given(kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS) -> NDArray[Any]:
+def graph_input(
+    kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS
+) -> NDArray[Any]:
     """Input of a graph of input `kind` for raw counts: the counts if "raw", otherwise `compute`."""
     return taxels if kind == "raw" else compute(kind, taxels, rate_hz, kinds)
 

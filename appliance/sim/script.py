@@ -77,7 +77,7 @@ def named(
             one for one in able if (one[0].skin, one[0].rate_hz) == (format.skin, format.rate_hz)
         ]
         if not fits:
-            sent = " or ".join(str(form) for form, _, _ in able)
+            sent = " or ".join(str(one) for one, _, _ in able)
             hint = _NAME_BUNDLE if seen else _NAME_SKIN
             raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
         _, world, by = fits[0]

@@ -237,7 +237,7 @@ def requests(data: bytes, folder: Path) -> None:
     for asked in got:
         assert asked.frames_hz is None or 0 <= asked.frames_hz <= 20
         assert asked.sweeps in (None, True, False)
-        assert asked != feed_reader.Asked()
+        assert asked != feed_reader.FeedRequest()
     for cut in cuts(data):
         first, left = feed_reader.requests(data[:cut])
         then, left = feed_reader.requests(data[cut:], left)

@@ -37,4 +37,4 @@ def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float
 def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
     """The input `kind` of a graph for raw counts [T, R, C]: the counts themselves where it is
     "raw", else `compute`."""
-    return features.given(kind, taxels, rate_hz, KINDS)
+    return features.graph_input(kind, taxels, rate_hz, KINDS)

@@ -184,7 +184,7 @@ class Player:
 
     def _obey(self) -> None:
         with contextlib.suppress(BlockingIOError, OSError):  # no bytes; closed at this moment
-            self._waiting += self.wire.hear(os.read(self._far, 4096))
+            self._waiting += self.wire.receive(os.read(self._far, 4096))
 
     def _flush(self) -> None:
         with contextlib.suppress(BlockingIOError, OSError):  # full; closed at this moment

@@ -34,7 +34,7 @@ class Wire(Protocol):
         """The bytes of one frame [R, C] or [R, C, A]. t_us: the skin's own time."""
         ...
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """The skin's answer to bytes from the box."""
         ...
 
@@ -58,7 +58,7 @@ class _Deaf(_Uncounted):
     def __init__(self, rate_hz: float) -> None:
         self.period_ns = 1e9 / rate_hz
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """Does nothing: the skin does not listen."""
         return b""
 
@@ -150,7 +150,7 @@ class PapillArray:
         self._unloaded: list[NDArray[np.float64]] = []
         self._tare_left = 0
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """`f1000\\n` sets the rate, `z\\n` takes the mean of the next two seconds as zero; other
         lines do nothing."""
         *lines, self._rest = (self._rest + data).split(b"\n")
@@ -252,7 +252,7 @@ class Slcan(_Uncounted):
         """Whether the channel is open at the sensors' speed and the start command was sent."""
         return self._open and self._started
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """The adapter's answers."""
         *lines, self._rest = (self._rest + data).split(b"\r")
         return b"".join(map(self._command, lines))
@@ -319,7 +319,7 @@ class Robotiq(_Uncounted):
         self._rest = b""
         self._last: NDArray[np.int64] | None = None
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """Commands: start sending with a period in ms, 0 to stop; ask for the version."""
         self._rest += data
         answer = b""

@@ -49,7 +49,7 @@ class Swept:
         self.phases: list[str] = []
         self.canceled = threading.Event()
         self.at_phase: Callable[[str], object] = lambda phase: None
-        self.source = LineSource(str(path), heard=lambda news: self.sweep.hear(news))
+        self.source = LineSource(str(path), heard=lambda news: self.sweep.notice(news))
         self.use(SystemClock())
 
     def use(self, clock: SystemClock) -> None:
@@ -198,7 +198,7 @@ def test_no_answer_in_time(swept: Swept):
 def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
     """What came before START is forgotten."""
     swept.box.script = saying()
-    swept.sweep.hear(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
+    swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
     with pytest.raises(NoAnswer, match="no answer within"):
         swept.run(timeout_s=0.3)
 
@@ -231,7 +231,7 @@ def test_a_box_that_speaks_is_waited_for(swept: Swept):
     swept.box.script = saying()
     spoken = CommandedSweep(
         swept.source,
-        canceled=lambda: bool(spoken.hear(state())),
+        canceled=lambda: bool(spoken.notice(state())),
         say=lambda phase, answer: None,
         clock=Hurried(),
     )

@@ -32,7 +32,7 @@ from appliance.service.feed import (
     SHARE,
     FeedServer,
 )
-from appliance.service.feed_reader import HEARD_BYTES, QUEUE_BYTES, Asked, requests
+from appliance.service.feed_reader import HEARD_BYTES, QUEUE_BYTES, FeedRequest, requests
 from appliance.sim import devices, rig, script, skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
 from tests.factories.simulated_box import SECOND, Rigged
@@ -493,7 +493,7 @@ def test_endless_requests_are_read_a_little_each_turn(
     taken: list[int] = []
     plain = feed_reader.requests
 
-    def counted(data: bytes, rest: bytes) -> tuple[list[Asked], bytes]:
+    def counted(data: bytes, rest: bytes) -> tuple[list[FeedRequest], bytes]:
         taken.append(len(data))
         return plain(data, rest)
 
@@ -677,7 +677,7 @@ def test_requests_in_parts_are_requests(offered: Offered) -> None:
     (reader,) = offered.feed._readers.values()
     assert (reader.frames_hz, reader.sweeps) == (4.0, False)
     assert requests(b'{"frames": 1}\n{"sweeps": true}\n{"fr') == (
-        [Asked(1.0), Asked(None, True)],
+        [FeedRequest(1.0), FeedRequest(None, True)],
         b'{"fr',
     )
     with pytest.raises(FormatError, match="over 1024 bytes"):

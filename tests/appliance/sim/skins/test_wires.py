@@ -107,11 +107,11 @@ def test_papillarray_commands() -> None:
     """f sets one of four rates, in parts, too; z makes the mean of two seconds the zero; nothing
     answers."""
     skin = wires.PapillArray(1000)
-    assert skin.hear(b"f2") == b""
+    assert skin.receive(b"f2") == b""
     assert skin.period_ns == 1e6
-    assert skin.hear(b"50\nf300\nf\nfast\n") == b""
+    assert skin.receive(b"50\nf300\nf\nfast\n") == b""
     assert skin.period_ns == 4e6
-    skin.hear(b"f100\nz\n")
+    skin.receive(b"f100\nz\n")
     forces = []
     for i in range(202):
         sent = skin.frame(np.full((3, 3, 3), 1.0 + i % 2), 0)
@@ -127,13 +127,13 @@ def test_slcan() -> None:
     and it was started."""
     skin = wires.Slcan(100)
     taxels = np.arange(48).reshape(4, 4, 3).astype(np.uint16) + 0x1234
-    assert skin.hear(b"t20120700\rO\rS9\r") == b"\a\a\a"
-    assert skin.hear(b"S6\rO\rt20120700\rC\r") == b"\r\r\a\r"
-    assert skin.hear(b"S8\rO\rO\rS8\r") == b"\r\r\a\a"
+    assert skin.receive(b"t20120700\rO\rS9\r") == b"\a\a\a"
+    assert skin.receive(b"S6\rO\rt20120700\rC\r") == b"\r\r\a\r"
+    assert skin.receive(b"S8\rO\rO\rS8\r") == b"\r\r\a\a"
     assert not skin.streaming
-    assert skin.hear(b"t20220700\rt20110") == b"z\r"  # another CAN board
+    assert skin.receive(b"t20220700\rt20110") == b"z\r"  # another CAN board
     assert not skin.streaming
-    assert skin.hear(b"7\rt20120700\r\rV\rX\r") == b"z\rz\r\rV1013\r\a"
+    assert skin.receive(b"7\rt20120700\r\rV\rX\r") == b"z\rz\r\rV1013\r\a"
     assert skin.streaming
     first, *_, last, empty = skin.frame(taxels, 0).split(b"\r")
     assert first == b"t71080012341235123600"
@@ -141,7 +141,7 @@ def test_slcan() -> None:
     assert empty == b""
     skin.invalid = frozenset({0})
     assert skin.frame(taxels, 0).startswith(b"t710800FA34")
-    assert skin.hear(b"C\r") == b"\r"
+    assert skin.receive(b"C\r") == b"\r"
     assert not skin.streaming
 
 
@@ -150,8 +150,8 @@ def test_robotiq() -> None:
     published order."""
     skin = wires.Robotiq(60)
     assert not skin.streaming
-    assert skin.hear(bytes.fromhex("009a00e300 9a0058")) == bytes.fromhex("9a00e305") + b"2.0.1"
-    skin.hear(bytes.fromhex("0110"))
+    assert skin.receive(bytes.fromhex("009a00e300 9a0058")) == bytes.fromhex("9a00e305") + b"2.0.1"
+    skin.receive(bytes.fromhex("0110"))
     assert (skin.streaming, skin.period_ns) == (True, 16e6)
     taxels = np.arange(56).reshape(14, 4) + 0x2700
     sent = skin.frame(taxels.astype(np.uint16), 5)
@@ -162,7 +162,7 @@ def test_robotiq() -> None:
     assert sent[71:80] == bytes.fromhex("700000000000000005")
     assert sent[80:85] == bytes.fromhex("14271c271d")
     assert skin.frame((taxels + 3).astype(np.uint16), 6)[61:64] == bytes.fromhex("200003")
-    skin.hear(bytes.fromhex("9a00580100"))
+    skin.receive(bytes.fromhex("9a00580100"))
     assert not skin.streaming
 
 
