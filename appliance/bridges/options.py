@@ -61,6 +61,11 @@ def add_arguments(command: CommandParser) -> None:
         metavar="N",
         help=f"most connections at a time (default {MOST})",
     )
+    _add_feed(command)
+    _add_ros(command)
+
+
+def _add_feed(command: CommandParser) -> None:
     command.only_for("modbus")(
         "--feed",
         nargs="?",
@@ -68,6 +73,9 @@ def add_arguments(command: CommandParser) -> None:
         metavar="PATH",
         help=f"on the box: read the feed at PATH (default {FEED})",
     )
+
+
+def _add_ros(command: CommandParser) -> None:
     command.only_for("ros")(
         "--ros-args",
         nargs=argparse.REMAINDER,

@@ -103,7 +103,8 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
     if sha == current:
         return "on trial", (
             f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of"
-            f" {settings.trial_sweeps} sweeps, {standing.streamed_s:.0f} of {settings.trial_s:.0f} s,"
+            f" {settings.trial_sweeps} sweeps, {standing.streamed_s:.0f} of {settings.trial_s:.0f}"
+            " s,"
             " as of its last start or end"
         )
     if sha == state.of(current).previous:
@@ -160,7 +161,8 @@ def suits(new: Bundle, skin: SweepFormat | None) -> None:
     known."""
     if skin and not fits(skin, new.format):
         raise BundleError(
-            f"bundle {new.id} is for a skin of {new.format}, and the skin that streams has {skin}: it"
+            f"bundle {new.id} is for a skin of {new.format}, and the skin that streams has {skin}:"
+            " it"
             " would answer no sweep; if another skin comes with it, use --other-skin (make deploy"
             " OTHER_SKIN=1)"
         )

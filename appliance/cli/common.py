@@ -53,7 +53,8 @@ def status_file(settings: Config) -> Path:
     """The file with the state of the service. Raises ConfigError if it is turned off."""
     if not settings.store.status:
         raise ConfigError(
-            'store.runtime = "" turns the status file off; set it to a folder, and restart the service'
+            'store.runtime = "" turns the status file off; set it to a folder, and restart the'
+            " service"
         )
     return settings.store.status
 

@@ -33,7 +33,8 @@ def run(args: argparse.Namespace) -> int:
     new = enrolment.enrol(start.bundle, args.label, _good_sweeps(args, settings, start.bundle))
     if new.disagreement and not args.scattered:
         raise BundleError(
-            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was written"
+            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
+            " written"
         )
     for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
@@ -50,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
         else "it runs on trial from the next start on: systemctl restart palpate"
     )
     log.info(
-        f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)} labels; {how}"
+        f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)}"
+        f" labels; {how}"
     )
     return 0
 

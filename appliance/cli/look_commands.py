@@ -1,4 +1,4 @@
-"""The commands with which a person looks at the box: check, status, watch, align, replay, config."""
+"""Commands that show the box to a person: check, status, watch, align, replay, config."""
 
 from __future__ import annotations
 
@@ -78,7 +78,8 @@ def run_align(args: argparse.Namespace) -> int:
 
 
 def _expected(settings: Config, devices: Devices) -> Expected:
-    """The expected contact: by the bundle if it fits the skin, or if there is no skin yet."""
+    """The expected contact. A bundle that fits the skin gives it, or any bundle before a skin is
+    found."""
     from appliance.alignment.live import Expected
 
     current, fingertip = None, settings.skin.fingertip
@@ -127,7 +128,8 @@ def run_watch(args: argparse.Namespace) -> int:
     socket, stopped = settings.store.feed, stop_flag()
     if not socket:
         raise ConfigError(
-            'store.runtime = "" turns the feed off, so there is nothing to watch; set it to a folder'
+            'store.runtime = "" turns the feed off, so there is nothing to watch; set it to a'
+            " folder"
         )
     path = str(socket)
     if args.web is not None:

@@ -273,13 +273,7 @@ def _record(command: CommandParser) -> None:
         metavar="DIR",
         help="folder of the sweeps (default: sweeps/ in the store's folder)",
     )
-    for name in ("material", "position", "session"):
-        command.add_argument(
-            f"--{name}",
-            default="",
-            metavar="TEXT",
-            help="until a command on the serial line or the page changes it",
-        )
+    _labels(command)
     command.add_argument(
         "--format",
         metavar="RxC:TYPE:HZ",
@@ -303,6 +297,16 @@ def _record(command: CommandParser) -> None:
         f"also as a page, on which the labels are set (default port {WEB_PORT}); watch.address"
         " opens it to the network",
     )
+
+
+def _labels(command: CommandParser) -> None:
+    for name in ("material", "position", "session"):
+        command.add_argument(
+            f"--{name}",
+            default="",
+            metavar="TEXT",
+            help="until a command on the serial line or the page changes it",
+        )
 
 
 def _enrol(command: CommandParser) -> None:

@@ -67,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
-    """The devices, and the format of the sweeps that are kept. Raises ConfigError if no sweep can be
-    as long as the window."""
+    """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
+    long as the window."""
     asked = skins.described(args.format) if args.format else None
     devices = open_devices(args, (lambda: asked) if asked else None)
     format = asked or devices.format or _announced(devices.wire(settings), devices)

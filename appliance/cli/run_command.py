@@ -92,8 +92,8 @@ def _reports(
 def _shadow(
     args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices
 ) -> Shadow | None:
-    """The candidate of `--shadow`, which classifies beside the current bundle. None if there is no
-    candidate, or if it cannot run."""
+    """The candidate of `--shadow`, which classifies beside the current bundle. None without a
+    candidate, and for a candidate that cannot run."""
     try:
         candidate = None
         if args.shadow:

@@ -43,7 +43,8 @@ def run_check(args: argparse.Namespace) -> int:
     with closing(skins.open_readout(settings, devices)) as link:
         more = "about half a minute" if port else "some seconds"
         log.info(
-            f"listening to frames for {seconds:g} s; stopping, requests and overflow take {more} more"
+            f"listening to frames for {seconds:g} s; stopping, requests and overflow take {more}"
+            " more"
         )
         for found in skin_check.check(link, devices.clock, seconds, port=port):
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)

@@ -121,8 +121,8 @@ class TriggerConfig:
 class OutputConfig:
     """The box's GPIO lines to the robot; "" means not wired.
 
-    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code, lowest bit first. settle_us: time from setting these lines to the
-    rise of `result_valid`.
+    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code,
+    lowest bit first. settle_us: time from setting these lines to the rise of `result_valid`.
     """
 
     ready: str = gpio_line()

@@ -1,1 +1,1 @@
-"""What a person runs without a robot: demo and bench, both on simulated devices."""
+"""Demo and bench on simulated devices, and tools for the skin alone."""

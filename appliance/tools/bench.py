@@ -1,9 +1,8 @@
 """`palpate bench`: latency, inference, memory, start and processor share of this machine, with the
 simulated skin.
 
-In: a way to build a box on simulated devices. Out: a line for each figure, and all of them as JSON
-with plain keys. Memory, start and processor share are measured in separate processes, so that
-nothing of the bench is in them.
+Each figure is printed in a line, and all of them are returned with plain keys. Memory, start and
+processor share are measured in processes of their own, without parts of the bench.
 """
 
 from __future__ import annotations
@@ -44,11 +43,9 @@ SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 def run(
     bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """All figures; `report` gets a line for each as soon as it is there.
-
-    references: folder of the models that are timed beside the bundle, made if it is not there.
-    seed: of the simulated sweeps. Raises BundleError where the references cannot be made.
-    """
+    """All figures. report: gets a line for each figure at once. references: folder of the models
+    that are timed beside the bundle; they are made if they are missing. seed: of the simulated
+    sweeps. Raises BundleError if the references cannot be made."""
     load_before = os.getloadavg()
     figures: dict[str, Any] = {
         "commit": commit(),
@@ -96,8 +93,8 @@ def _percentiles(values: list[float]) -> dict[str, float]:
 
 
 class _Watch(Observer):
-    """Measures how late answers are: when it gets a verdict, the sentence has been written to the
-    serial port."""
+    """Measures the latency of answers. An observer gets a verdict after its sentence was
+    written."""
 
     def __init__(self, clock: Clock) -> None:
         self.verdicts: list[Verdict] = []
@@ -115,12 +112,12 @@ class _Watch(Observer):
 
 
 def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
-    """SWEEPS simulated sweeps from USB bytes to sentence, at skin positions that no training set
-    has. Computing takes its real time, waiting is skipped.
+    """Latencies of SWEEPS simulated sweeps from USB bytes to sentence, at skin positions outside
+    all training sets.
 
-    edge_to_sentence_ms: from the moment when stop edge and last frame of the window have been read
-    to the sentence at the port. edge_seen_ms: from the kernel's time stamp of the stop edge to that
-    moment (glitch filter, rest of a packet).
+    Computing takes its real time, waiting is skipped. edge_to_sentence_ms: from stop edge and last
+    frame of the window, both read, to the sentence at the port. edge_seen_ms: from the kernel's
+    time stamp of the stop edge to the same moment (glitch filter, rest of a packet).
     """
     clock = rig.SkippingClock()
     watch = _Watch(clock)
@@ -148,8 +145,8 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
 
 
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
-    """Times of the bundle, of the same network in float and of the paper's network in int8,
-    measured in turns."""
+    """Times of the bundle, of the same network in float, and of the paper's network in int8, in
+    turns."""
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
     calls: dict[str, Callable[[], object]] = {}
@@ -162,7 +159,7 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     took_ms: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
-            call()  # fills the caches that the model before has emptied
+            call()  # fills the caches, which the other models have overwritten
             for _ in range(CALLS):
                 start = time.perf_counter_ns()
                 call()
@@ -171,7 +168,7 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
 
 
 def _make_references(folder: Path) -> None:
-    """Let the desktop's tools write the reference models, where they are installed beside this
+    """Let the desktop's tools write the reference models, if they are installed beside this
     program."""
     if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
         return
@@ -182,7 +179,7 @@ def _make_references(folder: Path) -> None:
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:
-    """One part of the figures, measured in a new process."""
+    """A part of the figures, measured in a new process."""
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
@@ -222,7 +219,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """What Linux calls the processor, or the board; "" where it has no name."""
+    """The name of the board or the processor; "" if there is none."""
     board, names = Path("/proc/device-tree/model"), Path("/proc/cpuinfo")
     if board.is_file():
         return board.read_text().strip("\0\n ")

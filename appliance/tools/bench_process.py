@@ -1,8 +1,7 @@
-"""The figures of the bench that are measured in a process of their own: memory and processor share.
+"""Memory and processor share, for the bench, each measured in a process of its own.
 
-In: recorded sweeps and a way to build a box. Out: figures. The simulated skin is not loaded here:
-it is no part of the box. Nor is the simulated board, but it must be: it is loaded last, so that
-what it takes is measured.
+This module does not load the simulated skin, which is not part of the box. It must load the
+simulated board, and loads it last, so that its memory can be measured.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ NAMES = ("memory", "stream")
 
 
 class Build(Protocol):
-    """Builds a box on simulated devices, which `stack` closes. Out: the box, and the robot's end of
-    its serial line."""
+    """Builds a box on simulated devices, which `stack` closes; returns the box and the robot's end
+    of its serial line."""
 
     def __call__(
         self,
@@ -52,23 +51,22 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 
 def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """The part `name` of NAMES, measured in this process while the acts in `path` are played again
-    and again."""
+    """The part `name` of NAMES, measured in this process, which repeats the acts in `path`."""
     return {"memory": _memory, "stream": _stream}[name](format, build, path)
 
 
 def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
-    """Devices that play the acts in `path`, in virtual time where there is no clock."""
+    """Devices that play the acts in `path`; in virtual time without a clock."""
     from appliance.sim import devices, rig
 
     with np.load(path, allow_pickle=False) as z:
         acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
-    # the acts that a simulator remembers are no part of the box
+    # the simulator's memory of acts is not part of the box
     return devices.build(format, cycle(acts), clock or rig.VirtualClock(), "sim", remember=False)
 
 
 def drain(far_end: int) -> None:
-    """Read and drop what the box has written, so that the line does not fill up."""
+    """Read and drop the box's output, so that the serial line does not fill up."""
     with suppress(BlockingIOError):
         os.read(far_end, 65536)
 
@@ -76,9 +74,9 @@ def drain(far_end: int) -> None:
 def _memory(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
 
-    without_board: less what loading the simulated board and its acts took. What the board takes
-    while it plays is still in it. growth_last_900: since a tenth of them, with what the allocator
-    takes at first. growth_next_900: from then on.
+    without_board: minus the memory for loading the simulated board and its acts; the board's memory
+    while it plays is still included. growth_last_900: since a tenth of the sweeps, with the
+    allocator's first growth. growth_next_900: growth over as many further sweeps.
     """
     n, rss_mb = MEMORY_SWEEPS, {}
     board = -_rss_mb()
@@ -106,7 +104,7 @@ def _rss_mb() -> float:
 
 
 def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """Share of one core while the skin streams in real time, without and with the simulated readout
+    """Share of one core while the skin streams in real time, with and without the simulated readout
     board."""
     simulated = _board(format, path, SystemClock())
     board_ns = 0

@@ -1,8 +1,7 @@
 """`palpate demo`: the skin live in the terminal during a sweep, then the verdict with its sentence,
 at the end a table.
 
-In: a box on simulated devices and the robot's end of its serial line. Out: pictures on a terminal,
-else plain lines.
+A terminal shows pictures; other outputs get plain lines.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from appliance.tools.score import AnswerScore
 FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
 ARRIVAL_S = 1.0
-"""The longest that a sentence may take from one end of the line to the other."""
+"""Longest time of a sentence from one end of the serial line to the other."""
 BAR = 30
 """Characters of a full bar."""
 BRIGHT = 160
-"""Raw counts that are shown white; the skin seldom gives more."""
+"""Raw counts that are shown white; the skin seldom has more."""
 
 
 def bar(probability: float) -> str:
@@ -38,8 +37,8 @@ def bar(probability: float) -> str:
 
 
 def picture(frame: NDArray[Any]) -> list[str]:
-    """A frame [R, C] or [R, C, A] of raw counts, the normal axis alone, as shaded cells with their
-    numbers, two lines a row."""
+    """A frame [R, C] or [R, C, A] of raw counts as shaded cells with numbers, two lines a row; of
+    several axes, the normal axis."""
     lines = []
     for row in normal(frame, 0).astype(int):
         level = [min(23, max(0, count) * 24 // BRIGHT) for count in row]
@@ -55,12 +54,10 @@ def picture(frame: NDArray[Any]) -> list[str]:
 
 
 class Demo:
-    """Steps a box until enough answers have come to the robot's end of its serial line, and shows
-    what happens.
+    """Steps a box until the robot's end of its serial line has enough answers, and shows them.
 
-    played: the acts of the simulated robot, which hold the true materials. far_end: non-blocking
-    file descriptor of the robot's end. labels: that the bundle knows. raw: print the sentences
-    alone.
+    played: the acts of the simulated robot, with the true materials. far_end: non-blocking file
+    descriptor of the robot's end. labels: labels of the bundle. raw: print the sentences alone.
     """
 
     def __init__(
@@ -97,7 +94,10 @@ class Demo:
                     ["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""]
                 )
         if not self._raw and self.score.answers:
-            lost = f"  frames lost     {box.counters.lost_frames} of {box.counters.frames + box.counters.lost_frames}"
+            lost = (
+                f"  frames lost     {box.counters.lost_frames} of"
+                f" {box.counters.frames + box.counters.lost_frames}"
+            )
             touch = (
                 [f"  touch time      {self.score.touch(box.format.rate_hz)}"]
                 if self.score.early
@@ -113,8 +113,8 @@ class Demo:
             )
 
     def _read(self, sent: int, wanted: int) -> None:
-        """Read what has come to the robot's end; wait for answers that were sent and have not come;
-        stop at `wanted`."""
+        """Read the sentences at the robot's end, up to `wanted` answers. Sent answers are waited
+        for."""
         while select.select([self._far_end], [], [], ARRIVAL_S if self.score.answers < sent else 0)[
             0
         ]:
@@ -140,11 +140,14 @@ class Demo:
         if not self._raw:
             named = answer.label or answer.status
             used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""
-            text = f"{answer.sweep:>3}  {act.label:<15} -> {named:<15} {mark}  {bar(answer.probability)}{used}"
+            text = (
+                f"{answer.sweep:>3}  {act.label:<15} -> {named:<15} {mark} "
+                f" {bar(answer.probability)}{used}"
+            )
             self._print(text, f"     {line}")
 
     def _draw(self, lines: list[str]) -> None:
-        """Draw over the picture before, in one write so that nothing flickers."""
+        """Draw over the previous picture, in one write against flicker."""
         self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
         self._out.flush()
         self._drawn = len(lines)

@@ -1,5 +1,4 @@
-"""The robot's end of the serial line: a pseudo-terminal. Out: a non-blocking descriptor and the
-name the box opens."""
+"""A pseudo-terminal as the serial line: the robot's end, and the name of the box's end."""
 
 from __future__ import annotations
 
@@ -11,7 +10,8 @@ from contextlib import contextmanager
 
 @contextmanager
 def pair() -> Iterator[tuple[int, str]]:
-    """(far end, name of the near end); both ends are raw, as a serial line is."""
+    """(far end, a non-blocking descriptor; name of the near end). Both ends are raw, as a serial
+    line is."""
     far, near = os.openpty()
     try:
         tty.setraw(far)

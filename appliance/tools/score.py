@@ -1,5 +1,4 @@
-"""Compares the answers that the robot read with what it did. In: sentences, acts. Out: counts and
-intervals."""
+"""Compares the answers that the robot read with the true materials."""
 
 from __future__ import annotations
 
@@ -17,10 +16,10 @@ from appliance.sim.rig import Act
 class AnswerScore:
     """Counts of the answers so far.
 
-    labels: that the bundle knows. right, total: by material; a material that the bundle does not
-    know is `unknown` at best. objects: whether the last answer for each object was right, where NEW
-    OBJECT was signalled. early: answers that did not need the whole window. slide_frames: frames
-    from START to STOP, of all sweeps.
+    labels: labels of the bundle. right, total: by material; the right answer for other materials is
+    `unknown`. objects: whether the last answer for each object was right, if NEW OBJECT was
+    signalled. early: answers that did not need the whole window. slide_frames: frames from START to
+    STOP, of all sweeps.
     """
 
     labels: frozenset[str]
@@ -32,8 +31,8 @@ class AnswerScore:
     slide_frames: int = 0
 
     def add(self, act: Act, answer: Answer) -> bool:
-        """Count an answer; True where it names the material of `act`, or says of one that the
-        bundle does not know that it is unknown."""
+        """Count an answer. Returns whether it is right: the material of `act`, or `unknown` for a
+        material that the bundle does not have."""
         known = act.label in self.labels
         right = (
             answer.label == act.label and answer.status == Status.OK
@@ -55,13 +54,11 @@ class AnswerScore:
 
     @property
     def answers(self) -> int:
-        """How many there are."""
         return self.total.total()
 
     def table(self) -> list[str]:
-        """Lines with right answers and their number: by material, of all sweeps, of all objects,
-        all of materials that the bundle knows; then how many sweeps of other materials were called
-        unknown."""
+        """Right answers and totals in lines: by material, of all sweeps, of all objects, of the
+        bundle's materials; then the share of other materials that were called unknown."""
         rows = [
             (name, self.right[name], self.total[name])
             for name in sorted(self.total.keys() & self.labels)
@@ -86,14 +83,15 @@ class AnswerScore:
         return ["  material        right / all", *lines]
 
     def touch(self, rate_hz: float) -> str:
-        """Mean touch time, from the start edge to the stop edge, and how many answers came before
-        it."""
+        """Mean touch time, from start edge to stop edge, and the number of early answers."""
         n = self.answers
         return f"{self.slide_frames / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
 
     def latency(self) -> str:
-        """Median and worst latency; by a clock that waits for nothing no time passes, and none was
-        measured."""
+        """Median and worst latency. In virtual time there is none."""
         if not any(self.latency_ms):
             return "not measured: --virtual lets no time pass"
-        return f"{statistics.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms worst"
+        return (
+            f"{statistics.median(self.latency_ms):.2f} ms median, {max(self.latency_ms):.2f} ms"
+            " worst"
+        )

@@ -1,8 +1,7 @@
-"""Whether a readout board does what PROTOCOL.md, part 1, asks for: the check behind `palpate skin
-check`.
+"""`palpate skin check`: compares a readout board with PROTOCOL.md, part 1.
 
-In: an opened link and a clock. Out: one finding for each part, with what to do where it fails. What
-cannot be decided over this link, or in this time, is unknown, and said to be so.
+Each part has one result, with advice if it fails. A part that cannot be decided over this link, or
+in this time, is unknown.
 """
 
 from __future__ import annotations
@@ -28,20 +27,20 @@ CLOCK_TOLERANCE = 200e-6
 LEAST_FIFO_S = 0.25
 LONGEST_PACKET_S = 0.008
 ANSWER_S = 1.0
-"""How long the first frames after START are waited for."""
+"""Time for the first frames after START."""
 QUIET_S = 0.3
-"""No frame may come for so long; one packet may be under way before."""
+"""Time without a frame after STOP; one packet may still arrive before."""
 LONGEST_PAUSE_S = 20.0
 PORT_BYTES = 140_000
-"""What the kernel may keep for a serial port that nobody reads: twice its buffers of 64 kB, and a
-little."""
+"""Bytes that the kernel may keep for a serial port without a reader: twice its buffers of 64 kB,
+and some more."""
 SAMPLE_BYTES = 1 << 16
 UNKNOWN_REQUEST = 0x51
 
 
 @dataclass(frozen=True, slots=True)
 class PartResult:
-    """The result for one part of the protocol. detail: what was seen, and what to do where it is no
+    """The result for one part of the protocol. detail: the observation, and the remedy unless it is
     `ok`."""
 
     part: str
@@ -51,8 +50,8 @@ class PartResult:
 
 @dataclass(slots=True)
 class Reception:
-    """What came in one stretch of listening. packets: with the host time at which they had
-    arrived."""
+    """Bytes and packets of one stretch of listening. packets: with the host time of their
+    arrival."""
 
     packets: list[tuple[int, Packet]] = field(default_factory=list)
     transfers: list[tuple[int, bytes]] = field(default_factory=list)
@@ -62,12 +61,11 @@ class Reception:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
         return sum(len(p.taxels) for _, p in self.packets)
 
     def followed(self) -> tuple[list[tuple[int, int, Packet]], int, int, int]:
-        """(arrival, unwrapped number, packet) of fresh packets; frames lost and stale; restarts of
-        the count."""
+        """(arrival, unwrapped number, packet) of fresh packets; lost frames; stale frames; restarts
+        of the count."""
         fresh, position, lost, stale = packets.follow(
             [p for _, p in self.packets], packets.StreamPosition(0)
         )
@@ -76,14 +74,14 @@ class Reception:
 
 
 class Listener:
-    """Reads a link for a while. `leftover` of one stretch belongs to the next."""
+    """Reads a link for a while. The leftover of a stretch belongs to the next stretch."""
 
     def __init__(self, link: SkinLink, clock: Clock) -> None:
         self.link, self.clock = link, clock
         self._leftover = b""
 
     def listen(self, seconds: float) -> Reception:
-        """All that comes in this time."""
+        """Everything that arrives in this time."""
         heard, end_ns = Reception(), self.clock.now_ns() + round(seconds * 1e9)
         while (left_ns := end_ns - self.clock.now_ns()) > 0:
             try:
@@ -105,7 +103,7 @@ class Listener:
         heard.sample += data[: SAMPLE_BYTES - len(heard.sample)]
 
     def quiet(self) -> bool:
-        """Whether nothing comes for QUIET_S, within a second of the last request."""
+        """Whether QUIET_S pass without a byte, within a second of the last request."""
         end_ns = self.clock.now_ns() + 1_000_000_000
         while self.listen(QUIET_S).size:
             if self.clock.now_ns() > end_ns:
@@ -115,13 +113,13 @@ class Listener:
 
 
 def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterator[PartResult]:
-    """One finding after the other. seconds: how long frames are listened to. port: a serial port,
-    whose buffers are large.
+    """The results, one after the other. seconds: time for listening to frames. port: whether the
+    link is a serial port, whose buffers are large.
 
     Raises SensorError if the link itself fails.
     """
     listener = Listener(link, clock)
-    link.request(Request.STOP, 0)  # an earlier program may have left it sending
+    link.request(Request.STOP, 0)  # the board may still send for an earlier program
     yield _identity(link)
     form, finding = _format(link)
     yield finding
@@ -166,7 +164,7 @@ def _identity(link: SkinLink) -> PartResult:
 
 
 def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
-    """The format, None where it cannot be used, and the finding."""
+    """The format and its result; None for a format that cannot be used."""
     try:
         form = packets.unpack_format(link.request(Request.FORMAT, 64))
         format = _sweep_format(form)
@@ -174,7 +172,10 @@ def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
         return None, PartResult("format", "FAIL", f"{e}; PROTOCOL.md, FORMAT, has its 16 bytes")
     size = form.packet_frames * form.rows * form.cols * form.axes * format.numpy_type.itemsize
     fifo_s, packet_s = form.fifo_frames / form.rate_hz, form.packet_frames / form.rate_hz
-    text = f"{form.rows}x{form.cols} {form.dtype} at {form.rate_hz:g} Hz, FIFO {fifo_s:.2f} s, {form.packet_frames} a packet"
+    text = (
+        f"{form.rows}x{form.cols} {form.dtype} at {form.rate_hz:g} Hz, FIFO {fifo_s:.2f} s,"
+        f" {form.packet_frames} a packet"
+    )
     if not (1 <= form.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):
         return form, PartResult(
             "format", "FAIL", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}"
@@ -230,13 +231,15 @@ def _crc(heard: Reception) -> PartResult:
     if not heard.packets:
         hint = "each packet begins with 50 C1 01 00, its length in bytes 4 and 5"
     else:
-        hint = "bytes were lost or added on the way: check cable and baud rate, and that nothing else prints to this port"
+        hint = (
+            "bytes were lost or added on the way: check cable and baud rate, and that nothing"
+            " else prints to this port"
+        )
     return PartResult("crc", "FAIL", f"{share}; {hint}")
 
 
 def _crc_fault(sample: bytes) -> str:
-    """What was done in place of the CRC that PROTOCOL.md asks for; "" if no usual mistake is
-    seen."""
+    """The usual mistake that explains a wrong CRC; "" if none does."""
     at = sample.find(packets.MAGIC)
     while 0 <= at <= len(sample) - packets.HEADER.size:
         length = int.from_bytes(sample[at + 4 : at + 6], "little")
@@ -261,7 +264,7 @@ def _crc_fault(sample: bytes) -> str:
 
 
 def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
-    """Packets, sequence, loss, rate and clock of a stretch of frames."""
+    """Results for packets, sequence, loss, rate and clock."""
     yield _packets(heard, form)
     fresh, lost, stale, restarts = heard.followed()
     yield _sequence(heard, stale, restarts)
@@ -293,7 +296,7 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
 
 
 def _packets(heard: Reception, form: SkinFormat) -> PartResult:
-    """Whether packets are as FORMAT has announced them."""
+    """Whether the packets agree with FORMAT."""
     for _, p in heard.packets:
         if p.taxels.shape[1:] != form.shape or p.taxels.dtype != _sweep_format(form).numpy_type:
             sent = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
@@ -340,15 +343,14 @@ def _sequence(heard: Reception, stale: int, restarts: int) -> PartResult:
 def _compared(
     part: str, points: Sequence[tuple[int, int]], tolerance: float, what: str, hint: str
 ) -> PartResult:
-    """Compare a board's times with the host's. points: (board ns, arrival ns). tolerance:
+    """Compare the board's times with the host's. points: (board ns, arrival ns). tolerance:
     relative."""
     third = len(points) // 3
     if third < 3:
         return PartResult(
             part, "unknown", f"only {len(points)} packets; listen longer with --seconds"
         )
-    # a packet may be late, never early, so the promptest of the first and of the last third are
-    # compared
+    # a packet may be late, never early: compare the most prompt packets of first and last third
     late = [arrival - at for at, arrival in points]
     first, last = (
         min(range(third), key=late.__getitem__),
@@ -356,12 +358,13 @@ def _compared(
     )
     span = points[last][1] - points[first][1]
     off = (points[last][0] - points[first][0]) / span - 1
-    # how late the others of a third are says how far its promptest can be trusted
+    # the delay of the other packets of a third bounds the error of its most prompt packet
     flat = [(arrival - points[0][1]) * (1 + off) - (at - points[0][0]) for at, arrival in points]
     spread = max(median(some) - min(some) for some in (flat[:third], flat[-third:])) / span
     scale, unit, digits = (100, "%", 2) if tolerance >= RATE_TOLERANCE else (1e6, "ppm", 0)
     text = (
-        f"{what}: {off * scale:+.{digits}f} {unit} by the host's clock, give or take {spread * scale:.{digits}f} {unit}, "
+        f"{what}: {off * scale:+.{digits}f} {unit} by the host's clock, give or take"
+        f" {spread * scale:.{digits}f} {unit}, "
         f"allowed are {tolerance * scale:g} {unit}"
     )
     if abs(off) - spread > tolerance:
@@ -372,8 +375,8 @@ def _compared(
 
 
 def _refused(heard: Reception, form: SkinFormat) -> str:
-    """Why the box would restart this board: its clock disagrees with its frame count. "" if it
-    would not."""
+    """Why the box would restart this board, whose clock disagrees with its frame count; ""
+    otherwise."""
     stream = Stream(_sweep_format(form), SensorCounters())
     stream.restart()
     try:
@@ -385,8 +388,8 @@ def _refused(heard: Reception, form: SkinFormat) -> str:
 
 
 def _requests(listener: Listener) -> PartResult:
-    """Requests while frames are sent, and one that does not exist."""
-    # a vendor-class board refuses it (a stall), one on a serial port leaves the byte alone
+    """Requests while frames are sent, and a request that does not exist."""
+    # a vendor-class board refuses it (a stall); a board on a serial port ignores the byte
     with contextlib.suppress(SensorError):
         listener.link.request(UNKNOWN_REQUEST, 0)  # type: ignore[arg-type]
     try:
@@ -409,9 +412,8 @@ def _requests(listener: Listener) -> PartResult:
 
 
 def _overflow(listener: Listener, form: SkinFormat, before: Reception, *, port: bool) -> PartResult:
-    """Do not read until the FIFO has run over, then look for the gap and its flag."""
-    flag = packets.Flag.OVERFLOW
-    if any(p.flags & flag for _, p in before.packets) and not before.followed()[1]:
+    """Let the FIFO run over, then look for the gap and its flag."""
+    if any(map(_flagged, before.packets)) and not before.followed()[1]:
         return PartResult(
             "overflow",
             "FAIL",
@@ -431,35 +433,40 @@ def _overflow(listener: Listener, form: SkinFormat, before: Reception, *, port: 
     resumed_ns = listener.clock.now_ns()
     after = listener.listen(pause_s + ANSWER_S)
     lost = Reception(start.packets + after.packets).followed()[1]
-    flagged = [p for _, p in after.packets if p.flags & flag]
+    flagged = [packet for _, packet in filter(_flagged, after.packets)]
+    kept_s = _age_s(before, flagged[0], resumed_ns) if lost and flagged else 0.0
+    return _gap(lost, bool(flagged), pause_s, kept_s, fifo_s)
+
+
+def _flagged(arrived: tuple[int, Packet]) -> bool:
+    """Whether a packet reports an overflow."""
+    return bool(arrived[1].flags & packets.Flag.OVERFLOW)
+
+
+def _gap(lost: int, flagged: bool, pause_s: float, kept_s: float, fifo_s: float) -> PartResult:
+    """The result for the gap after a pause. lost: missing frames. kept_s: age of the oldest kept
+    frame."""
     if not lost:
-        verdict: Literal["FAIL", "unknown"] = "FAIL" if flagged else "unknown"
         why = "bit 1 of byte 6 is set and no frame is missing" if flagged else "nothing was lost"
         return PartResult(
             "overflow",
-            verdict,
-            f"{why} in a pause of {pause_s:.1f} s; drop the oldest frames of a full FIFO, then set bit 1",
+            "FAIL" if flagged else "unknown",
+            f"{why} in a pause of {pause_s:.1f} s; drop the oldest frames of a full FIFO, then set"
+            " bit 1",
         )
     if not flagged:
-        return PartResult(
-            "overflow",
-            "FAIL",
-            f"{lost} frames were dropped; set bit 1 of byte 6 in the next packet",
-        )
-    kept_s = _age_s(before, flagged[0], resumed_ns)
+        text = f"{lost} frames were dropped; set bit 1 of byte 6 in the next packet"
+        return PartResult("overflow", "FAIL", text)
     if kept_s < 0.8 * fifo_s:
         text = f"{kept_s:.2f} s were kept, FORMAT says {fifo_s:.2f} s"
         return PartResult("overflow", "FAIL", f"{text}; drop the oldest frames, not the newest")
-    return PartResult(
-        "overflow",
-        "ok",
-        f"{lost} frames dropped in a pause of {pause_s:.1f} s, flagged, {kept_s:.2f} s kept",
-    )
+    text = f"{lost} frames dropped in a pause of {pause_s:.1f} s, flagged, {kept_s:.2f} s kept"
+    return PartResult("overflow", "ok", text)
 
 
 def _age_s(before: Reception, packet: Packet, now_ns: int) -> float:
-    """Age of a packet's first frame, by what arrived promptly before. Behind a gap: how much the
-    FIFO had kept."""
+    """Age of a packet's first frame in seconds, measured by the prompt packets before it. Behind a
+    gap it is the time that the FIFO had kept."""
     device = DeviceClock()
     offset_ns = min(t_ns - device.unwrap(p.t_us) * 1000 for t_ns, p in before.packets)
     return (now_ns - device.unwrap(packet.t_us) * 1000 - offset_ns) / 1e9

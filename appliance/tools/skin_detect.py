@@ -1,8 +1,7 @@
-"""Which skins are plugged in (`palpate skin detect`), and all profiles in lines (`palpate skin
-list`).
+"""`palpate skin detect` and `list`: connected skins, and all profiles.
 
-In: ports, profiles. Out: what was found on each port: ids first, then by listening. Nothing is
-written to a port that was not named for it.
+A port is compared by its ids, then by listening. Commands are written only to a port that the user
+has named.
 """
 
 from __future__ import annotations
@@ -25,20 +24,20 @@ from appliance.io.skin_codecs import Rest
 from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 LISTEN_S = 2.0
-"""How long each speed of a port is listened to: 56 frames of the slowest skin."""
+"""Time for each speed of a port: 56 frames of the slowest skin."""
 FITS = 0.9
 """Share of the bytes that must be in frames of a profile."""
 FEWEST = 4
-"""Frames that are no chance any more."""
+"""Number of frames that cannot be chance."""
 SAME_RATE = 0.02
-"""A measured rate that differs by less from the profile's needs no setting."""
+"""Relative difference of rates that needs no setting."""
 OpenPort = Callable[[str, int], BytePort]
 
 
 @dataclass(frozen=True, slots=True)
 class PortFinding:
-    """What is on a port. profile: its name, "" where none fits. detail: how that is known, and what
-    to set or do."""
+    """The skin on a port. profile: its name, "" if no profile fits. detail: the evidence, and the
+    settings or the remedy."""
 
     port: PortInfo
     profile: str
@@ -47,19 +46,17 @@ class PortFinding:
 
 @dataclass(frozen=True, slots=True)
 class HeardBytes:
-    """What came from a port. reads: (bytes, when it came in ns)."""
+    """Bytes of a port. reads: (bytes, time of arrival in ns)."""
 
     reads: list[tuple[bytes, int]]
 
     @property
     def data(self) -> bytes:
-        """All of it."""
         return b"".join(data for data, _ in self.reads)
 
 
 def listed(name: str, profile: SkinProfile) -> str:
-    """A profile in a line: what it is, what it lacks, whether anybody has compared it with a
-    device."""
+    """A profile in a line, with missing features, and whether it was compared with a device."""
     form = "as its board says" if profile.codec == DEFAULT else form_of(profile.format)
     lacks = f"lacks {', '.join(profile.lacks)}" if profile.lacks else "lacks nothing"
     measured = f"measured: {profile.measured}" if profile.measured else "not measured on a device"
@@ -80,7 +77,7 @@ def detect(
     write: bool = False,
     seconds: float = LISTEN_S,
 ) -> Iterator[PortFinding]:
-    """What is on each of the ports. profiles: as the settings have them. write: also ask, and send
+    """The skins on the ports. profiles: with the changes of the settings. write: also ask, and send
     start commands."""
     for port in ports:
         try:
@@ -101,7 +98,7 @@ def _on_port(
     known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
     others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
     heard: dict[int, HeardBytes] = {}
-    # those with its ids first; one speed after the other, each for all profiles that have it
+    # profiles with the port's ids first; each speed once, for all profiles that use it
     for baud in dict.fromkeys(
         others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)
     ):
@@ -118,7 +115,10 @@ def _on_port(
                 return
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
-            grid = f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x columns"
+            grid = (
+                f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x"
+                " columns"
+            )
             own = "if it is another skin, describe it with `palpate skin new`"
             yield PortFinding(
                 port,
@@ -144,8 +144,8 @@ def listen(
     clock: Clock,
     seconds: float,
 ) -> HeardBytes:
-    """What comes from a port at this speed. starter: whose start and stop commands are written.
-    Raises SensorError."""
+    """The bytes of a port at this speed. starter: the profile whose start and stop commands are
+    written. Raises SensorError."""
     port = open_port(path, baud)
     reads: list[tuple[bytes, int]] = []
     try:
@@ -161,8 +161,7 @@ def listen(
 
 
 def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, int]]:
-    """What comes from an open port within `seconds`: each read, and when it ended. Raises
-    SensorError."""
+    """The reads of an open port within `seconds`, with their times. Raises SensorError."""
     reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
     while (left_ns := until_ns - clock.now_ns()) > 0:
         if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
@@ -171,16 +170,16 @@ def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, i
 
 
 def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
-    """Whether nearly all that was heard is frames of a profile."""
+    """Whether frames of a profile explain nearly all bytes."""
     found = skin_codecs.codec(profile)(Rest(), heard.data)
-    # the first frame was under way when the port was opened, the last one when it was closed
+    # opening the port cut the first frame, closing it cut the last frame
     most = len(heard.data) - len(found.rest.data) - found.size
     return len(found) >= FEWEST and len(found) * found.size >= FITS * most
 
 
 def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
-    """Frames per second of what was heard, from the arrivals of the first and the last frame; 0 for
-    fewer than two."""
+    """Frames per second, by the arrivals of the first and the last frame; 0 for fewer than two
+    frames."""
     codec, rest, seen = skin_codecs.codec(profile), Rest(), []
     for data, t_ns in heard.reads:
         found = codec(rest, data)
@@ -195,7 +194,7 @@ def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
 def _settings(
     port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes
 ) -> str:
-    """What was measured, and what to set."""
+    """The measurements, and the settings."""
     profile = profiles[fitting[0]]
     hz = measured_hz(profile, heard)
     sets = [f'skin.profile = "{fitting[0]}"', f'skin.port = "{port.path}"']
@@ -207,7 +206,7 @@ def _settings(
 
 
 def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
-    """A board of PROTOCOL.md that answers, "" if none does."""
+    """The answer of a board of PROTOCOL.md, "" if there is none."""
     port = open_port(path, SkinProfile().baud)
     try:
         port.write(bytes([packets.Request.IDENTITY]))
@@ -220,18 +219,24 @@ def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
 
 
 def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
-    """Why no profile fits, and what to do."""
+    """The reason why no profile fits, and the remedy."""
     if heard:
-        return f"sends {heard} bytes, but no frames of a profile; try skin.grid, or describe it with `palpate skin new`"
+        return (
+            f"sends {heard} bytes, but no frames of a profile; try skin.grid, or describe it with"
+            " `palpate skin new`"
+        )
     if write:
         return "sends nothing and answers nothing"
     asking = ", ".join(name for name, p in profiles.items() if p.start)
-    return f"sends nothing unasked; {asking} and boards of PROTOCOL.md may have to be asked: add --write --port with its path"
+    return (
+        f"sends nothing unasked; {asking} and boards of PROTOCOL.md may have to be asked: add"
+        " --write --port with its path"
+    )
 
 
 def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
-    """Taxels in a frame of a profile with marks, as the distance between marks in what was heard
-    tells; 0 if it does not."""
+    """Taxels of a frame, by the distance between the marks of a profile; 0 if it is not
+    constant."""
     mark, data = profile.trailer + profile.marker, heard.data
     places = [at for at in range(len(data)) if mark and data.startswith(mark, at)]
     steps = Counter(later - at for at, later in pairwise(places))
@@ -251,7 +256,8 @@ def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
 
 
 def on_usb(config: SkinConfig) -> list[str]:
-    """A line for each board of PROTOCOL.md on USB with the configured ids; it is not opened."""
+    """A line for each board of PROTOCOL.md on USB with the configured ids. The boards are not
+    opened."""
     import usb.core
 
     try:

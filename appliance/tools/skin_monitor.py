@@ -1,8 +1,6 @@
-"""How a skin is, for `palpate skin show`. In: its Frames, as they come. Out: LiveViews: load, rate,
-noise and faults.
+"""The state of a skin, for `palpate skin show`: load, rate, noise and faults.
 
-Nothing here needs a bundle: the format is the skin's own, and the faults are those that a signal
-shows by itself.
+No bundle is needed: the format is the skin's own, and the faults are visible in the signal alone.
 """
 
 from __future__ import annotations
@@ -16,17 +14,15 @@ from numpy.typing import NDArray
 from appliance.core.types import Frames, SweepFormat
 
 SPAN_S = 2.0
-"""Latest signal from which rate and noise are computed."""
+"""Length of the signal for rate and noise."""
 SHOWN_S = 0.1
-"""Latest signal that is averaged into the load shown."""
+"""Length of the signal whose mean is shown as load."""
 STUCK_S = 5.0
-"""A taxel that has given one value for so long is stuck, unless all have: then nothing says
-which."""
+"""A taxel with one value for this long is stuck. If all taxels have one value, none is named."""
 MOVED = 10.0
-"""The skin was touched once half of its taxels have moved this many times their noise."""
+"""The skin counts as touched once half of its taxels have moved this many times their noise."""
 DEAD = 0.1
-"""A taxel is dead if it has moved less than this share of the median, after the skin was
-touched."""
+"""After a touch, a taxel is dead if it has moved less than this share of the median."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +30,11 @@ class LiveView:
     """A skin at one moment.
 
     number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: profile and
-    form. state: of the sensor (PROTOCOL.md); trouble: why it does not stream and what to do. shape:
-    rows, columns, axes. load: mean of the last SHOWN_S above the lowest since the start,
-    [axes][rows][columns] raw counts; empty before there is any. full: load that is shown as the
-    strongest. rate_hz: measured, None before there are frames. noise: [axes][rows][columns], raw
-    counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost None where
+    format. state: of the sensor (PROTOCOL.md). trouble: the reason why it does not stream, and the
+    remedy. shape: rows, columns, axes. load: mean of the last SHOWN_S minus the lowest since the
+    start, [axes][rows][columns] in raw counts; empty before the first frame. full: the strongest
+    load on the scale. rate_hz: measured, None without frames. noise: [axes][rows][columns] in raw
+    counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost is None if
     it cannot be known.
     """
 
@@ -59,7 +55,7 @@ class LiveView:
     lost: int | None = None
 
     def json(self) -> dict[str, Any]:
-        """The View as the page reads it."""
+        """The View as JSON for the page."""
         return asdict(self)
 
 
@@ -67,13 +63,12 @@ class SkinDisplay(Protocol):
     """Shows one LiveView after another."""
 
     def show(self, view: LiveView) -> None:
-        """Show `view` in place of the one before."""
+        """Show a view; it replaces the previous view."""
         ...
 
 
 class SkinMonitor:
-    """Collects what a skin of format `format` sends. All times are those of the frames, so no clock is
-    needed."""
+    """Collects the frames of a skin. All times are times of frames, so no clock is needed."""
 
     def __init__(self, format: SweepFormat) -> None:
         self._grid = format.rows, format.cols, format.axes
@@ -82,7 +77,7 @@ class SkinMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew: this may be another skin than before."""
+        """Forget everything: this may be another skin."""
         self._t_ns, self._taxels = np.empty(0, np.int64), np.empty((0, *self._grid))
         self._lowest, self._highest = np.full(self._grid, np.inf), np.full(self._grid, -np.inf)
         self._changed_ns = np.zeros(self._grid, np.int64)
@@ -106,7 +101,8 @@ class SkinMonitor:
         )
 
     def measured(self) -> dict[str, Any]:
-        """The fields of a LiveView that the signal gives; none before the second frame."""
+        """The fields of a LiveView that are computed from the signal; none before the second
+        frame."""
         if len(self._t_ns) < 2:
             return {}
         level = self._taxels[-self._shown :].mean(axis=0)
@@ -142,7 +138,7 @@ class SkinMonitor:
         return np.asarray(touched & (moved < DEAD * np.median(moved, axis=(0, 1))))
 
     def _saturated(self) -> NDArray[np.bool_]:
-        """Taxels at the end of the type's range in the newest frame; never for floating-point
+        """Taxels at the end of their type's range in the newest frame; none for floating-point
         counts."""
         newest = self._taxels[-1]
         if self._limits is None:
@@ -152,7 +148,7 @@ class SkinMonitor:
         )
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
-        """Names of taxels, counted from 1: "2.3", or "2.3 axis 1" where there are several axes."""
+        """Names of taxels, counted from 1: "2.3", or "2.3 axis 1" with several axes."""
         several = self._grid[2] > 1
         return tuple(
             f"{r + 1}.{c + 1}" + f" axis {a + 1}" * several

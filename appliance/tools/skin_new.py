@@ -1,6 +1,5 @@
-"""A profile for a skin that nobody has described, for `palpate skin new`. In: what its port sends.
-Out: proposals in words, and the text of the profile.
-"""
+"""A profile for an unknown skin, for `palpate skin new`: proposals in words, and the text of the
+file."""
 
 from __future__ import annotations
 
@@ -19,13 +18,13 @@ from appliance.tools.skin_detect import collect
 from appliance.tools.stream_analysis import Grid, Proposal, Read, analyse
 
 BAUDS = 115_200, 2_000_000, 921_600, 1_000_000, 460_800, 230_400
-"""Speeds that makers use, the most frequent first; over a port that is USB down to the
-microcontroller any of them does."""
+"""Speeds that makers use, the most frequent first. A port that is USB down to the microcontroller
+works at any speed."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortSample:
-    """What a port sent at a speed, and how it can be understood, the most likely first."""
+    """The bytes of a port at a speed, and their possible meanings, the most likely first."""
 
     baud: int
     reads: Sequence[Read]
@@ -35,11 +34,11 @@ class PortSample:
 def listen(
     open_port: Callable[[int], BytePort], bauds: Sequence[int], seconds: float, clock: Clock
 ) -> PortSample:
-    """What comes within `seconds` at the first of the `bauds` at which there is a pattern; nothing
-    is written.
+    """The bytes within `seconds` at the first of the `bauds` that shows a pattern. Nothing is
+    written.
 
-    open_port: opens the port at a speed. Raises SensorError: SensorSilent where nothing comes,
-    SensorMismatch where no speed shows a pattern.
+    open_port: opens the port at a speed. Raises SensorSilent without a byte, SensorMismatch without
+    a pattern, and other SensorErrors.
     """
     count, tried = 0, ", ".join(map(str, bauds))
     for baud in bauds:
@@ -48,17 +47,19 @@ def listen(
             heard = collect(port, clock, seconds)
         finally:
             port.close()
-        # the first read holds what had piled up before, and may begin anywhere
+        # the first read holds older bytes, and may begin within a frame
         reads = [Read(t_ns, data) for data, t_ns in heard[1:]]
         count += sum(len(read.data) for read in reads)
         if found := analyse(reads):
             return PortSample(baud, reads, found)
     if not count:
         raise SensorSilent(
-            f"nothing came in {seconds:g} s at {tried} baud; if the skin waits for a command, copy matrix.toml and write it there"
+            f"nothing came in {seconds:g} s at {tried} baud; if the skin waits for a command, copy"
+            " matrix.toml and write it there"
         )
     raise SensorMismatch(
-        f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --baud N, or listen longer"
+        f"{count} bytes at {tried} baud have no pattern; name the skin's speed with --baud N, or"
+        " listen longer"
     )
 
 
@@ -78,17 +79,14 @@ def words(proposal: Proposal) -> str:
 
 
 def grid_text(grid: Grid) -> str:
-    """4x4, or 3x3x3 where there are several axes."""
+    """4x4, or 3x3x3 with several axes."""
     rows, cols, axes = grid
     return f"{rows}x{cols}" + f"x{axes}" * (axes > 1)
 
 
 def choose(heard: PortSample, text: str, number: int) -> tuple[Proposal, Grid]:
-    """The proposal `number`, from 1, with the grid that `text` names; the first that has as many
-    values for 0.
-
-    Raises ConfigError where there is none.
-    """
+    """The proposal `number`, counted from 1, with the grid in `text`. 0 takes the first proposal
+    with as many values. Raises ConfigError if there is none."""
     if number > len(heard.proposals):
         raise ConfigError(f"--proposal {number} is not there; use 1 to {len(heard.proposals)}")
     parts = text.split("x")
@@ -132,15 +130,18 @@ def profile(proposal: Proposal, grid: Grid, baud: int, port: PortInfo) -> str:
         values["byte_order"] = "big"
     if axes > 1:
         values |= {"values": axes, "take": list(range(axes))}
-    head = "# Written by `palpate skin new`. Compare it with what the maker says; matrix.toml explains each key.\n"
+    head = (
+        "# Written by `palpate skin new`. Compare it with what the maker says; matrix.toml"
+        " explains each key.\n"
+    )
     return head + "".join(
         f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in values.items()
     )
 
 
 def decoded(text: str, reads: Sequence[Read]) -> tuple[int, int]:
-    """(frames, bytes in no frame) of `reads`, read as the profile `text` says. Raises ConfigError
-    where it cannot be."""
+    """(frames, left-over bytes) of `reads`, decoded with the profile in `text`. Raises ConfigError
+    if they cannot be decoded."""
     codec = skin_codecs.codec(skin_profile.from_json(tomllib.loads(text), "the new profile"))
     found = codec(skin_codecs.Rest(), b"".join(read.data for read in reads))
     return len(found), found.garbage

@@ -1,7 +1,6 @@
-"""Shows a skin in a terminal, for `palpate skin show`. In: LiveViews. Out: heat maps that are drawn
-again and again, or plain lines.
+"""Shows a skin in a terminal, for `palpate skin show`: heat maps that are drawn again and again.
 
-Where the output is no terminal, or a dumb one, it gets one line a second.
+An output that is not a terminal, or a dumb terminal, gets a line a second.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from appliance.alignment.terminal import BLOCKS, BOLD, PLAIN, LiveScreen
 from appliance.tools.skin_monitor import LiveView
 
 MOST_NAMED = 8
-"""So many faulty taxels are named; of more, only the number is told."""
+"""Largest number of faulty taxels that are named; of more, the number is shown."""
 
 
 class SkinScreen(LiveScreen[LiveView]):
@@ -38,7 +37,7 @@ def figures(view: LiveView) -> str:
 
 
 def faults(view: LiveView) -> str:
-    """Stuck, dead and saturated taxels in words; "" where there are none."""
+    """Stuck, dead and saturated taxels in words; "" if there are none."""
     kinds = (("stuck", view.stuck), ("dead", view.dead), ("saturated", view.saturated))
     return "; ".join(f"{name}: {_named(taxels)}" for name, taxels in kinds if taxels)
 

@@ -1,5 +1,4 @@
-"""`palpate skin show`: a skin live, in the terminal and on a page. In: a Sensor. Out: LiveViews,
-five times a second."""
+"""`palpate skin show`: a skin live, in the terminal and on a page, five times a second."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ def run(
     displays: Iterable[SkinDisplay],
     stopped: Callable[[], bool],
 ) -> None:
-    """Show on `displays` what `sensor` sends, until `stopped()`. name: of the skin's profile."""
+    """Show the frames of `sensor` on `displays` until `stopped()`. name: of the skin's profile."""
     shown_on, monitor, number = tuple(displays), SkinMonitor(format), 0
     enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
     while not stopped():

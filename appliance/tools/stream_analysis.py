@@ -1,8 +1,7 @@
-"""What an unknown skin sends, found in its bytes alone, for `palpate skin new`. In: reads with
-their times. Out: Proposals, the most likely first.
+"""Finds the format of an unknown skin in its bytes, for `palpate skin new`.
 
-Nothing is decided here: a person confirms the grid, which no stream can tell (16 values may be 4 x
-4 or 2 x 8).
+Reads with their times become proposals, the most likely first. A person confirms the grid: no
+stream shows whether 16 values are 4 x 4 or 2 x 8.
 """
 
 from __future__ import annotations
@@ -19,27 +18,27 @@ from numpy.typing import NDArray
 from appliance.io.skin_codecs.frames import MOST_PACKET
 
 LEAST_FRAMES = 8
-"""Frames that must follow one another before a pattern counts."""
+"""Frames in succession before a pattern counts."""
 SHARE = 0.8
 """Least share of the bytes that the frames of a proposal explain. A wrong baud rate explains
 none."""
 CONSTANT = 0.99
 """A byte of a frame is constant if it has one value in this share of the frames."""
 MOST_MARK = 4
-"""Longest marker or trailer that is proposed; the makers known to us use two or four bytes."""
+"""Longest proposed marker or trailer; the known makers use two or four bytes."""
 FLOATS = 1e-6, 1e7
-"""Magnitudes of sensible numbers; other bytes read as float32 seldom lie within (nor does a zero
-count against it)."""
+"""Magnitudes of sensible numbers. Other bytes that are read as float32 are seldom within, and a
+zero does not count against them."""
 CONTRAST = 4.0
-"""How many more values one byte of a pair must take than the other, for the two to be one
-number."""
+"""Ratio of the numbers of values of two bytes from which on they are one number."""
 AGAIN = 0.01
-"""Where as many bytes, less this share, come again after a shorter distance, it is the frame and
-the longer is two."""
+"""If a shorter distance repeats as many bytes, less this share, the shorter distance is the
+frame."""
 COUNTS = 0.95
-"""A number counts the frames if it grows by one in this share of them; the rest were lost."""
+"""A number counts the frames if it grows by one in this share of them; the rest may be lost
+frames."""
 LONGEST = 4
-"""A grid that is more times longer than wide is not likely."""
+"""Ratio of the sides from which on a grid is unlikely."""
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _TEXT = frozenset(b"0123456789+-.eE,;:[]() \t\r\n")
 
@@ -49,7 +48,7 @@ Grid = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """What one read of the port gave. t_ns: when it ended, host monotonic."""
+    """One read of the port. t_ns: its end, host monotonic."""
 
     t_ns: int
     data: bytes
@@ -57,13 +56,13 @@ class Read:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """One way to understand a stream.
+    """A possible format of a stream.
 
-    framing: what shows where a frame is: a `mark` before it, a `mark` behind it, or lines of text.
-    length: bytes of a frame with its mark; for text, lines. sequence: type of a count of the frames
-    behind the marker, "" for none. dtype, big_endian: type of a value on the wire. values: in a
-    frame. grids: that have as many values, the squarest first. rate_hz: frames by their times of
-    arrival. share: of all bytes that these frames explain, 0 to 1.
+    framing: the way to find a frame: a `mark` before it, a `mark` behind it, or lines of text.
+    length: bytes of a frame with its mark; for text, lines. sequence: type of the frame count
+    behind the marker, "" for none. dtype, big_endian: type of a value on the wire. values: number
+    of values in a frame. grids: grids with as many values, the squarest first. rate_hz: frames by
+    their times of arrival. share: share of the bytes that these frames explain, 0 to 1.
     """
 
     framing: Literal["marker", "trailer", "text"]
@@ -79,8 +78,7 @@ class Proposal:
 
 
 def analyse(reads: Sequence[Read]) -> list[Proposal]:
-    """All ways in which `reads` can be understood, the most likely first; empty if there is no
-    pattern in them."""
+    """All possible formats of `reads`, the most likely first; empty without a pattern."""
     data = b"".join(read.data for read in reads)
     if not data:
         return []
@@ -91,8 +89,8 @@ def analyse(reads: Sequence[Read]) -> list[Proposal]:
 
 
 def grids(values: int) -> tuple[Grid, ...]:
-    """Up to six grids of `values` numbers: one axis, then three where it divides by three; the
-    squarest first."""
+    """Up to six grids of `values` numbers: with one axis, then with three if three divides the
+    number; the squarest first."""
     found = []
     for axes in (1, 3):
         if values % axes == 0 and values >= axes:
@@ -105,7 +103,8 @@ def grids(values: int) -> tuple[Grid, ...]:
 
 
 def _text(data: bytes, seconds: float) -> list[Proposal]:
-    """Lines of numbers: each a frame, or so many to one, with a shorter line behind them."""
+    """Formats of lines of numbers: a line is a frame, or several lines that end with a shorter
+    line."""
     lines = [
         _NUMBER.findall(line) for line in data.split(b"\n")[1:-1]
     ]  # the first and the last may be cut
@@ -140,8 +139,8 @@ def _text_type(words: Sequence[bytes]) -> str:
 
 
 def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[Proposal]:
-    """Frames of one length with the same bytes at their begin or end. boundaries: offsets at which
-    reads began."""
+    """Formats with frames of one length and the same bytes at their begin or end. boundaries:
+    offsets at which reads began."""
     stream = np.frombuffer(data, np.uint8)
     found = _period(stream)
     if found is None:
@@ -160,7 +159,7 @@ def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[
         payload = frames[:, size:] if framing == "marker" else frames[:, : length - size]
         mark = bytes(np.roll(usual, -first)[:size])
         if not any(mark):
-            continue  # what nobody touches is zero, too
+            continue  # untouched taxels are zero, too
         for sequence, behind in _sequences(payload) if framing == "marker" else [("", payload)]:
             for dtype, big_endian in _types(behind):
                 values = behind.shape[1] // np.dtype(dtype).itemsize
@@ -182,19 +181,18 @@ def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[
 
 
 def _unlikely(proposal: Proposal) -> tuple[bool, int]:
-    """What speaks against a proposal: a grid much longer than wide; small numbers, as which
-    anything can be read."""
+    """The reasons against a proposal: a grid much longer than wide; small numbers, because any
+    bytes can be read as small numbers."""
     flat = not proposal.grids or max(proposal.grids[0][:2]) > LONGEST * min(proposal.grids[0][:2])
     return flat, -np.dtype(proposal.dtype).itemsize
 
 
 def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] | None:
-    """(bytes of a frame, offsets of one constant place in the frames, share of the stream that they
+    """(bytes of a frame, offsets of a constant place in the frames, share of the stream that they
     explain).
 
-    Candidates are the distances at which a byte, or a pair of bytes, comes again and again. The
-    frame is the one at which most bytes of the stream come again: numbers change little from one
-    frame to the next.
+    Candidates are the distances at which a byte, or a pair of bytes, repeats. The frame is the
+    distance at which most bytes of the stream repeat: numbers change little between frames.
     """
     found: dict[int, tuple[NDArray[np.int64], float, float]] = {}
     for words in ((stream[:-1].astype(np.int32) << 8) + stream[1:], stream.astype(np.int32)):
@@ -218,8 +216,8 @@ def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] |
 
 
 def _begin(boundaries: NDArray[np.int64], start: int, length: int) -> int | None:
-    """Where frames begin after `start`, if reads begin there more often than elsewhere: a board
-    sends frames whole."""
+    """The begin of frames after `start`, if reads begin there more often than elsewhere: a board
+    sends whole frames."""
     if not len(boundaries):
         return None
     phases = np.bincount((boundaries - start) % length, minlength=length)
@@ -232,9 +230,8 @@ def _marks(
     """(framing, first byte, bytes) of each run of constant bytes that can mark a frame, the most
     likely first.
 
-    A run at the begin of a frame is a marker, one at its end a trailer; where reads do not tell,
-    all are markers. Zeros are left out at the side of the values: taxels that nobody touches are
-    zero, too.
+    A run at the begin of a frame is a marker, a run at its end a trailer; if reads do not show it,
+    all are markers. Zeros at the side of the values are left out: untouched taxels are zero, too.
     """
     length = len(constant)
     runs = []
@@ -245,7 +242,9 @@ def _marks(
     for first, size in runs:
         inner = 0 if begin is None else (begin - first) % length
         text = np.roll(usual, -first)[:size]
-        if inner < size:  # frames begin in this run: what is before belongs to the end of a frame
+        if (
+            inner < size
+        ):  # frames begin in this run: the bytes before it belong to the end of a frame
             for kept in _sizes(text[inner:][::-1]):
                 yield "marker", (first + inner) % length, kept
         if begin is not None and 0 < inner <= size:
@@ -254,16 +253,15 @@ def _marks(
 
 
 def _sizes(run: NDArray[np.uint8]) -> list[int]:
-    """Bytes that a mark can have in a run whose last byte is the mark's outer one: all, two as most
-    have, or three. The bytes of numbers that do not change can lie beside it."""
+    """Possible lengths of a mark in a run whose last byte is the mark's outer byte: all bytes, two
+    (the usual length), or three. Constant bytes of numbers can lie beside a mark."""
     beside = np.flatnonzero(run)
     most = min(MOST_MARK, len(run) - int(beside[0])) if len(beside) else 0
     return [most, *(size for size in (2, 3) if size < most)] if most else []
 
 
 def _types(payload: NDArray[np.uint8]) -> Iterator[tuple[str, bool]]:
-    """(type, big-endian) that the bytes [frames, bytes] of the values can have, the most likely
-    first."""
+    """Possible (type, big-endian) of the value bytes [frames, bytes], the most likely first."""
     raw = np.ascontiguousarray(payload)
     size = raw.shape[1]
     if size % 4 == 0:
@@ -284,22 +282,22 @@ def _types(payload: NDArray[np.uint8]) -> Iterator[tuple[str, bool]]:
 
 
 def _crosses_zero(numbers: NDArray[Any]) -> bool:
-    """True if a value goes from a little above zero to a little below it: it has a sign."""
+    """Whether a value passes from a little above zero to a little below it: then it has a sign."""
     near = np.abs(numbers) < 1 << 13
     return bool((near.all(axis=0) & (numbers.min(axis=0) < 0)).any())
 
 
 def _sequences(payload: NDArray[np.uint8]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """(type of the count of frames in front, the bytes behind it), the most likely first; "" where
-    nothing counts.
+    """(type of the frame count in front, bytes behind it), the most likely first; "" without a
+    count.
 
-    The lowest byte grows by one from frame to frame; further bytes belong to the count if they
+    The lowest byte grows by one from frame to frame. Further bytes belong to the count if they
     carry.
     """
     counting = (np.diff(payload.astype(np.int16), axis=0) % 256 == 1).mean(axis=0) >= COUNTS
     if (
         payload.shape[1] > 4 and counting[0] and counting.mean() < 0.5
-    ):  # taxels of a test pattern may all count
+    ):  # all taxels of a test pattern may count
         for size in (4, 2):
             number = payload[:, :size].copy().view(f"<u{size}")[:, 0].astype(np.int64)
             carried = (np.diff(number) == 1)[

@@ -72,7 +72,8 @@ class Access:
             context.load_cert_chain(self.certificate, self.key)
         except (OSError, ssl.SSLError) as e:
             raise ConfigError(
-                f"{self.certificate} and {self.key.name} cannot be used: {e}; make install makes them"
+                f"{self.certificate} and {self.key.name} cannot be used: {e}; make install makes"
+                " them"
             ) from e
         return context
 

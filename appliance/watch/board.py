@@ -80,7 +80,8 @@ class PageBoard:
             act(self, line)
         except (KeyError, TypeError, ValueError, AttributeError) as e:
             raise FormatError(
-                f"the feed's line {line.get('type')!r} is not as PROTOCOL.md has it: {e!r}; update one of both"
+                f"the feed's line {line.get('type')!r} is not as PROTOCOL.md has it: {e!r}; update"
+                " one of both"
             ) from e
 
     def away(self, why: str) -> None:

@@ -62,7 +62,8 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
     name, text = str(asked.get("command")), asked.get("text", "")
     if name not in allowed or not isinstance(text, str):
         raise FormatError(
-            f"no order that the page has; its commands are {' '.join(allowed)}, each with a text or none"
+            f"no order that the page has; its commands are {' '.join(allowed)}, each with a text"
+            " or none"
         )
     text = text.strip()
     if name in LABELS:

@@ -74,7 +74,8 @@ class WatchedBox:
         if self._latencies_ms:
             values = sorted(self._latencies_ms)
             facts["latency"] = (
-                f"{self._latencies_ms[-1]:.1f} ms; median {values[len(values) // 2]:.1f} ms, most {values[-1]:.1f} ms "
+                f"{self._latencies_ms[-1]:.1f} ms; median {values[len(values) // 2]:.1f} ms, most"
+                f" {values[-1]:.1f} ms "
                 f"of {len(values)}"
             )
         if self.missed:
@@ -208,7 +209,8 @@ def _what(state: WatchedBox) -> str:
         return ""
     simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
     return _plain(
-        f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle {state.hello['bundle'] or 'none'}"
+        f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle"
+        f" {state.hello['bundle'] or 'none'}"
     )
 
 
@@ -233,7 +235,10 @@ def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
     full, empty = (signs[4], signs[1]) if signs != ASCII else ("#", ".")
     for p, label in ranked[:LABELS]:
         filled = round(BAR * max(0.0, min(1.0, p)))
-        yield f"{_plain(label)[:NAME]:<{NAME}} {full * filled}{empty * (BAR - filled)} {100 * p:5.1f} %"
+        yield (
+            f"{_plain(label)[:NAME]:<{NAME}} {full * filled}{empty * (BAR - filled)}"
+            f" {100 * p:5.1f} %"
+        )
 
 
 def events(state: WatchedBox, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:

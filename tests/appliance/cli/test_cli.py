@@ -505,7 +505,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (
             ["record", "--material", "wood"],
             SensorError,
-            "or say what it sends, with --format 4x4:uint8:750",
+            "or name its format with --format 4x4:uint8:750",
         ),
         (
             ["skin", "show"],
