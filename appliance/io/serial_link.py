@@ -162,6 +162,10 @@ def _refused(path: str, e: Exception) -> SensorError:
         return SensorAbsent(
             f"no port {path} (errno {code}); plug the skin in, or correct --port (skin.port)"
         )
+    if code == errno.EISDIR or f"({errno.ENOTTY}," in str(
+        e
+    ):  # pyserial has no errno for the latter
+        return SensorLost(f"{path} is not a serial port; correct --port (skin.port)")
     return SensorLost(
         f"{path} cannot be opened: {e}; check skin.port and the baud rate of its profile"
     )

@@ -251,6 +251,13 @@ def test_a_port_that_cannot_be_opened(code: int, kind: type[SensorError], hint: 
     assert "/dev/ttyX9" in str(e.value)
 
 
+@pytest.mark.parametrize("path", ["/dev/null", "/etc/passwd", "/tmp"])
+def test_a_file_that_is_not_a_serial_port(path: str):
+    """The message says so and names the option, with the real pyserial."""
+    with pytest.raises(SensorLost, match=f"{path} is not a serial port; correct --port"):
+        SerialLink(path, 115200, CLOCK)
+
+
 def test_ids_find_the_port(tmp_path: Path):
     """The first port with the ids, and the serial number where one is set; without one, all ports
     are named."""
