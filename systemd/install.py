@@ -148,9 +148,8 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
             stdin=f".palpate-{name}.tar",
             limit_s=BUILD_S,
         )
-    box.run(
-        "tidying up", "rm -f .palpate-*.tar"
-    )  # also of an install that was interrupted after it had built
+    # also of an install that was interrupted after it had built
+    box.run("tidying up", "rm -f .palpate-*.tar")
     setup = prepare(release, board, signers)
     said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:

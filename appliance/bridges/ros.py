@@ -183,9 +183,8 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._states = self.create_lifecycle_publisher(DiagnosticArray, "~/state", LATCHED)
         self._frames = self.create_lifecycle_publisher(Image, "~/frames", qos_profile_sensor_data)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        asking = (
-            MutuallyExclusiveCallbackGroup()
-        )  # a command may take seconds, and verdicts must not wait for it
+        # a command may take seconds, and verdicts must not wait for it
+        asking = MutuallyExclusiveCallbackGroup()
         self._made = [
             (self.destroy_guard_condition, guard),
             (self.destroy_publisher, self._diagnostics),
@@ -306,9 +305,8 @@ def run(arguments: Sequence[str]) -> None:
     """Serve until SIGINT or SIGTERM. arguments: those of ROS."""
     rclpy.init(args=["palpate", "--ros-args", *arguments] if arguments else ["palpate"])
     node = PalpateNode()
-    executor = MultiThreadedExecutor(
-        num_threads=4
-    )  # news; a command; a sweep; goals and cancelling meanwhile
+    # news; a command; a sweep; goals and cancelling meanwhile
+    executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
     try:
         # a signal wakes the executor before it ends the context, so a wait without end might go on

@@ -109,9 +109,8 @@ class TcpServer:
             return
         connection = writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        connection.setsockopt(
-            socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER
-        )  # the default of the kernel is some megabytes
+        # the default of the kernel is some megabytes
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
         peer = TcpPeer(reader, writer, now_s)
         self.peers.add(peer)
         try:

@@ -64,9 +64,8 @@ class CommandedSweep:
         is then aborted if the box can be reached.
         """
         check(terms)
-        self._source.wait_ready(
-            READY_S
-        )  # so every earlier sweep is answered, and the next answer belongs to this sweep
+        # so every earlier sweep is answered, and the next answer belongs to this sweep
+        self._source.wait_ready(READY_S)
         if self._canceled():
             raise CommandRefused("the sweep was canceled before START")
         if terms.new_object:
@@ -120,9 +119,8 @@ class CommandedSweep:
     def _close(self, answer: Answer) -> None:
         """Send STOP for a sweep that was already answered. It causes no answer; without it, the
         next START would end the sweep."""
-        if (
-            answer.status is not Status.NO_STOP
-        ):  # else a START of another peer has closed it, and the STOP belongs to that peer
+        # with NO_STOP, a START of another peer has closed it, and the STOP belongs to that peer
+        if answer.status is not Status.NO_STOP:
             with suppress(ApplianceError):
                 self._source.send("STOP")
 

@@ -59,9 +59,8 @@ class TcpBridge:
 
     def _pass_on(self, heard: Sentence) -> None:
         line = sentence(heard.kind, *heard.fields)
-        if (
-            heard.kind == "ANS"
-        ):  # an answer that came too late, or that no peer has asked for, is dropped
+        # an answer that came too late, or that no peer has asked for, is dropped
+        if heard.kind == "ANS":
             if heard.fields[:1] == [self._asked] and not self._answer.done():
                 self._answer.set_result(line)
             return

@@ -285,9 +285,8 @@ class Palpate:
     def _counted(self, answer: Answer) -> Answer:
         """The answer with the number of answers that are missing before it, as each sweep gets
         exactly one."""
-        if (
-            answer.sweep in self._absent
-        ):  # it waited for late frames while the next sweep was answered at once
+        # it waited for late frames while the next sweep was answered at once
+        if answer.sweep in self._absent:
             self._absent.remove(answer.sweep)
             self.missed -= 1
             return answer

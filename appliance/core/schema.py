@@ -149,9 +149,8 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     for name, value in values.items():
         if isinstance(value, str) and not value.isprintable():
             raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
-    made = kind(
-        **values
-    )  # first, because the error of a class about its values is more specific than their types
+    # first, because the error of a class about its values is more specific than their types
+    made = kind(**values)
     for name, value in values.items():
         if not _fits(value, hints[name]):
             wanted = getattr(hints[name], "__name__", hints[name])

@@ -276,9 +276,8 @@ def save(
         sweep.frames.taxels,
     )
     own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
-    packed = (
-        io.BytesIO()
-    )  # np.save writes to a file without Python's I/O, and a full disk then gives no errno
+    # np.save writes to a file without Python's I/O, and a full disk then gives no errno
+    packed = io.BytesIO()
     np.save(packed, table, allow_pickle=False)
     content = {
         **about,

@@ -93,9 +93,8 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         try:
             with gpio.Chip(path) as chip:
                 info = chip.get_info()
-                if (
-                    info.name in chips
-                ):  # a second device name of the same chip, as on Raspberry Pi OS
+                # a second device name of the same chip, as on Raspberry Pi OS
+                if info.name in chips:
                     continue
                 chips.add(info.name)
                 for offset in range(info.num_lines):

@@ -164,9 +164,8 @@ class TimedTrigger(LinelessTrigger):
         if self.held and not self._sweeping:
             self._due_ns, self._announced = now_ns + self._every_ns - self._sweep_ns, COUNTDOWN + 1
             return super().edges(now_ns)
-        if (
-            not self._sweeping and now_ns - self._due_ns > self._every_ns
-        ):  # after a pause of the program, the starts that it missed are left out
+        # after a pause of the program, the starts that it missed are left out
+        if not self._sweeping and now_ns - self._due_ns > self._every_ns:
             self._due_ns = now_ns
         while now_ns >= self._due_ns:
             kind = EdgeKind.STOP if self._sweeping else EdgeKind.START

@@ -160,9 +160,8 @@ class Stream:
         self._position = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
-        self._mark: tuple[int, int] | None = (
-            None  # (number, device ns) of a frame at most a second ago
-        )
+        # (number, device ns) of a frame at most a second ago
+        self._mark: tuple[int, int] | None = None
 
     def restart(self) -> None:
         """Begin an enumeration, also the first: frame numbers get the next epoch, and the device

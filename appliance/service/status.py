@@ -128,9 +128,8 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
         raise FormatError(f"{path}: not a status of this version ({e}); restart the service") from e
     why = ""
-    if (
-        not _alive(pid) or age_ns < 0
-    ):  # a file from before the last boot can be ahead of this boot's clock
+    # a file from before the last boot can be ahead of this boot's clock
+    if not _alive(pid) or age_ns < 0:
         why = f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = (

@@ -47,9 +47,8 @@ class Notifier(Observer):
         ready = ready or self._ready
         messages = []
         if status != self._status:
-            messages.append(
-                "STATUS=" + " ".join(status.splitlines())
-            )  # a line break would begin another message
+            # a line break would begin another message
+            messages.append("STATUS=" + " ".join(status.splitlines()))
         if ready and not self._ready:
             messages.append("READY=1")
         if due:

@@ -100,9 +100,8 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     full scale.
     """
     taxels, tare = normal(taxels, 1), normal(tare, 0)
-    series = np.ascontiguousarray(
-        taxels.reshape(len(taxels), -1).T
-    )  # contiguous: twice as fast to reduce
+    # contiguous: twice as fast to reduce
+    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)
     load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
     load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
     total = load.sum()

@@ -77,9 +77,8 @@ def inspect(
     the counts.
     """
     shape = (*tare.shape, 1)[:3]  # [R, C, A]
-    series = np.ascontiguousarray(
-        taxels.reshape(len(taxels), -1).T
-    )  # [R * C * A, T]: three times as fast to reduce
+    # [R * C * A, T]: three times as fast to reduce
+    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)
     highest, lowest = series.max(axis=1), series.min(axis=1)
     still = (lowest == highest).reshape(shape)
     load = series.mean(axis=1, dtype=np.float64).reshape(shape) - tare.reshape(shape)

@@ -125,9 +125,8 @@ class SimRequest:
         size: int,
     ) -> None:
         self.path, self.names, self.settings = path, names, settings
-        size = min(
-            size or 16 * len(names), 1024
-        )  # the kernel's limit; it rounds up to a power of two
+        # the kernel's limit; it rounds up to a power of two
+        size = min(size or 16 * len(names), 1024)
         self.queue: deque[gpiod.EdgeEvent] = deque(maxlen=1 << (size - 1).bit_length())
         self._gpio, self._levels = gpio, levels
         self._seqno, self._line_seqno = count(1), {offset: count(1) for offset in names}

@@ -218,9 +218,8 @@ def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
     before = None
     lead, lifted = (round(s * sweeps.format.rate_hz) for s in (LEAD_S, LIFTED_SET_S))
     start = lifted + MARGIN
-    stop = (
-        start + 2 * lead + sweeps.format.window // 2 * 2
-    )  # even, so that a frame lies in the middle
+    # even, so that a frame lies in the middle
+    stop = start + 2 * lead + sweeps.format.window // 2 * 2
     for i in order:
         window, now = sweeps.samples[i], None if recording is None else recording[i]
         ahead, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)

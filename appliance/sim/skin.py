@@ -34,9 +34,8 @@ SHEAR_FORMAT = replace(FORMAT, dtype="int16", axes=3)
 SHEAR_FULL = 2047
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
 STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
-FORCE_LIMIT = (
-    0.2  # precision of the controller: largest error of the force, as a share of the desired one
-)
+# precision of the controller: largest error of the force, as a share of the desired one
+FORCE_LIMIT = 0.2
 SETS = {
     "T-LAB": (1, 40),
     "T-REAL": (9, 10),
@@ -97,9 +96,8 @@ class World:
     noise_counts: float = 0.36
     gain_spread: float = 0.17  # per attachment, one draw for all taxels and one for each
     bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
-    colour_spread: float = (
-        0.49  # of the transmission of vibrations by tape and glove, per attachment and octave
-    )
+    # of the transmission of vibrations by tape and glove, per attachment and octave
+    colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
     damping_octaves_per_mm: float = -0.60  # which is lower the closer the skin is to the fingertip;
     relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
@@ -304,9 +302,8 @@ def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
     x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
     depth = np.linspace(0, 8, 161)
     pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
-    across = (
-        4 / 3 * np.sqrt(2 * TUBE_RADIUS_MM * pressed) * pressed
-    )  # the springs of one x, integrated over y
+    # the springs of one x, integrated over y
+    across = 4 / 3 * np.sqrt(2 * TUBE_RADIUS_MM * pressed) * pressed
     newton = kpa_per_mm * across.sum(axis=1) * (x[1] - x[0]) / 1000
     return np.interp(force_n, newton, depth)
 

@@ -26,9 +26,8 @@ class Scanner:
         )
         self._pins = [Pin(number, Pin.OUT, value=0) for number in tuple(row_pins) + tuple(col_pins)]
         self._read, self._settle_us = ADC(Pin(adc_pin)).read_u16, settle_us
-        self.scan = (
-            self._scan8 if format.item_bytes == 1 else self._scan16
-        )  # (buffer, at): writes a frame there
+        # (buffer, at): writes a frame there
+        self.scan = self._scan8 if format.item_bytes == 1 else self._scan16
 
     @micropython.native
     def _scan8(self, buffer, at):
@@ -122,7 +121,6 @@ def run(config=settings, **counters):
 
 
 if __name__ == "__main__" and Pin(settings.SERVICE_PIN, Pin.IN, Pin.PULL_UP).value():
-    micropython.alloc_emergency_exception_buf(
-        100
-    )  # an interrupt cannot allocate the message of its failure
+    # an interrupt cannot allocate the message of its failure
+    micropython.alloc_emergency_exception_buf(100)
     run()

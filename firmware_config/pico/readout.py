@@ -45,9 +45,8 @@ class Format:
         self.rows, self.cols, self.board = rows, cols, board
         self.code, self.item_bytes = DATA_TYPES[dtype]
         self.frame_bytes = rows * cols * self.item_bytes
-        self.period_us = int(
-            1000000 / rate_hz + 0.5
-        )  # timers count whole microseconds, and the announced rate must be exact
+        # timers count whole microseconds, and the announced rate must be exact
+        self.period_us = int(1000000 / rate_hz + 0.5)
         self.packet_frames = max(
             1, min(MAX_FRAMES, MAX_PAYLOAD // self.frame_bytes, PACKET_US // self.period_us)
         )

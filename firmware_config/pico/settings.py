@@ -13,7 +13,6 @@ COL_PINS = (6, 7, 8, 9)  # the same for the columns
 ADC_PIN = 26  # GPIO 26, 27 or 28: the common pin of the columns' multiplexer
 SETTLE_US = 5  # wait between switching to a taxel and reading it; README.md, "Budget"
 TRIGGER_PIN = None  # GPIO of the robot's trigger line, if it is wired to the Pico as well
-SERVICE_PIN = (
-    22  # connect to GND at power-on to get the prompt of MicroPython instead of the firmware
-)
+# connect to GND at power-on to get the prompt of MicroPython instead of the firmware
+SERVICE_PIN = 22
 HARD_TIMER = True  # frames are taken even while MicroPython collects garbage; needs MicroPython 1.26 or later

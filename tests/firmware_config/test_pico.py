@@ -218,9 +218,8 @@ def test_stop_ends_the_stream() -> None:
             data += link.read(65536, 1000)
         link.request(packets.Request.STOP, 0)
         data = data + link.read(65536, 100)
-        link.request(
-            packets.Request.FORMAT, 0
-        )  # read below: all before it was sent before it was asked
+        # read below: all before it was sent before it was asked
+        link.request(packets.Request.FORMAT, 0)
         while not packets.unpack(data).replies:
             assert time.monotonic() < end_s
             data += link.read(65536, 1000)
@@ -291,9 +290,8 @@ def test_settings_that_cannot_be(options: dict[str, Any], message: str) -> None:
         json.dumps({"RATE_HZ": 750} | options),
     ]
     ended = subprocess.run(command, input=b"\1", capture_output=True, timeout=LIMIT_S)
-    said = (
-        (ended.stderr + ended.stdout).decode().splitlines()
-    )  # MicroPython prints an error on either
+    # MicroPython prints an error on either
+    said = (ended.stderr + ended.stdout).decode().splitlines()
     assert [line for line in said if line != "serves"][-1] == message
     assert ended.returncode == 1
 

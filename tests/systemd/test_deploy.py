@@ -68,9 +68,8 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
         inside=site.hosts[0],
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (
-        "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
-    )  # reported, not changed silently
+    # reported, not changed silently
+    assert "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
     return done.stdout
 
 

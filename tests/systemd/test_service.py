@@ -163,9 +163,8 @@ def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service
 def test_a_killed_process_is_started_again(machine: Machine, service: Service, signal: str):
     """However it dies, it restarts two seconds later; in between the lines of the same settings are
     lowered."""
-    machine.put(
-        SITE, "[output]\nready = 'GPIO23'\n"
-    )  # the simulated skin has lines of its own and ignores it
+    # the simulated skin has lines of its own and ignores it
+    machine.put(SITE, "[output]\nready = 'GPIO23'\n")
     first = service.start()
     service.kill(signal)
     service.until("NRestarts", "1")
@@ -322,9 +321,8 @@ def test_it_is_nobody_in_particular(machine: Machine, service: Service):
     assert machine.run(*as_palpate, "cat", SITE).returncode == 0
     for path in (SITE, "/etc/palpate/new", "/opt/palpate/new", "/root/new"):
         assert machine.run(*as_palpate, "touch", path).returncode != 0
-        assert (
-            "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr
-        )  # not even root could
+        # not even root could
+        assert "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr
     machine.get(*as_palpate, "touch", "/var/lib/palpate/new")
 
 

@@ -33,9 +33,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         fields = _tsf_fields(data[at + _TSF_HEADER : end]) if end > 0 else None
         whole = fields is not None and not grids.keys() & fields.keys()
         upto = at + 1 if fields is None else at if not whole else begun
-        if (
-            upto > begun
-        ):  # no packet, or a finger's grid is missing: the current frame is incomplete
+        # no packet, or a finger's grid is missing: the current frame is incomplete
+        if upto > begun:
             garbage, before, begun, grids = garbage + upto - begun, before + upto - begun, upto, {}
         if fields is None:
             found = data.find(_TSF_START, begun)

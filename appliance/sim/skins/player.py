@@ -245,9 +245,8 @@ def _wait_for_bytes(fd: int, sent: int) -> bool:
     while (waited := time.monotonic() - begin) < DELIVERY_S and (held := _held(fd)) < min(
         sent, PORT_BYTES
     ):
-        if (
-            waited > SPIN_S
-        ):  # it usually takes some 10 us; a sleeping thread on a busy machine wakes much later
+        # it usually takes some 10 us; a sleeping thread on a busy machine wakes much later
+        if waited > SPIN_S:
             time.sleep(1e-4) if held else wait_readable(fd, DELIVERY_S)
     return wait_readable(fd, 0)
 

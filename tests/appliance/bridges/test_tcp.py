@@ -69,9 +69,8 @@ def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
         peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
         for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
             peer.sendall(b"$PPLP," + command + b"\r\n")
-            assert peer.recv(4096).startswith(
-                b"$PPLP,ANS," + command + b",ok,"
-            )  # so it is served by now
+            # so it is served by now
+            assert peer.recv(4096).startswith(b"$PPLP,ANS," + command + b",ok,")
         box.say(result(1).replace(b"wood", b"wo0d"), b"\xff\xfe\r\n", state(), result(2))
         for peer in peers:
             heard = b""

@@ -594,9 +594,8 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
     total = 2000
 
     def numbered(i: int) -> bytes:
-        return sentence(
-            "ANS", i, "x" * (i % 59)
-        )  # of many lengths, so that the line fills up within a sentence, after its number
+        # of many lengths, so that the line fills up within a sentence, after its number
+        return sentence("ANS", i, "x" * (i % 59))
 
     for i in range(total):
         began_ns = now(u)

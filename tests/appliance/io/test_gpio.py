@@ -390,9 +390,8 @@ def test_reading_is_bounded() -> None:
 
 def test_unread_rest_of_a_burst() -> None:
     """A burst with events still in the queue is not settled, though the call is long after it."""
-    setup = TriggerSetup(
-        {CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3
-    )  # one event of each chip a call
+    # one event of each chip a call
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)
     setup.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
     setup.drive("STOP", 11 * MS)
     reported = [setup.poll((50 + i) * MS) for i in range(5)]
@@ -404,9 +403,8 @@ def test_unread_rest_of_a_burst() -> None:
 def test_unread_edges_of_another_chip() -> None:
     """While one chip's queue is being read, edges are reported as they become certain, and later
     ones wait."""
-    setup = TriggerSetup(
-        {CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2
-    )  # one event of each chip a call
+    # one event of each chip a call
+    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)
     setup.drive("START", 10 * MS, 20 * MS)
     setup.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
     reported = [setup.poll((50 + i) * MS) for i in range(6)]

@@ -88,9 +88,8 @@ def playing() -> Iterator[str]:
             rest, i, begin = b"", 0, time.monotonic()
             while not ended.is_set():
                 if not rest:
-                    ended.wait(
-                        max(0, begin + i / 100 - time.monotonic())
-                    )  # 100 Hz on average, however busy the machine
+                    # 100 Hz on average, however busy the machine
+                    ended.wait(max(0, begin + i / 100 - time.monotonic()))
                     rest, i = wire("flexitac", i), i + 1
                 try:
                     rest = rest[os.write(far, rest) :]

@@ -361,9 +361,8 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offere
         got += slow.lines()
     lost = [line["lines"] for line in got if line["type"] == "lost"]
     assert len(lost) == 1
-    at = kinds(got).index(
-        "lost"
-    )  # where the gap is; before stand hello and health, which each reader has of its own
+    # where the gap is; before stand hello and health, which each reader has of its own
+    at = kinds(got).index("lost")
     assert got[2:at] == all_lines[2:at]
     rest = got[at + 1 :]
     first = all_lines.index(rest[0])
@@ -506,9 +505,8 @@ def test_endless_requests_are_read_a_little_each_turn(
     offered.turns(10)
     assert len(taken) == HEARD * 10
     assert max(taken) <= HEARD_BYTES
-    assert (
-        sum(reader.sweeps for reader in offered.feed._readers.values()) == 1
-    )  # heard between the floods
+    # heard between the floods
+    assert sum(reader.sweeps for reader in offered.feed._readers.values()) == 1
     offered.feed.answered(OK)
     offered.turns(4)
     assert "verdict" in kinds(other.lines())
