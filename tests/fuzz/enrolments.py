@@ -41,6 +41,20 @@ def read(data: bytes, folder: Path) -> Bundle:
     return enrolled.applied(small(), data, bundle.identity(data))
 
 
+def _check_classes(old: Bundle, got: Bundle) -> None:
+    """Statistics of the trained labels are unchanged, and all are finite."""
+    assert old.classes
+    assert got.classes
+    n, trained = len(old.manifest.labels), old.classes.arrays()
+    for name, values in got.classes.arrays().items():
+        assert np.isfinite(values).all(), f"{name} is not finite"
+        if not name.startswith("moved_turn"):
+            assert len(values) == len(got.manifest.labels)
+            assert values[:n].tobytes() == trained[name].tobytes(), (
+                f"{name} of a trained label changed"
+            )
+
+
 def target(data: bytes, folder: Path) -> None:
     """enrolled.applied: labels that can be sent, and nothing else, are added to what was signed; or
     a BundleError."""
@@ -61,15 +75,7 @@ def target(data: bytes, folder: Path) -> None:
     )
     assert got.manifest.known == old.manifest.known
     assert got.manifest.early is None, "early heads do not know the label"
-    assert old.classes
-    assert got.classes
-    for name, values in got.classes.arrays().items():
-        assert np.isfinite(values).all(), f"{name} is not finite"
-        if not name.startswith("moved_turn"):
-            assert len(values) == len(labels)
-            assert values[:n].tobytes() == old.classes.arrays()[name].tobytes(), (
-                f"{name} of a trained label changed"
-            )
+    _check_classes(old, got)
     assert set(got.enrolled) == set(labels[n:])
     assert all(1 <= sweeps <= MOST_SWEEPS for sweeps in got.enrolled.values())
     assert got.golden.shape == (

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -205,82 +205,66 @@ SEEDS: dict[str, Callable[[], list[bytes]]] = {
 }
 
 
+SETTINGS = (
+    *("board = ", " = ", '"', "[", "]", "true", "nan", "-0.0", "1e-9", "0x"),
+    *('"\\u0000"', "1979-05-27", "'''"),
+)
+"""Syntax of settings, and values at its limits."""
+JSON_VALUES = (
+    *("NaN", "Infinity", "1e999", "4.0", "-1", "true", "null"),
+    *('"\\ud800"', '"\\n"', "{}", "[]", "[[[["),
+)
+"""Values at the limits of JSON, and beyond them."""
+FEED = (b'{"frames": ', b'"sweeps": true', b"NaN", b"1e999", b"-0.0", b"null", b"}\n", b", ")
+FILES: Mapping[str, tuple[type, ...]] = {
+    "manifest": (bundle.Manifest, bundle.Thresholds),
+    "recording": (SweepFormat, Sweep),
+    "capture": (SweepFormat,),
+}
+"""Classes whose fields are keys of a file."""
+MAGICS = {
+    "recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"],
+    "capture": [MAGIC],
+}
+
+
+def _settings() -> list[bytes]:
+    """Sections and keys of the settings, and their syntax."""
+    groups = {
+        f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name))
+        for f in fields(config.Config)
+    }
+    sections = {name: group for name, group in groups.items() if is_dataclass(group)}
+    keys = [key for group in sections.values() for key in schema.keys(group)]
+    return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *SETTINGS)]
+
+
+def _file(target: str) -> list[bytes]:
+    """Keys of a file of JSON, values, and the words that surround them."""
+    names = [FILE_KEYS.get(f.name, f.name) for kind in FILES[target] for f in fields(kind)]
+    if target == "manifest":
+        names.append("contact")  # key of Thresholds; a field of Manifest has the same name
+    texts = (*(f'"{name}"' for name in names), *JSON_VALUES)
+    return [*MAGICS.get(target, []), *(text.encode() for text in texts)]
+
+
 def words(target: str) -> Sequence[bytes]:
-    """What the target's format is made of."""
+    """The words of the target's format."""
     if target == "unpack":
-        return [
-            packets.MAGIC,
-            ENDLESS,
-            *(b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind),
-        ]
+        kinds = (b"%c%c" % (packets.VERSION, kind) for kind in packets.PacketKind)
+        return [packets.MAGIC, ENDLESS, *kinds]
     if target == "command":
         return [b"$PPLP,", b"*", b"\r\n", b"\xff", *(name.encode() for name in robot_link.COMMANDS)]
     if target in far_sides.WORDS:
         return far_sides.WORDS[target]
     if target == "feed":
-        return [
-            b'{"frames": ',
-            b'"sweeps": true',
-            b"NaN",
-            b"1e999",
-            b"-0.0",
-            b"null",
-            b"}\n",
-            b", ",
-        ]
+        return FEED
     if target == "settings":
-        groups = {
-            f.name: type(getattr(config.load(None, site=Path("/dev/null")), f.name))
-            for f in fields(config.Config)
-        }
-        sections = {name: group for name, group in groups.items() if is_dataclass(group)}
-        keys = [key for group in sections.values() for key in schema.keys(group)]
-        odd = [
-            "board = ",
-            " = ",
-            '"',
-            "[",
-            "]",
-            "true",
-            "nan",
-            "-0.0",
-            "1e-9",
-            "0x",
-            '"\\u0000"',
-            "1979-05-27",
-            "'''",
-        ]
-        return [text.encode() for text in (*(f"[{name}]" for name in sections), *keys, *odd)]
+        return _settings()
     if target == "enrolment":
         return enrolments.words()
     if target == "profile":
         return [f"{field.name} = ".encode() for field in fields(SkinProfile)]
     if target.startswith("skin-"):
         return list(skins.MARKS[target.removeprefix("skin-")])
-    kinds = {
-        "manifest": (bundle.Manifest, bundle.Thresholds),
-        "recording": (SweepFormat, Sweep),
-        "capture": (SweepFormat,),
-    }
-    names = [FILE_KEYS.get(f.name, f.name) for kind in kinds[target] for f in fields(kind)]
-    if target == "manifest":
-        names.append("contact")  # key of Thresholds; a field of Manifest has the same name
-    odd = [
-        "NaN",
-        "Infinity",
-        "1e999",
-        "4.0",
-        "-1",
-        "true",
-        "null",
-        '"\\ud800"',
-        '"\\n"',
-        "{}",
-        "[]",
-        "[[[[",
-    ]
-    magic = {
-        "recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"],
-        "capture": [MAGIC],
-    }.get(target, [])
-    return [*magic, *(text.encode() for text in (*(f'"{name}"' for name in names), *odd))]
+    return _file(target)

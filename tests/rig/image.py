@@ -199,6 +199,17 @@ def _hash(parts: Iterable[Path], key: str) -> str:
     return total.hexdigest()[:16]
 
 
+def _download_wheels(part: Path) -> None:
+    """The locked wheels for the guest's processor."""
+    lock = part / emulated_machines.LOCK.name
+    lock.write_text(guest_lock())
+    run(
+        *(*emulated_machines.PIP, "download", *emulated_machines.ARM_WHEELS),
+        *("--python-version", GUEST_PYTHON, "--require-hashes"),
+        *("-r", lock, "-d", part / "wheels"),
+    )
+
+
 def _make_ground(part: Path) -> None:
     apt = emulated_machines.apt(part, "arm64")
     about = run(*apt, "apt-cache", "depends", "linux-image-arm64").split()
@@ -210,35 +221,12 @@ def _make_ground(part: Path) -> None:
     )
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
-    lock = part / emulated_machines.LOCK.name
-    lock.write_text(guest_lock())
-    run(
-        *emulated_machines.PIP,
-        "download",
-        *emulated_machines.ARM_WHEELS,
-        "--python-version",
-        GUEST_PYTHON,
-        "--require-hashes",
-        "-r",
-        lock,
-        "-d",
-        part / "wheels",
-    )
+    _download_wheels(part)
     version = package.removeprefix("linux-image-")
     _make_root(part, version)
     _make_ramdisk(part, version)
-    run(
-        "mke2fs",
-        "-q",
-        "-t",
-        "ext4",
-        "-E",
-        "lazy_itable_init=1",
-        "-d",
-        part / "root",
-        part / "disk.img",
-        DISK,
-    )
+    ext4 = ("mke2fs", "-q", "-t", "ext4", "-E", "lazy_itable_init=1")
+    run(*ext4, "-d", part / "root", part / "disk.img", DISK)
     shutil.copy(part / "kernel" / "boot" / f"vmlinuz-{version}", part / "vmlinuz")
     _make_tree(part / "tree.dtb")
     for rest in part.iterdir():

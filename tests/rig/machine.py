@@ -94,71 +94,30 @@ class Guest:
 
     def _command(self, image: Image, snapshot: bool, ssh: int) -> list[str | Path]:
         at = self._folder
-
-        forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
-        network = (
-            ["-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="]
-            if ssh
-            else []
-        )
-
-        def port(name: str) -> tuple[str, str]:
-            return "-chardev", f"socket,id={name},path={at}/{name},server=on,wait=off"
-
         return [
-            "qemu-system-aarch64",
-            *MACHINE,
-            "-accel",
-            "tcg,thread=single",
+            *("qemu-system-aarch64", *MACHINE, "-accel", "tcg,thread=single"),
             *guest_clock.STEADY,
-            "-display",
-            "none",
-            "-kernel",
-            image.kernel,
-            "-initrd",
-            image.ground / "ramdisk",
-            "-dtb",
-            image.ground / "tree.dtb",
-            "-append",
-            "console=ttyAMA0 quiet systemd.show_status=0 panic=-1",
-            "-no-reboot",
-            "-drive",
-            f"file={self.disk},format=qcow2,if=none,id=d0",
-            "-device",
-            "virtio-blk-pci,drive=d0,addr=4",
-            "-drive",
-            f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on",
-            "-device",
-            "virtio-blk-pci,drive=d1,addr=5",
-            "-device",
-            "qemu-xhci,id=xhci,addr=6",
-            "-device",
-            "virtio-rng-pci,addr=7",
-            *port("robot"),
-            "-device",
-            "pci-serial,chardev=robot,addr=8",
-            "-device",
-            "virtio-serial-pci,addr=9",
-            *guest_clock.DEVICE,
-            *port("agent"),
-            "-device",
-            "virtserialport,chardev=agent,name=palpate.agent",
-            *port("bench"),
-            "-device",
-            "virtserialport,chardev=bench,name=palpate.bench",
-            "-chardev",
-            f"file,id=console,path={at}/console",
-            "-serial",
-            "chardev:console",
-            "-qmp",
-            f"unix:{at}/qmp,server=on,wait=off",
-            "-qtest",
-            f"unix:{at}/qtest,server=on,wait=off",
-            "-qtest-log",
-            "/dev/null",
-            *network,
-            *(["-loadvm", "ready"] if snapshot else []),
+            *("-display", "none", "-kernel", image.kernel),
+            *("-initrd", image.ground / "ramdisk", "-dtb", image.ground / "tree.dtb"),
+            *("-append", "console=ttyAMA0 quiet systemd.show_status=0 panic=-1", "-no-reboot"),
+            *("-drive", f"file={self.disk},format=qcow2,if=none,id=d0"),
+            *("-device", "virtio-blk-pci,drive=d0,addr=4"),
+            *("-drive", f"file={at}/code.img,format=raw,if=none,id=d1,readonly=on"),
+            *("-device", "virtio-blk-pci,drive=d1,addr=5"),
+            *("-device", "qemu-xhci,id=xhci,addr=6", "-device", "virtio-rng-pci,addr=7"),
+            *(*self._port("robot"), "-device", "pci-serial,chardev=robot,addr=8"),
+            *("-device", "virtio-serial-pci,addr=9", *guest_clock.DEVICE),
+            *(*self._port("agent"), "-device", "virtserialport,chardev=agent,name=palpate.agent"),
+            *(*self._port("bench"), "-device", "virtserialport,chardev=bench,name=palpate.bench"),
+            *("-chardev", f"file,id=console,path={at}/console", "-serial", "chardev:console"),
+            *("-qmp", f"unix:{at}/qmp,server=on,wait=off"),
+            *("-qtest", f"unix:{at}/qtest,server=on,wait=off", "-qtest-log", "/dev/null"),
+            *(_network(ssh) if ssh else ()),
+            *(("-loadvm", "ready") if snapshot else ()),
         ]
+
+    def _port(self, name: str) -> tuple[str, str]:
+        return "-chardev", f"socket,id={name},path={self._folder}/{name},server=on,wait=off"
 
     def _connect(self, name: str) -> socket.socket:
         end = time.monotonic() + START_S
@@ -258,3 +217,9 @@ class Guest:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _network(ssh: int) -> tuple[str, ...]:
+    """Options of QEMU: a network without a way out, where `ssh` of this machine leads to port 22."""
+    forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
+    return "-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="

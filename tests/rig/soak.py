@@ -338,8 +338,7 @@ def _drawn(out: Path) -> list[dict[str, Any]]:
     return list(json.loads(path.read_text())["boxes"].values()) if path.exists() else []
 
 
-def main() -> int:
-    """Run what the arguments say; its exit code."""
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m tests.rig.soak", description="Has boxes sweep without pause, and judges them."
     )
@@ -365,29 +364,28 @@ def main() -> int:
     parser.add_argument(
         "--draw", action="store_true", help="only draw what is there, or the page of --out again"
     )
+    return parser
+
+
+def _alone(box: str, seed: int, hours: float, work: Path) -> None:
+    """Record one box until its time is over or a signal comes."""
+    got: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, frame: got.append(n))
+    log = partial(print, flush=True)
+    soak(BOXES[box](), seed, hours, work, stopped=lambda: bool(got), log=log)
+
+
+def main() -> int:
+    """Run the boxes, or one of them, and draw the page; the exit code."""
+    parser = _parser()
     args = parser.parse_args()
     hours = args.minutes / 60 if args.minutes else args.hours
     if args.box:
-        got: list[int] = []
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda n, frame: got.append(n))
-        soak(
-            BOXES[args.box](),
-            args.seed,
-            hours,
-            args.work,
-            stopped=lambda: bool(got),
-            log=partial(print, flush=True),
-        )
+        _alone(args.box, args.seed, hours, args.work)
         return 0
-    arguments = [
-        "--seed",
-        str(args.seed),
-        "--hours",
-        repr(hours),
-        "--work",
-        str(args.work.resolve()),
-    ]
+    arguments = ["--seed", str(args.seed), "--hours", repr(hours)]
+    arguments += ["--work", str(args.work.resolve())]
     recorded = args.draw or _together(arguments)
     try:
         reached = draw([args.work, *args.beside], args.out)

@@ -226,27 +226,15 @@ def unaccounted(behind: Sequence[float]) -> int:
 
 
 def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
-    """(what, what is wanted, what came out, whether it was reached) of each target; None where the
-    run was too short."""
-    yield (
-        "sweeps without an answer",
-        "0",
-        f"{result['unanswered']} of {result['due']}",
-        result["unanswered"] == 0,
-    )
-    yield (
-        "sentences out of order, broken or missing",
-        "0",
-        f"{result['faults']}",
-        result["faults"] == 0,
-    )
-    yield (
-        "frames lost and not accounted for",
-        "0",
-        f"{result['unaccounted']} of {_taken(result)}",
-        result["unaccounted"] == 0,
-    )
-    yield "sentences dropped", "0", f"{result['dropped']}", result["dropped"] == 0
+    """(name, wanted, measured, whether it was reached) of each target; None where the run was too
+    short."""
+    for name, key, of in (
+        ("sweeps without an answer", "unanswered", f" of {result['due']}"),
+        ("sentences out of order, broken or missing", "faults", ""),
+        ("frames lost and not accounted for", "unaccounted", f" of {_taken(result)}"),
+        ("sentences dropped", "dropped", ""),
+    ):
+        yield name, "0", f"{result[key]}{of}", result[key] == 0
     most = result["wrong_band"][1]
     wrong = result["wrong"]["n"]
     yield (

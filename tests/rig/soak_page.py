@@ -7,7 +7,7 @@ sums.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +127,33 @@ def _verdict(box: Json) -> str:
     return f"{count}; missed: {'; '.join(missed)}" if missed else count
 
 
+FRAMES: Sequence[tuple[str, Callable[[Json], str]]] = (
+    ("frames received", lambda s: f"{s['received']:,}"),
+    ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
+    ("frames not accounted for", lambda s: f"{s['unaccounted']:,}"),
+    ("bytes that belonged to no packet", lambda s: f"{s['garbage']:,}"),
+    ("times that the skin was found on the bus", lambda s: f"{s['enumerations']}"),
+    ("sentences dropped", lambda s: f"{s['dropped']}"),
+    ("longest silence, s", lambda s: f"{s['silence_s']:.1f}"),
+    (
+        "latency, ms: median, 99 %, worst",
+        lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values()),
+    ),
+    ("resident memory, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
+    (
+        "the same, shared pages divided by their users, MiB: start, half-way, end",
+        lambda s: _mib(s["pss_kib"]),
+    ),
+    (
+        "growth of resident memory in the second half, KiB an hour",
+        lambda s: _slope(s["memory"]),
+    ),
+    ("the same, KiB for 1,000 sweeps", lambda s: _each(s)),
+    ("share of a core used", lambda s: formatting.percent(s["cpu"])),
+)
+"""Rows about frames, times and the process."""
+
+
 def _sums(sums: Sequence[Json]) -> list[list[str]]:
     """All sums, a line each."""
     statuses = dict.fromkeys(status for s in sums for status in s["statuses"])
@@ -146,28 +173,7 @@ def _sums(sums: Sequence[Json]) -> list[list[str]]:
             "other than the network by itself",
             lambda s: f"{s['differs']} of {s['answers'] - s['cut']:,}",
         ),
-        ("frames received", lambda s: f"{s['received']:,}"),
-        ("frames lost, reported by the box", lambda s: f"{s['lost']:,}"),
-        ("frames not accounted for", lambda s: f"{s['unaccounted']:,}"),
-        ("bytes that belonged to no packet", lambda s: f"{s['garbage']:,}"),
-        ("times that the skin was found on the bus", lambda s: f"{s['enumerations']}"),
-        ("sentences dropped", lambda s: f"{s['dropped']}"),
-        ("longest silence, s", lambda s: f"{s['silence_s']:.1f}"),
-        (
-            "latency, ms: median, 99 %, worst",
-            lambda s: " / ".join(f"{v:.1f}" for v in s["latency_ms"].values()),
-        ),
-        ("resident memory, MiB: start, half-way, end", lambda s: _mib(s["rss_kib"])),
-        (
-            "the same, shared pages divided by their users, MiB: start, half-way, end",
-            lambda s: _mib(s["pss_kib"]),
-        ),
-        (
-            "growth of resident memory in the second half, KiB an hour",
-            lambda s: _slope(s["memory"]),
-        ),
-        ("the same, KiB for 1,000 sweeps", _each),
-        ("share of a core used", lambda s: formatting.percent(s["cpu"])),
+        *FRAMES,
     ]
     return [[what, *(of(s) for s in sums)] for what, of in lines]
 
