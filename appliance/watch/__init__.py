@@ -1,1 +1,1 @@
-"""What shows the running box to a person: a page and its server."""
+"""The running box for a person: a page and its server, and pictures for a terminal."""

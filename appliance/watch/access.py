@@ -1,5 +1,4 @@
-"""Who may see a page: its address, the names by which browsers may ask for it, token and
-certificate. In: settings. Out: an Access."""
+"""Access to a page: its address, the host names that browsers may use, token and certificate."""
 
 from __future__ import annotations
 
@@ -15,18 +14,18 @@ from appliance.core.errors import ConfigError
 
 HERE = "127.0.0.1"
 NAMES = ("localhost", HERE, "[::1]")
-"""Names by which a browser may ask for this machine. Another name belongs to another site that
-points here (DNS rebinding)."""
+"""Host names of this machine. Any other name belongs to another site that points here (DNS
+rebinding)."""
 LEAST_TOKEN, MOST_TOKEN = 16, 256
-"""Characters of a token."""
+"""Least and most characters of a token."""
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Where a page is served, and to whom.
+    """Address of a page, and the browsers that may read it.
 
-    port: 0 for any that is free. names: further host names that browsers may use. token: what a
-    browser has to know, "" for nothing. certificate, key: PEM files of TLS; None serves without it.
+    port: 0 for any free port. names: further host names that browsers may use. token: the secret of
+    a browser, "" if none is needed. certificate, key: PEM files of TLS; None serves without TLS.
     """
 
     port: int
@@ -38,10 +37,8 @@ class Access:
 
     @classmethod
     def configured(cls, settings: WatchConfig, port: int) -> Access:
-        """As the settings say. Beyond this machine only with token and certificate.
-
-        Raises ConfigError where these cannot be used.
-        """
+        """The access of the settings. An address beyond this machine needs token and certificate.
+        Raises ConfigError if they cannot be used."""
         address, *names = settings.address.lower().split() or [""]
         try:
             local = ipaddress.ip_address(address).is_loopback
@@ -63,7 +60,7 @@ class Access:
         )
 
     def tls(self) -> ssl.SSLContext | None:
-        """The context of TLS. Raises ConfigError where certificate or key cannot be used."""
+        """The context of TLS. Raises ConfigError if certificate or key cannot be used."""
         if not self.certificate or not self.key:
             return None
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -78,15 +75,15 @@ class Access:
         return context
 
     def url(self, port: int) -> str:
-        """The page's address for a person; port: the one that is listened on."""
+        """The page's address for a person. port: the port of the server."""
         name = self.address if not self.certificate else self.names[0] if self.names else HERE
         return (
             f"http{'s' if self.certificate else ''}://{f'[{name}]' if ':' in name else name}:{port}"
         )
 
     def is_host(self, host: str, own: str) -> bool:
-        """Whether the Host of a request names this machine. own: the address that the request came
-        to."""
+        """Whether the Host of a request names this machine. own: the local address of the
+        connection."""
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
         return bool(name) and name.lower() in (
             *NAMES,
@@ -95,18 +92,19 @@ class Access:
         )
 
     def admits(self, given: str) -> bool:
-        """Whether `given` is the token, or none is needed. Takes as long for every wrong one."""
+        """Whether `given` is the token, or no token is needed. All wrong tokens take the same
+        time."""
         return not self.token or hmac.compare_digest(given.encode(), self.token.encode())
 
 
 def _own_names() -> tuple[str, ...]:
-    """The machine's host name, also as multicast DNS has it."""
+    """The machine's host name, and its name in multicast DNS."""
     name = socket.gethostname().lower()
     return (name, f"{name.partition('.')[0]}.local")
 
 
 def _token(path: Path) -> str:
-    """The token in a file. Raises ConfigError where there is none that can be used."""
+    """The token in a file. Raises ConfigError if it cannot be used."""
     advice = "make install makes one; or set watch.address to 127.0.0.1"
     try:
         token = path.read_text("ascii").strip()

@@ -1,7 +1,7 @@
-"""What `palpate watch --web` shows. In: lines of the feed. Out: events of the page, and on request
+"""The content of `palpate watch --web`: lines of the feed become events of the page, and on request
 the picture of a sweep.
 
-Nothing is written to a disk: what the page knows of the shift is what this program has seen.
+Nothing is written to a disk: the list of the shift begins when this program starts.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from appliance.core.types import SweepFormat
 from appliance.watch.sweep_picture import Window, picture, window
 
 SHIFT = 5000
-"""Verdicts that are kept: eight hours with a sweep every six seconds."""
+"""Verdicts in the list: eight hours with a sweep every six seconds."""
 SWEEPS = 20
-"""Latest sweeps whose windows are kept."""
+"""Latest sweeps with a picture."""
 MINUTE_NS = 60_000_000_000
 KEPT = {"hello": 8, "verdict": SHIFT, "minute": 1440, "signal": SWEEPS, "note": 200}
-"""Events that stay for browsers that come later; of all others the newest one."""
+"""Number of events that are kept for new browsers, by name; of all other names the newest event is
+kept."""
 FIELDS = (
     "sweep",
     "time_ns",
@@ -42,7 +43,7 @@ FIELDS = (
     "share",
     "moved",
 )
-"""Of a verdict."""
+"""Fields of a verdict."""
 
 Publish = Callable[[str, object], None]
 
@@ -50,29 +51,29 @@ Publish = Callable[[str, object], None]
 class PageBoard:
     """Turns lines of the feed into events, by their type.
 
-    hello, health, state: as they come. box: whether there is a feed. verdict: with rounded `scores`
-    and the `reason` of a sweep without a label. minute: frames and lost frames of the last minute.
-    signal: that a sweep's window is here. view: see alignment.view. note: another bundle or
+    hello, health, state: unchanged. box: whether there is a feed. verdict: with rounded `scores`,
+    and the `reason` for a sweep without a label. minute: frames and lost frames of the last minute.
+    signal: a sweep's window is available. view: see alignment.view. note: another bundle or
     program.
     """
 
     def __init__(self, publish: Publish) -> None:
         self._publish = publish
         self._hello: dict[str, Any] = {}
-        self._before: dict[str, Any] = {}  # the hello before, until the restart has been noted
+        self._before: dict[str, Any] = {}  # the previous hello, until the restart was noted
         self._skin, self._trouble = "", ""
         self._tracker: ContactTracker | None = None
         self._enumerations = 0
         self._view_ns = -VIEW_NS
         self._minute: tuple[int, int, int] | None = (
-            None  # time, frames and lost frames at its begin
+            None  # time, frames and lost frames at the begin of the minute
         )
         self._windows: OrderedDict[int, Window] = OrderedDict()
         self._taken = 0
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take one line. One of an unknown type is for a later version. Raises FormatError for one
-        that is not as it must be."""
+        """Take a line of the feed. Lines of an unknown type are ignored: a later version may send
+        them. Raises FormatError for a line that does not fit its type."""
         act = _LINES.get(str(line.get("type")))
         if not act:
             return
@@ -85,12 +86,12 @@ class PageBoard:
             ) from e
 
     def away(self, why: str) -> None:
-        """There is no feed."""
+        """Show the box as away."""
         self._minute = None
         self._publish("box", {"there": False, "why": why})
 
     def sweep(self, which: str) -> dict[str, Any] | None:
-        """The picture of a sweep by its number in `signal`; None where it is not kept."""
+        """The picture of a sweep by its number in `signal`; None if its window is not kept."""
         kept = self._windows.get(int(which))
         return picture(kept) if kept else None
 
@@ -170,7 +171,7 @@ class PageBoard:
 
 
 def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """What has changed with another program, for a person."""
+    """Description of the changes after a restart."""
     changed = (
         f"bundle {now['bundle']} in place of {before['bundle']}"
         if now["bundle"] != before["bundle"]

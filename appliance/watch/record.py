@@ -1,8 +1,8 @@
-"""The page of `palpate record --web`. In: what happens in the loop; orders of the page. Out: events
-of the page, and commands that the loop carries out between two turns, as it does those of the
-serial line.
+"""The page of `palpate record --web`: events of the loop for the page, and orders of the page for
+the loop.
 
-The loop hands over numbers and takes up one command a turn; nothing of a browser is waited for.
+The loop carries out at most one order between two turns, like a command of the serial line. It
+never waits for a browser.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from appliance.watch.server import PageServer
 from appliance.watch.sweep_picture import Window, picture
 
 MOST_WAITING = 16
-"""Commands that wait for the loop; a further one is refused at once."""
+"""Most commands that wait for the loop; further commands are refused at once."""
 PERIOD_NS = 1_000_000_000
-"""From one state of the recording to the next, where nothing changes."""
+"""Time between two states of the recording without changes."""
 LABELS = tuple(name.upper() for name in Labels.__slots__)
 TRIGGERS = {
     "two-lines": "the robot's lines START and STOP",
@@ -38,19 +38,16 @@ TRIGGERS = {
     "serial": "START and STOP, here or on the serial line",
     "key": "the space bar in the terminal of palpate record",
 }
-"""What starts and stops sweeps, for a person."""
+"""The trigger of sweeps in words."""
 
 Obey = Callable[[Command], list[object]]
-"""Carries out a command: the fields of its answer. Raises ApplianceError."""
+"""Carries out a command and returns the fields of its answer. Raises ApplianceError."""
 
 
 def order(body: bytes, allowed: Sequence[str]) -> Command:
-    """The command in what a page has sent: `{"command": "MATERIAL", "text": "wood"}`. allowed:
-    names of commands.
-
-    Raises FormatError where it is none; ConfigError, as the command itself would, for a label that
-    cannot be used.
-    """
+    """The command in an order of a page, such as `{"command": "MATERIAL", "text": "wood"}`.
+    allowed: names of commands. Raises FormatError for other orders, and ConfigError, as the command
+    itself does, for a label that cannot be used."""
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError) as e:
@@ -67,7 +64,7 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
         )
     text = text.strip()
     if name in LABELS:
-        Labels(**{name.lower(): text})  # before a capture notes it
+        Labels(**{name.lower(): text})  # before a capture records the order
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
         raise FormatError(
             f"{name} takes no text, but for DISCARD the number of a sweep; leave it out"
@@ -76,14 +73,14 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
 
 
 class CommandQueue:
-    """Commands on their way from the server's thread to the loop, and their answers on the way
-    back."""
+    """Commands from the server's thread to the loop, and their answers."""
 
     def __init__(self) -> None:
         self._waiting: Queue[tuple[Command, Future[list[object]]]] = Queue(MOST_WAITING)
 
     def put(self, command: Command) -> Future[list[object]]:
-        """Have a command carried out; its answer. Raises NoAnswer where too many wait."""
+        """Have a command carried out and return its answer. Raises NoAnswer if too many commands
+        wait."""
         answer: Future[list[object]] = Future()
         try:
             self._waiting.put_nowait((command, answer))
@@ -94,8 +91,8 @@ class CommandQueue:
         return answer
 
     def carry_out(self, obey: Obey) -> bool:
-        """Carry out the next command that is still wanted, in the loop's thread; whether there was
-        one."""
+        """Carry out the next command that is still wanted, in the loop's thread. Returns whether
+        there was a command."""
         try:
             while not (waiting := self._waiting.get_nowait())[1].set_running_or_notify_cancel():
                 pass
@@ -109,7 +106,7 @@ class CommandQueue:
         return True
 
     def refuse(self) -> None:
-        """Answer whoever still waits."""
+        """Refuse all commands that wait."""
         while self.carry_out(_ended):
             pass
 
@@ -119,11 +116,11 @@ def _ended(_: Command) -> list[object]:
 
 
 class RecordPage(Observer):
-    """The page of a recording at `access`; it is served while this is entered.
+    """The page of a recording at `access`. It is served within its `with` block.
 
-    format: of the sweeps. source: where the frames come from. trigger: what starts and stops sweeps.
-    about: see RecordingSession.about. obey: carries out what the page orders, in the loop's thread.
-    clock: the host's real one. Raises ConfigError where the address cannot be used.
+    format: of the sweeps. source: of the frames. trigger: its settings. about: see
+    RecordingSession.about. obey: carries out the orders of the page, in the loop's thread. clock:
+    the host's real clock. Raises ConfigError if the address cannot be used.
     """
 
     def __init__(
@@ -170,12 +167,12 @@ class RecordPage(Observer):
         self.server.__exit__(*reason)
 
     def frames(self, frames: Frames) -> None:
-        """Keep the newest for the picture of the skin, while somebody looks at it."""
+        """Keep the newest frames for the picture of the skin, if a browser is connected."""
         if self.server.watched:
             self._tracker.put(frames.taxels)
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Show what a sweep has given. It comes after the recording has stored it."""
+        """Show the result of a sweep, after the recording has stored it."""
         self._window = (
             Window(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
         )
@@ -195,7 +192,7 @@ class RecordPage(Observer):
         self._state = ()
 
     def turn(self, health: Health) -> None:
-        """Take up one command; show what has changed."""
+        """Carry out a command, and show the changes."""
         if self._queue.carry_out(self._obey):
             self._state = ()
         now_ns = self._clock.now_ns()
@@ -227,8 +224,7 @@ class RecordPage(Observer):
         return self._queue.put(order(body, self._commands))
 
     def _shown(self, which: str) -> dict[str, Any] | None:
-        """The picture of the last sweep, where it is this one; computed once, whoever asks and
-        however often."""
+        """The picture of the last sweep, if it has this number. It is computed once."""
         window = self._window
         if not window or window.sweep != int(which):
             return None
@@ -238,7 +234,7 @@ class RecordPage(Observer):
 
 
 def trigger_words(trigger: TriggerConfig) -> str:
-    """What starts and stops sweeps, for a person."""
+    """The trigger of sweeps in words."""
     if trigger.mode == "timed":
         return f"the clock: {trigger.sweep_s:g} s in every {trigger.every_s:g} s"
     return TRIGGERS[trigger.mode]

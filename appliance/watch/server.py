@@ -1,10 +1,9 @@
-"""Serves a page and the events that it shows, with tornado. In: events of the program. Out: both,
-to browsers; orders of its page, where the program takes any.
+"""Serves a page and its events to browsers, with tornado, and takes orders of the page.
 
 The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET
-of the paths it was given; of a request nothing beyond the head is read. A browser that connects
-gets the events that are kept, then the new ones (server-sent events); one that comes back gets what
-it has missed. What a program takes orders for, it alone decides: without any there is no way in
+of the paths it was given, and reads only the head of a request. A new browser gets the kept events,
+then the new events (server-sent events); a browser that comes back gets the events it has missed.
+The program alone decides about orders: a page without orders is read-only
 (docs/decisions/0016-labels-from-the-page.md).
 """
 
@@ -45,8 +44,8 @@ KINDS = {
     ".js": "text/javascript; charset=utf-8",
 }
 HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -54,51 +53,52 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Server": "palpate",
 }
-"""What every answer says a browser may do, errors too."""
+"""Permissions of the page in a browser, in every answer, errors included."""
 HEAD_S = 5.0
-"""Limit for a request's head, with the handshake of TLS before it, and for a connection without a
+"""Time limit for a request's head, including the handshake of TLS, and for a connection without a
 request."""
 TAKEN_S = 30
-"""Limit for taking what was sent: who reads nothing for so long is gone."""
+"""Time after which a browser that reads nothing is disconnected."""
 MOST_HEAD = 8192
-"""Most bytes of a request that are read."""
+"""Most bytes of a request."""
 MOST_OPEN, MOST_OF_ONE = 64, 24
-"""Most connections at a time, and of one address; a further one is closed at once. A browser opens
-up to six."""
+"""Most connections at a time, and most of an address; further connections are closed at once. A
+browser opens up to six."""
 MOST_WAITING = 100
-"""Events that wait for one browser. Who is further behind is cut off, and gets what is kept when it
-comes back."""
+"""Most events that wait for a browser. A browser that is further behind is disconnected, and gets
+the kept events when it comes back."""
 MOST_ORDER = 1024
-"""Bytes of an order."""
+"""Most bytes of an order."""
 DONE_S = 3.0
-"""Longest wait until the program has carried an order out."""
+"""Longest wait for the answer to an order."""
 WRONG_S = 1.0
-"""A wrong token is answered after this time."""
+"""Delay of the answer to a wrong token."""
 COOKIE = "__Host-palpate"
 KEY = "X-Palpate-Key"
-"""Header of an order: the key that the page got with its events, which no other site can read."""
+"""Header with the key of an order. The page gets the key with its events; another site cannot read
+it."""
 DAY = 86_400
 
 Answer = Callable[[str], object | None]
-"""Content for JSON, by the last part of a path; None where there is none."""
+"""The content for JSON by the last part of a path; None for an unknown path."""
 Orders = Callable[[bytes], Future[Any]]
-"""Takes what a page has sent, without waiting; gives what becomes of it, for JSON, or an
-ApplianceError where it is refused."""
+"""Takes an order without waiting. Its future gives the answer for JSON, or an ApplianceError if the
+order is refused."""
 
 
 class State(Protocol):
-    """What a page shows that shows one thing."""
+    """The content of a page with a single view."""
 
     def json(self) -> dict[str, Any]:
-        """It as the page reads it."""
+        """The content as JSON."""
         ...
 
 
 class EventLog:
-    """The events of one program. Each has a number; of each name the newest `kept[name]` stay, one
-    where it has none.
+    """The events of a program, with numbers.
 
-    run: tells the browsers of one server from those of the next, whose numbers begin anew.
+    Of each name the newest `kept[name]` events are kept, or the newest event if `kept` lacks the
+    name. run: distinguishes this server from the next, which counts anew.
     """
 
     def __init__(self, kept: Mapping[str, int]) -> None:
@@ -108,7 +108,7 @@ class EventLog:
         self._events: dict[str, deque[tuple[int, bytes]]] = {}
 
     def add(self, name: str, content: object) -> bytes:
-        """The event as it goes to browsers."""
+        """Add an event and return its text for browsers."""
         self._number += 1
         data = json.dumps(content, allow_nan=False, separators=(",", ":"))
         event = f"id: {self.run}-{self._number}\nevent: {name}\ndata: {data}\n\n".encode()
@@ -118,8 +118,7 @@ class EventLog:
         return event
 
     def since(self, last: str) -> list[bytes]:
-        """What a browser has to get that has got everything up to the event `last` ("": nothing),
-        in order."""
+        """The events after the event `last` ("": all), in order."""
         run, _, number = last.partition("-")
         after = int(number) if run == self.run and number.isdecimal() and len(number) < 20 else 0
         first = [] if after else [f"event: begin\ndata: {json.dumps(self.run)}\n\n".encode()]
@@ -127,12 +126,11 @@ class EventLog:
 
 
 class PageServer:
-    """Serves the page `name` of FOLDER and the other files there, at `access`. kept: as for
-    EventLog.
+    """Serves the page `name` of FOLDER and the other files there, at `access`.
 
-    now_ns: the clock by which events are stamped. answers: what is computed on request, by the
-    first part of its path. orders: takes what the page POSTs to /order; None: the page is
-    read-only. Raises ConfigError where the address cannot be used.
+    kept: as for EventLog. now_ns: the clock of the events' time stamps. answers: functions for
+    content on request, by the first part of its path. orders: takes the page's POSTs to /order;
+    None for a page that is read-only. Raises ConfigError if the address cannot be used.
     """
 
     def __init__(
@@ -186,12 +184,12 @@ class PageServer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is there."""
+        """Whether a browser is connected."""
         return bool(self.queues)
 
     def publish(self, name: str, content: object) -> None:
-        """Send an event to all browsers, and keep it. Never waits. Raises ValueError for a number
-        that JSON lacks."""
+        """Send an event to all browsers, and keep it. It never waits. Raises ValueError for a
+        number that JSON lacks."""
         json.dumps(
             content, allow_nan=False
         )  # an error belongs to the caller, not into the server's thread
@@ -205,7 +203,7 @@ class PageServer:
         event = self.events.add(name, content)
         for queue in [*self.queues]:
             if queue.full():
-                self.queues.remove(queue)  # its handler ends at the next event it takes
+                self.queues.remove(queue)  # its handler ends at its next event
             else:
                 queue.put_nowait(event)
 
@@ -241,24 +239,23 @@ class PageServer:
 
 
 def _checked(port: int) -> int:
-    """Raises ValueError for a number that is no port, which the resolver would take modulo
-    65536."""
+    """The port. Raises ValueError for other numbers, which the resolver would take modulo 65536."""
     if not 0 <= port <= 65535:
         raise ValueError("ports are numbers from 0 to 65535")
     return port
 
 
 class LimitedServer(HTTPServer):
-    """tornado's server with a limit of connections, and of the time for taking an answer."""
+    """tornado's server with limits for connections and for the time without reading."""
 
     def initialize(self, *args: Any, **options: Any) -> None:
-        """As HTTPServer's."""
+        """As HTTPServer.initialize."""
         super().initialize(*args, **options)
         self._open: dict[Any, str] = {}  # stream -> address
-        self._since: Counter[Any] = Counter()  # stream -> seconds for which it has taken nothing
+        self._since: Counter[Any] = Counter()  # stream -> seconds without reading
 
     def handle_stream(self, stream: Any, address: Any) -> None:
-        """Take up a connection where there is room."""
+        """Accept a connection if there is room."""
         self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
         if (
             len(self._open) >= MOST_OPEN
@@ -270,7 +267,7 @@ class LimitedServer(HTTPServer):
         super().handle_stream(stream, address)
 
     def drop_those_who_take_nothing(self) -> None:
-        """Close connections whose other side has taken nothing for TAKEN_S; called once a
+        """Close connections whose other side has read nothing for TAKEN_S. It is called once a
         second."""
         self._since = Counter({one: self._since[one] + 1 for one in self._open if one.writing()})
         for stream, seconds in self._since.items():
@@ -279,21 +276,21 @@ class LimitedServer(HTTPServer):
 
 
 class _Handler(RequestHandler):
-    """What all requests have in common: who may ask, and what an answer says."""
+    """Common part of all requests: permissions and headers."""
 
     SUPPORTED_METHODS = ("GET",)
 
     def initialize(self, page: PageServer) -> None:
-        """page: whose request it is."""
+        """page: the page that gets the request."""
         self.page = page
 
     def set_default_headers(self) -> None:
-        """What every answer has."""
+        """Set the headers of all answers."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
     async def prepare(self) -> None:
-        """Refuse a request that is meant for another site, and one without the token."""
+        """Refuse a request for another site, and a request without the token."""
         access, request = self.page.access, self.request
         stream = request.connection.stream if request.connection else None  # type: ignore[attr-defined]
         own = stream.socket.getsockname()[0] if stream and stream.socket else ""
@@ -313,16 +310,16 @@ class _Handler(RequestHandler):
         raise HTTPError(401)
 
     def write_error(self, status_code: int, **_: Any) -> None:
-        """A line for a person."""
+        """Answer with a line of text."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code} {self._reason}\n")
 
 
 class FileHandler(_Handler):
-    """The page and its files; without the token, the page that asks for it."""
+    """The page and its files. A browser without the token gets a page that asks for it."""
 
     def get(self) -> None:
-        """Answer with a file; any other path is not found."""
+        """Answer with a file, or with 404."""
         if self.request.path == "/enter" and self.page.access.token:  # the token was right
             self.set_cookie(
                 COOKIE,
@@ -340,8 +337,7 @@ class FileHandler(_Handler):
         self._send(self.request.path)
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Who asks for the page without a token gets to enter it; the style and script of this are
-        no secret."""
+        """Let a browser without a token enter it. Style and script of this page are not secret."""
         path = "/enter.html" if self.request.path == "/" else self.request.path
         if status_code == 401 and path in ("/enter.html", "/enter.js", "/page.css"):
             self.set_status(401 if path == "/enter.html" else 200)
@@ -357,10 +353,10 @@ class FileHandler(_Handler):
 
 
 class AnswerHandler(_Handler):
-    """What is computed on request."""
+    """Content that is computed on request."""
 
     def get(self, name: str, which: str) -> None:
-        """Answer with JSON; what there is not is not found."""
+        """Answer with JSON, or with 404."""
         answer = self.page.answers.get(name)
         content = answer(which) if answer else None
         if content is None:
@@ -370,13 +366,12 @@ class AnswerHandler(_Handler):
 
 
 class OrderHandler(_Handler):
-    """What the page wants done."""
+    """Orders of the page."""
 
     SUPPORTED_METHODS = ("POST",)
 
     async def prepare(self) -> None:
-        """Refuse what the page itself did not send: another site has not its origin, and cannot
-        read its key."""
+        """Refuse orders of other sites: they have another origin, and cannot read the key."""
         await super().prepare()
         headers, own = (
             self.request.headers,
@@ -390,7 +385,8 @@ class OrderHandler(_Handler):
             raise HTTPError(415)
 
     async def post(self) -> None:
-        """Answer with what has become of it, as JSON; else with the reason as a line."""
+        """Answer with the result of the order as JSON, or with the reason for a refusal as a
+        line."""
         task = asyncio.current_task()
         assert task
         self.page.answering.add(task)
@@ -407,8 +403,8 @@ class OrderHandler(_Handler):
             self.finish(str(e))
 
     async def _done(self) -> Any:
-        """What has become of the order. Raises ApplianceError where it is refused; NoAnswer where
-        nobody takes it up."""
+        """The result of an order. Raises ApplianceError if it is refused; NoAnswer if it is not
+        carried out in time."""
         assert self.page.orders
         order = self.page.orders(self.request.body)
         try:
@@ -423,10 +419,10 @@ class OrderHandler(_Handler):
 
 
 class EventsHandler(_Handler):
-    """The stream of events to one browser."""
+    """The stream of events to a browser."""
 
     async def get(self) -> None:
-        """Send what it has missed, then each new event, until one of both ends it."""
+        """Send the missed events, then each new event, until browser or page ends."""
         page, queue = self.page, asyncio.Queue[bytes](MOST_WAITING)
         self.set_header("Content-Type", "text/event-stream")
         now = f"event: now\ndata: {page.now_ns()}\n\n".encode()
@@ -445,7 +441,7 @@ class EventsHandler(_Handler):
             page.queues.discard(queue)
 
     def on_connection_close(self) -> None:
-        """The browser has gone: wake the handler up, so that it ends."""
+        """Wake the handler up, so that it ends."""
         if (queue := getattr(self, "_queue", None)) in self.page.queues:
             self.page.queues.discard(queue)
             if queue.empty():

@@ -1,5 +1,5 @@
-"""The picture of one sweep for the page. In: a `sweep` line of the feed. Out: lines of the taxels
-and a spectrogram, as numbers for JSON."""
+"""The picture of a sweep for the page: a `sweep` line of the feed becomes lines of the taxels and a
+spectrogram, as numbers for JSON."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from appliance.core.types import DATA_TYPES, normal
 from appliance.signal import features
 
 MOST_TAXELS = 16
-"""Of a larger skin the most loaded taxels are drawn."""
+"""Most taxels in a picture; of a larger skin, the most loaded taxels are drawn."""
 FINEST = 300
-"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no
-peak is lost."""
+"""Steps in time of a taxel's line. Lowest and highest count of each step are drawn, so that no peak
+is lost."""
 MOST_BYTES = 1 << 20
-"""Of a window."""
+"""Fields of a window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """One sweep's window. taxels: raw counts [T, R, C] or [T, R, C, A]."""
+    """The window of a sweep. taxels: raw counts [T, R, C] or [T, R, C, A]."""
 
     sweep: int
     rate_hz: float
@@ -34,8 +34,8 @@ class Window:
 
 
 def window(line: Mapping[str, Any], rate_hz: float) -> Window:
-    """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for one that is not as
-    it must be."""
+    """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for a malformed
+    line."""
     dtype, shape, data = (
         line["dtype"],
         tuple(map(int, line["shape"])),
@@ -53,9 +53,12 @@ def window(line: Mapping[str, Any], rate_hz: float) -> Window:
 
 
 def picture(one: Window) -> dict[str, Any]:
-    """What the page draws. taxels: name, least and highest count of each step in time, of the axis
-    along the normal. spectrogram: share of each band [steps][bands] (features.h_features), of
-    `band_hz` and `step_s`; `trouble` says why there is none."""
+    """The content of the picture.
+
+    taxels: name, lowest and highest count of each step in time, of the normal axis. spectrogram:
+    share of each band [steps][bands] (features.h_features), with `band_hz` and `step_s`; or
+    `trouble`, the reason why there is none.
+    """
     counts = normal(one.taxels, 1).astype(np.float64)
     counts = np.where(np.isfinite(counts), counts, 0)
     frames, rows, cols = counts.shape

@@ -1,6 +1,5 @@
-"""Pictures of a sweep for a terminal, for `palpate record` and `palpate watch`. In: raw counts of
-its window. Out: lines: the signal over time, and where the rate allows it the spectrogram.
-"""
+"""Pictures of a sweep for a terminal, for `palpate record` and `palpate watch`: the signal over
+time and, if the rate allows it, the spectrogram."""
 
 from __future__ import annotations
 
@@ -20,16 +19,16 @@ from appliance.core.types import Sweep, Verdict, normal
 from appliance.signal import features
 
 NAME, COLUMNS = 8, 40
-"""Characters of the names at the left, and at most of the time."""
+"""Characters of the names at the left, and most characters of the time axis."""
 HIGH, BANDS = 3, 6
-"""Lines of the signal, and at most of the spectrogram."""
+"""Lines of the signal, and most lines of the spectrogram."""
 
 
 def picture(
     taxels: NDArray[Any], rate_hz: float, width: int, *, colours: bool, signs: str = BLOCKS
 ) -> list[str]:
-    """Lines of at most `width` characters. taxels: raw counts [T, R, C] or [T, R, C, A]; rate_hz:
-    frames per second."""
+    """The picture in lines of at most `width` characters. taxels: raw counts [T, R, C] or [T, R, C,
+    A]. rate_hz: frames per second."""
     mean = np.nan_to_num(normal(taxels, 1).astype(np.float64)).reshape(len(taxels), -1).mean(axis=1)
     bands, why = _bands(taxels, rate_hz)
     columns = max(1, min(width - NAME - 2, COLUMNS, bands.shape[1] or len(mean)))
@@ -48,12 +47,12 @@ def picture(
 
 
 def _pooled(values: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
-    """Means of so many parts."""
+    """Means of `parts` parts."""
     return np.array([part.mean() for part in np.array_split(values, columns)])
 
 
 def _bars(values: NDArray[np.float64], signs: str) -> list[str]:
-    """HIGH lines of bars: of two halves each, where there is a sign for half a character."""
+    """HIGH lines of bars, with half characters if the terminal has them."""
     full, half = (signs[4], "▄") if signs != ASCII else ("#", "_")
     level = values - values.min()
     halves = np.rint(level / max(float(level.max()), 1e-12) * 2 * HIGH).astype(int)
@@ -65,8 +64,8 @@ def _bars(values: NDArray[np.float64], signs: str) -> list[str]:
 
 
 def _bands(taxels: NDArray[Any], rate_hz: float) -> tuple[NDArray[np.float64], str]:
-    """Shares of power (features.h_features) of at most BANDS bands [bands, short windows]; or why
-    there are none."""
+    """Shares of power (features.h_features) of at most BANDS bands [bands, short windows], or the
+    reason why there are none."""
     try:
         shape = features.h_shape(len(taxels), rate_hz)
         shares = features.h_features(np.nan_to_num(taxels), rate_hz, "hann").reshape(shape).T
@@ -78,7 +77,7 @@ def _bands(taxels: NDArray[Any], rate_hz: float) -> tuple[NDArray[np.float64], s
 
 
 def _shades(bands: NDArray[np.float64], top_hz: float, colours: bool, signs: str) -> list[str]:
-    """One line a band, the highest first; a field is one character wide."""
+    """A line for each band, the highest band first; a field is a character wide."""
     rows = bands[::-1].tolist()
     names = [f"{top_hz:.0f} Hz", *[""] * (len(rows) - 2), "0 Hz"][: len(rows)]
     lines = next(side_by_side([rows], max(float(bands.max()), 1e-12), len(rows[0]) + 4, signs))
@@ -107,10 +106,11 @@ def counts_table(counts: Sequence[Sequence[Any]], width: int) -> list[str]:
 
 
 class SweepPrinter(Observer):
-    """Prints each recorded sweep on a terminal: its picture, then what there is per material and
-    position. A terminal that takes nothing now misses it.
+    """Prints each recorded sweep on a terminal: its picture, then the counts per material and
+    position.
 
-    rate_hz: of the sweeps. about: see RecordingSession.about.
+    A terminal that does not accept output misses the sweep. rate_hz: of the sweeps. about: see
+    RecordingSession.about.
     """
 
     def __init__(self, out: TextIO, rate_hz: float, about: Callable[[], Mapping[str, Any]]) -> None:
@@ -118,7 +118,6 @@ class SweepPrinter(Observer):
         self._colours, self._signs = abilities(out)
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Print it."""
         if not select.select([], [self._out], [], 0)[1]:
             return
         width = os.get_terminal_size(self._out.fileno()).columns or 80

@@ -1,6 +1,7 @@
-"""Shows the running box in a terminal, for `palpate watch`. In: lines of its feed. Out: a picture
-that is drawn again and again; where the output is no terminal, a line for each event; or the feed's
-lines as they are.
+"""`palpate watch`: the running box in a terminal.
+
+A terminal gets a picture that is drawn again and again, another output a line for each event, or
+the feed's lines unchanged.
 """
 
 from __future__ import annotations
@@ -30,16 +31,17 @@ FRAMES_HZ = 10.0
 DRAW_NS = 100_000_000
 """Time between two pictures."""
 READ_S = 0.5
-"""Longest wait for a line; the ages of the verdicts go on then."""
+"""Longest wait for a line of the feed, so that the ages of the verdicts go on."""
 LATENCIES = 100
-"""Latest answers whose latency is summed up."""
+"""Latest answers in the summary of the latency."""
 LABELS, BAR, NAME = 8, 12, 16
-"""Labels whose probabilities are shown; characters of a bar, and of a label."""
+"""Most labels with a probability; characters of a bar, and of a label."""
 _SEQUENCE = re.compile("\033\\[[0-9;]*m")
 
 
 class WatchedBox:
-    """What the feed has said so far. trouble: why there is no feed, "" where there is."""
+    """State of the box, from the lines of the feed. trouble: why the feed is missing, "" with a
+    feed."""
 
     def __init__(self) -> None:
         self.trouble = ""
@@ -50,14 +52,14 @@ class WatchedBox:
         self.full = 1.0
         self.missed = 0
         self.window: Any = None
-        """Raw counts of the last sweep, None before there is one."""
+        """Raw counts of the last sweep, None before the first sweep."""
         self.rate_hz = 1.0
         self._latencies_ms: deque[float] = deque(maxlen=LATENCIES)
         self._lowest: Any = None
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take one line; one of an unknown type is for a later version. Raises FormatError for one
-        that is not as PROTOCOL.md has it."""
+        """Take a line of the feed. Lines of an unknown type are ignored: a later version may send
+        them. Raises FormatError for a line that PROTOCOL.md does not allow."""
         take = _TAKERS.get(line["type"])
         if not take:
             return
@@ -105,7 +107,7 @@ class WatchedBox:
         health = {name: value for name, value in line.items() if name != "type"}
         status.lines(
             {**health, "running": True, "verdicts": []}, 0
-        )  # what cannot be shown is noticed here
+        )  # raises for a line that cannot be shown
         self.health = health
 
     def _take_state(self, line: Mapping[str, Any]) -> None:
@@ -139,7 +141,7 @@ class WatchedBox:
         window = data.reshape(line["shape"])
         sweep_text.picture(
             window, self.rate_hz, 80, colours=False
-        )  # what cannot be shown is noticed here
+        )  # raises for a line that cannot be shown
         self.window = window
 
     def _take_lost(self, line: Mapping[str, Any]) -> None:
@@ -172,8 +174,8 @@ class WatchScreen(LiveScreen[WatchedBox]):
 def picture(
     state: WatchedBox, now_ns: int, width: int, height: int, *, colours: bool, signs: str = BLOCKS
 ) -> list[str]:
-    """The box as at most `height` lines of at most `width` characters. now_ns: of the clock that
-    the box has."""
+    """The box in at most `height` lines of at most `width` characters. now_ns: by the clock of the
+    box."""
     says = wrap(_plain(state.headline), max(10, width - 2))
     head = [
         f" palpate watch   {_what(state)}"[:width],
@@ -199,12 +201,12 @@ def picture(
     ]  # of a large skin the first rows, and below it skin and last answer
     room = height - len(head) - len(body) - 2 * bool(body) - 1
     most = room - min(len(verdicts), 3)
-    few = facts[:most] if most > 1 else facts[1:2]  # the skin, where there is room for one
+    few = facts[:most] if most > 1 else facts[1:2]  # the skin, if there is room
     return [*head, *body, *[""] * bool(body), *few, *verdicts[: room - len(few)], " Ctrl-C ends"]
 
 
 def _what(state: WatchedBox) -> str:
-    """Which box this is."""
+    """The box's skin, bundle and source."""
     if not state.hello:
         return ""
     simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
@@ -215,8 +217,8 @@ def _what(state: WatchedBox) -> str:
 
 
 def _beside(state: WatchedBox, width: int, signs: str) -> list[str]:
-    """What stands beside the skin: probabilities; while sweeps are recorded, the picture of the
-    last one."""
+    """The lines beside the skin: probabilities, or the picture of the last sweep while sweeps are
+    recorded."""
     if state.hello.get("labels") and width >= NAME + BAR + 10:
         return list(probabilities(state, signs))
     if state.window is None or width < NAME + BAR:
@@ -242,8 +244,7 @@ def probabilities(state: WatchedBox, signs: str) -> Iterator[str]:
 
 
 def events(state: WatchedBox, line: Mapping[str, Any], now_ns: int) -> Iterable[str]:
-    """What is printed for a line of the feed where there is no terminal: connections, verdicts,
-    changes of the state."""
+    """The lines for an output without a terminal: connections, verdicts, changes of the state."""
     if line["type"] == "hello":
         return [f"box {line['pid']}: {_what(state)}"]
     if line["type"] == "verdict":
@@ -256,13 +257,12 @@ def events(state: WatchedBox, line: Mapping[str, Any], now_ns: int) -> Iterable[
 
 
 def _plain(text: str) -> str:
-    """Text of a device or a file without what steers a terminal."""
+    """Text of a device or a file without control characters of a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 class TerminalWatch:
-    """`palpate watch` in a terminal: reads the feed at `path` until it is told to stop, also over
-    restarts of the box."""
+    """`palpate watch` in a terminal: reads the feed at `path`, also after restarts of the box."""
 
     def __init__(self, path: str, out: TextIO, clock: Clock) -> None:
         self._screen = WatchScreen(out, clock)
@@ -278,7 +278,7 @@ class TerminalWatch:
                 self.step()
 
     def step(self) -> None:
-        """Take the next line, and show what is new."""
+        """Take the next line, and show the changes."""
         line = self._feed.read(READ_S)
         if line:
             try:
@@ -309,8 +309,8 @@ class TerminalWatch:
 def pass_on(
     path: str, out: TextIO, clock: Clock, stopped: Callable[[], bool], report: Callable[[str], None]
 ) -> None:
-    """Write the feed's lines as they are, with frames at FRAMES_HZ, until `stopped()`. report: gets
-    why there is none."""
+    """Write the feed's lines unchanged, with frames at FRAMES_HZ, until `stopped()`. report: gets
+    the trouble of a missing feed."""
     with Feed(path, frames_hz=FRAMES_HZ, clock=clock) as feed:
         while not stopped():
             if line := feed.read(READ_S):

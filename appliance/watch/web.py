@@ -1,7 +1,5 @@
-"""`palpate watch --web`: reads the feed for as long as it is wanted, and keeps the page up to date.
-
-A box that is not there, dies or restarts is shown as away until its feed is there again.
-"""
+"""`palpate watch --web`: reads the feed, and keeps the page up to date. The page shows a missing
+box as away until its feed is back."""
 
 from __future__ import annotations
 
@@ -15,16 +13,15 @@ from appliance.watch.board import KEPT, PageBoard
 from appliance.watch.server import PageServer
 
 FRAMES_HZ = 20.0
-"""Frames that are asked for while somebody watches: alignment averages the last third of a
-second."""
+"""Frames per second while a browser is connected: alignment averages the last third of a second."""
 READ_S = 0.5
-"""Longest wait for a line: a box that is away is shown as often, which tells browsers that this
-program is there."""
+"""Longest wait for a line of the feed. The page is updated as often while the box is away, so that
+browsers see that this program runs."""
 
 
 class PageWatcher:
-    """The page of `palpate watch --web` at `access`, and what it shows: the feed at `path`. now_ns:
-    the clock by which the box stamps. Raises ConfigError where the address cannot be used."""
+    """The page of `palpate watch --web` at `access`, for the feed at `path`. now_ns: the clock of
+    the box's time stamps. Raises ConfigError if the address cannot be used."""
 
     def __init__(self, path: str, access: Access, now_ns: Callable[[], int]) -> None:
         self.feed = Feed(path, sweeps=True)
@@ -38,7 +35,6 @@ class PageWatcher:
         )
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Watch until `stopped()`."""
         with self.server, self.feed:
             while not stopped():
                 self.step()

@@ -78,7 +78,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
     )
     with pytest.raises(
         BundleError,
-        match=r"is for a skin of 5x3 uint8 at 100 Hz.*the one that streams has 4x4 uint8",
+        match=r"is for a skin of 5x3 uint8 at 100 Hz.*the skin that streams has 4x4 uint8",
     ):
         bundle_commands.suits(other, format)
     bundle_commands.suits(other, None)

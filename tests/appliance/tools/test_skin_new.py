@@ -166,7 +166,7 @@ def test_emulated_skins_are_described_and_read_again(
     path = tmp_path / "mine.toml"
     assert out.splitlines()[-1].endswith(f"use it with --skin {path}")
     assert skins.profile(config.load(None, [f"skin.profile={path}"])) == written
-    frames = int(re.search(r"mine.toml: (\d+) frames", out)[1])
+    frames = int(re.search(r"mine.toml: decodes (\d+) frames", out)[1])
     assert frames > 0.5 * 2 * Numbered(name).rate_hz
     assert "already" in err
     assert "--replace" in err
