@@ -57,8 +57,8 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default \
 	  --version 3
 
-bench: $(DESKTOP) ## measure this machine: docs/bench.json, and the tables of README and manual
-	$(BIN)/palpate bench --json docs/bench.json
+bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
+	$(BIN)/palpate bench --json docs/data/bench.json
 	$(BIN)/python -m train.studies figures
 
 site: $(SITE) ## build the documents and the pages of results as a site: build/site/index.html

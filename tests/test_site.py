@@ -3,7 +3,6 @@ code, and the workflow publishes what `make site` builds."""
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import re
 import sys
@@ -65,6 +64,8 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
     """By their titles; links to Markdown lead to the pages made of it, linked files come along."""
 
     def write(command: list[str], **_: object) -> None:
+        if "train.studies" not in command:
+            return
         page = command[-1] / "soak" / "index.html"
         page.parent.mkdir(parents=True)
         page.write_text(
@@ -74,8 +75,6 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
         page.with_name("soak.svg").write_text("<svg/>")
 
     monkeypatch.setattr(build.subprocess, "run", write)
-    studies = dataclasses.replace(build.STUDIES, groups={"pages": {"pages": "write them"}})
-    monkeypatch.setattr(build, "STUDIES", studies)
     sources, site = tmp_path / "src", tmp_path / "site"
     build.results(sources)
     listed = (sources / build.RESULTS).read_text()

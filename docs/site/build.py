@@ -21,12 +21,11 @@ import manual
 from manual import BOX_PAGES, ROOT
 
 from train.cli.main import PROGRAM
-from train.studies.command import PROGRAM as STUDIES
 
 HERE = Path(__file__).resolve().parent
 
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
-RESULTS = "results.md"
+RESULTS, SOAK = "results.md", "docs/data/soak.json"
 TITLE = re.compile(r"<title>([^<]*)</title>")
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
 CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
@@ -46,7 +45,7 @@ CHAPTERS = {
         "docs/skins",
         "docs/faults",
     ],
-    "Results": ["results", "docs/*/README"],
+    "Results": ["results", "docs/data/README", "docs/*/README"],
     "Project": [
         "CHANGELOG",
         "CONTRIBUTING",
@@ -91,21 +90,22 @@ def gather(out: Path) -> list[str]:
         target.parent.mkdir(parents=True, exist_ok=True)
         text = linked(Path(name), text, out, lost)
         target.write_text(text + contents(listed) * (name == "README.md"), "utf-8")
-    for page in ROOT.glob("docs/**/*.html"):
-        shutil.copyfile(page, out / page.relative_to(ROOT))
     return lost
 
 
 def results(out: Path) -> None:
-    """Have the studies write their pages into `out`/results, and list them on a page."""
-    if "pages" not in STUDIES.descriptions():
-        return
-    command = [sys.executable, "-m", "train.studies", "pages", "--out"]
-    subprocess.run([*command, (out / "results").absolute()], check=True, cwd=ROOT)
-    written = sorted((out / "results").rglob("*.html"))
+    """Draw the pages of results into `out`/results, and list them on a page."""
+    pages = (out / "results").absolute()
+    for words in (
+        ["train.studies", "pages", "--out", pages],
+        ["tests.rig.soak", "--draw", "--work", pages, "--out", SOAK, "--page", pages / "soak"],
+    ):
+        command = [sys.executable, "-m", *words]
+        subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+    written = sorted(pages.glob("*/*.html"))
     titles = {page: TITLE.search(page.read_text("utf-8")) for page in written}
     links = (
-        f'- <a href="{page.relative_to(out)}">{title[1] if title else page.stem}</a>'
+        f'- <a href="results/{page.relative_to(pages)}">{title[1] if title else page.stem}</a>'
         for page, title in titles.items()
     )
     text = ["# Result pages", "", "The studies make these pages from their results.", "", *links]

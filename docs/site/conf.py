@@ -9,7 +9,6 @@ root_doc = "index"
 source_suffix = {".md": "markdown"}
 myst_heading_anchors = 4
 suppress_warnings = ["misc.highlighting_failure"]  # URScript, KRL and RAPID have no lexer
-exclude_patterns = ["results/**"]
 smartquotes = False  # quotes belong to settings and commands
 html_theme = "furo"
 html_title = "Palpate"

@@ -154,8 +154,8 @@ CAMPAIGNS = {
         variables={"PALPATE_MACHINES": "1"},
     ),
     "soak": Campaign(
-        "sweep without pause on the virtual box and on this machine: docs/soak",
-        _module("tests.rig.soak", "--out", "docs/soak"),
+        "sweep without pause on the virtual box and on this machine: docs/data/soak.json",
+        _module("tests.rig.soak", "--out", "docs/data/soak.json"),
         prepare=rig_image,
     ),
     "attacked": Campaign(

@@ -1,5 +1,5 @@
 """What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out
-docs/feed.json`. In: minutes for each kind of readers. Out: JSON and a table: share of a core,
+docs/data/feed.json`. In: minutes for each kind of readers. Out: JSON and a table: share of a core,
 memory, latency and losses, with and without them; exit code 1 if a target was missed.
 
 One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had

@@ -1,6 +1,6 @@
 """All that can be attached, at once and for long: `python -m tests.campaigns.full_load --minutes 60
 --page docs/faults.md`. In: minutes, and how often each fault is made after them. Out:
-docs/full-load.json, tables; exit code 1 if a target was missed.
+docs/data/full-load.json, tables; exit code 1 if a target was missed.
 
 Of each skin there are two boxes side by side (`palpate run`, emulator and box processes of their
 own in real time): one with recording, black box, shadow, feed with eight readers, page and both
@@ -378,7 +378,7 @@ def main() -> int:
         default=ROOT / "build" / "disks",
         help="where the boxes' disks lie as files",
     )
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "full-load.json")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "data" / "full-load.json")
     parser.add_argument(
         "--page", type=Path, help="also put the tables there, between the markers named after --out"
     )

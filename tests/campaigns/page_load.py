@@ -1,5 +1,5 @@
 """What the page costs: `python -m tests.campaigns.page_load --seconds 60 --out
-docs/watch/load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory and
+docs/data/page-load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory and
 share of a core of `palpate watch --web`, with none, one and eight browsers.
 
 One box (`palpate run --sim skin`, in real time) and one page; the numbers of browsers take turns. A

@@ -447,12 +447,12 @@ def test_drawing_names_what_does_not_belong_together(tmp_path, monkeypatch, caps
     for folder in ("a", "b"):
         soak.soak(FakeBox(), 7, 0.01, tmp_path / folder, log=lambda line: None)
     works = ["--work", f"{tmp_path}/a", "--beside", f"{tmp_path}/b"]
-    monkeypatch.setattr("sys.argv", ["soak", "--draw", *works, "--out", f"{tmp_path}/page"])
+    monkeypatch.setattr("sys.argv", ["soak", "--draw", *works, "--out", f"{tmp_path}/soak.json"])
     monkeypatch.setattr(soak, "BOXES", {FakeBox.name: FakeBox})
     with pytest.raises(SystemExit, match="2"):
         soak.main()
     assert "two runs have the seed 7" in capsys.readouterr().err
-    assert not (tmp_path / "page").exists()
+    assert not (tmp_path / "soak.json").exists()
 
 
 def test_edges_and_frames_are_reckoned_from_the_first_sentences():
@@ -710,24 +710,23 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
         "runs": [soak.asdict(clean)],
     }
     soak.write(tmp_path / "this-machine.json", record)
-    assert soak.draw([tmp_path], tmp_path / "page")
+    results = tmp_path / "soak.json"
+    assert soak.draw([tmp_path], results, tmp_path / "page")
     first = (tmp_path / "page" / "index.html").read_text()
     (tmp_path / "page" / "index.html").unlink()
-    assert soak.draw([tmp_path / "no records"], tmp_path / "page")
+    assert soak.draw([tmp_path / "no records"], results, tmp_path / "page")
     assert (tmp_path / "page" / "index.html").read_text() == first
     soak.write(tmp_path / "other" / "virtual-box.json", record | {"box": "virtual box"})
     assert soak.draw(
-        [tmp_path / "other"], tmp_path / "page"
+        [tmp_path / "other"], results, tmp_path / "page"
     )  # the box that was not recorded again stays
-    kept = json.loads((tmp_path / "page" / "results.json").read_text())
+    kept = json.loads(results.read_text())
     assert list(kept["boxes"]) == ["this machine", "virtual box"]
     record["runs"][0]["due"] += 1
     soak.write(tmp_path / "this-machine.json", record)
-    assert not soak.draw([tmp_path], tmp_path / "page")
+    assert not soak.draw([tmp_path], results, tmp_path / "page")
     assert "FAIL this machine  sweeps without an answer: 1" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "page").iterdir()} == {
         "index.html",
-        "README.md",
         "soak.svg",
-        "results.json",
     }

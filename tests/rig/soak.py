@@ -292,11 +292,11 @@ def _moved(run: SoakRun, began_s: float) -> SoakRun:
     return replace(run, began_s=began_s, **rows)
 
 
-def draw(works: Sequence[Path], out: Path) -> bool:
-    """Put the records together, judge and draw them; False where a target was not reached.
+def draw(works: Sequence[Path], out: Path, page: Path) -> bool:
+    """Join the records, check them against the targets, and write results and page; False if a
+    target was not reached.
 
-    A box of which several folders hold a record has them joined; one of which none does keeps that
-    of the page in `out`, which is judged and drawn again.
+    out: the file of results. A box without a record in `works` keeps its record in `out`.
     """
     records = _drawn(out)
     for name in BOXES:
@@ -314,9 +314,9 @@ def draw(works: Sequence[Path], out: Path) -> bool:
         },
         "boxes": boxes,
     }
-    page, svg = soak_page.render(results)
-    write(out / "results.json", results)
-    html.publish(out, {"index": page}, {"soak": svg}, provenance.of(results))
+    write(out, results)
+    rendered, svg = soak_page.render(results)
+    html.publish(page, {"index": rendered}, {"soak": svg}, provenance.of(results))
     reached = True
     for name, box in results["boxes"].items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):
@@ -333,9 +333,8 @@ def _record(work: Path, name: str) -> Path:
 
 
 def _drawn(out: Path) -> list[dict[str, Any]]:
-    """The records of the page in `out`; none where there is no page."""
-    path = out / "results.json"
-    return list(json.loads(path.read_text())["boxes"].values()) if path.exists() else []
+    """The records in a file of results; none if there is no file."""
+    return list(json.loads(out.read_text())["boxes"].values()) if out.exists() else []
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -350,7 +349,10 @@ def _parser() -> argparse.ArgumentParser:
         "--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept"
     )
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes"
+        "--out", type=Path, default=ROOT / "build" / "soak" / "soak.json", help="file of results"
+    )
+    parser.add_argument(
+        "--page", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes"
     )
     parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
     parser.add_argument(
@@ -362,7 +364,9 @@ def _parser() -> argparse.ArgumentParser:
         help="where a soak with another --seed is kept, whose runs are joined when the page is drawn",
     )
     parser.add_argument(
-        "--draw", action="store_true", help="only draw what is there, or the page of --out again"
+        "--draw",
+        action="store_true",
+        help="only draw the records that are there, and those in --out",
     )
     return parser
 
@@ -388,7 +392,7 @@ def main() -> int:
     arguments += ["--work", str(args.work.resolve())]
     recorded = args.draw or _together(arguments)
     try:
-        reached = draw([args.work, *args.beside], args.out)
+        reached = draw([args.work, *args.beside], args.out, args.page)
     except ValueError as e:  # records stay where they are
         parser.error(str(e))
     return 0 if reached and recorded else 1

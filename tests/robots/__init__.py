@@ -1,2 +1,2 @@
-"""Measures what each connection to a robot costs: docs/robots/latency.json, the table of
+"""Measures what each connection to a robot costs: docs/data/robots-latency.json, the table of
 docs/robots/README.md."""

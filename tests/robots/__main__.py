@@ -41,7 +41,7 @@ from tests.factories.bridges import bridge
 from tests.factories.paths import NO_SITE, ROOT
 from tests.robots import page
 
-RESULTS = ROOT / "docs" / "robots" / "latency.json"
+RESULTS = ROOT / "docs" / "data" / "robots-latency.json"
 POLL_S = 0.01
 Seen = Callable[[int], None]
 """Takes the number of a sweep whose answer is there now."""

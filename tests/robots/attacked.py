@@ -1,5 +1,5 @@
 """What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes
-2`. In: minutes for each case. Out: a table, docs/robots/attacked.json; exit code 1 if a frame, a
+2`. In: minutes for each case. Out: a table, docs/data/robots-attacked.json; exit code 1 if a frame, a
 sentence or an answer was lost.
 
 One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had
@@ -131,7 +131,9 @@ def main() -> int:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
     figures = measure(args.minutes, [*REAL_TIME] if real_time else [])
     content = {"commit": commit(), "real_time": real_time, "cases": figures}
-    (ROOT / "docs" / "robots" / "attacked.json").write_text(json.dumps(content, indent=1) + "\n")
+    (ROOT / "docs" / "data" / "robots-attacked.json").write_text(
+        json.dumps(content, indent=1) + "\n"
+    )
     page.write(ROOT / "docs" / "robots" / "README.md", "attacked", table(figures))
     print(table(figures))
     bad = [

@@ -1,5 +1,5 @@
 """A box with everything attached and attacked, beside one with nothing: `python -m
-tests.robots.side_by_side --minutes 5`. In: minutes. Out: docs/robots/side-by-side.json and the
+tests.robots.side_by_side --minutes 5`. In: minutes. Out: docs/data/robots-side-by-side.json and the
 table of docs/robots/README.md; exit code 1 if the one was worse off.
 
 Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this
@@ -42,7 +42,7 @@ from tests.skins.load import BOX, hurry
 START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
 """Time for the boxes to start, for what is attached to come, and between two looks at the
 processes."""
-RESULTS = ROOT / "docs" / "robots" / "side-by-side.json"
+RESULTS = ROOT / "docs" / "data" / "robots-side-by-side.json"
 SWEEP_S = 3.0
 """The robot sweeps no more often."""
 SHARE = 0.03

@@ -1,4 +1,4 @@
-"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/skins.json,
+"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/data/skins.json,
 tables of docs/skins.md.
 
 way: record, describe, fit, export and run with each. noise: wrong frames on a bad cable. load:
@@ -23,7 +23,7 @@ from tests.skins.subjects import NAMES, subject
 from train.metrics import score
 
 WORK = ROOT / "build" / "skins"
-RESULTS = ROOT / "docs" / "skins.json"
+RESULTS = ROOT / "docs" / "data" / "skins.json"
 FAULTS = 10_000
 
 

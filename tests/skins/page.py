@@ -1,4 +1,4 @@
-"""The tables of docs/skins.md. In: docs/skins.json. Out: the page with each table between its
+"""The tables of docs/skins.md. In: docs/data/skins.json. Out: the page with each table between its
 markers."""
 
 from __future__ import annotations

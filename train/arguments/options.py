@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import atexit
-import json
 import shlex
 import sys
 import tempfile
@@ -218,22 +217,3 @@ class Log:
             self._bar.start()
             atexit.register(self._bar.stop)
         return self._bar
-
-
-def earlier_run(
-    path: Path, command: str, keys: set[str], advice: str, otherwise: str = ""
-) -> dict[str, Any]:
-    """What an earlier run of a command wrote, an object with these keys. advice: what to do where
-    it cannot be read; otherwise: where it has another content. Raises FormatError, with one of
-    them."""
-    try:
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        if keys <= found.keys():
-            return found
-    except OSError as e:
-        raise FormatError(f"{path} cannot be read: {e.strerror}; {advice}") from e
-    except (ValueError, AttributeError):
-        pass
-    raise FormatError(
-        f"{path} is not what python -m train.studies {command} wrote; {otherwise or advice}"
-    )

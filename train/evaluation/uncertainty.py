@@ -1,4 +1,4 @@
-"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as results.json holds
+"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as the results hold
 them.
 
 Calibration, the sequential test, unknown materials, enrolment and early decisions, each on test
@@ -59,7 +59,7 @@ def run(
     effort: Effort = methods.FULL_EFFORT,
     seed: int = 1,
 ) -> dict[str, Any]:
-    """All figures, as results.json holds them. test: the set that is tested on; without it
+    """All figures, as the results hold them. test: the set that is tested on; without it
     `protocol` says what is left out.
 
     Raises FormatError where the sets do not fit, or the method cannot do it.

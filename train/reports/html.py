@@ -24,9 +24,7 @@ from train.reports.provenance import Provenance
 
 TEMPLATES = Path(__file__).with_name("templates")
 HOME = "../../README.md"
-"""README, from a page in a folder of docs/."""
-MADE = "\n\n<!-- written with the page -->\n"
-"""Ends a README.md that `publish` may write again."""
+"""README, from the page of a study in the site (results/NAME/)."""
 FRAMES = (
     (r"<th(?=[ >])(?![^>]*\bscope=)", '<th scope="col"'),
     (
@@ -96,35 +94,12 @@ def publish(
     out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], about: Provenance
 ) -> Path:
     """Write the pictures, NAME.svg, each with its header, and the pages, NAME.html, into the folder
-    `out`; the path of "index".
-
-    For those who see no HTML, as on GitHub, README.md beside it shows the pictures; one that was
-    written by hand stays.
-    """
+    `out`; the path of "index"."""
     for name, svg in pictures.items():
         put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
     for name, page in pages.items():
         put(out / f"{name}.html", page.encode(), parents=True)
-    readme = out / "README.md"
-    if not readme.exists() or readme.read_text(encoding="utf-8").endswith(MADE):
-        put(
-            readme,
-            provenance.in_markdown(_pictures_alone(pages["index"], pictures), about).encode(),
-        )
     return out / "index.html"
-
-
-def _pictures_alone(page: str, pictures: Mapping[str, str]) -> str:
-    """A page's title and pictures in Markdown, with the way home and to the page."""
-    title = _between("h1", page)
-    shown = [f"![{_between('title', svg)}]({name}.svg)" for name, svg in pictures.items()]
-    links = "The whole page, to be opened in a browser: [index.html](index.html). Back to [Palpate](../../README.md)."
-    return "\n\n".join([f"# {title}", links, *shown]) + MADE
-
-
-def _between(tag: str, text: str) -> str:
-    found = re.search(rf"<{tag}\b[^>]*>(.*?)</{tag}>", text, re.DOTALL)
-    return " ".join(found[1].split()) if found else ""
 
 
 def _environment(folder: Path, escape: bool) -> Environment:

@@ -1,4 +1,4 @@
-"""The table of the box's figures in README and manual. In: docs/bench.json, which `palpate bench
+"""The table of the box's figures in README and manual. In: docs/data/bench.json, which `palpate bench
 --json` wrote. Out: the table in Markdown; document_figures puts it into the documents.
 """
 

@@ -1,5 +1,5 @@
-"""The interactive chart. In: dots, as chart.json lists them, and their picture. Out: one HTML file
-that needs nothing else.
+"""Renders the interactive chart from dots, the entries of chart.json: one HTML file that needs
+nothing else.
 
 It is made of templates/chart.html.j2 and chart.js, and shows the picture and a table where scripts
 do not run.
@@ -22,11 +22,21 @@ from train.reports import html as pages
 from train.reports import provenance
 from train.reports.formatting import estimate
 from train.reports.provenance import Provenance
-from train.studies import TEMPLATES, comparison, method_names
+from train.studies import TEMPLATES, comparison, method_names, scatter
 from train.studies.method_names import OURS
 from train.studies.pareto import ACCURACIES, COSTS, ChartAxis, Dot, label, name, networks, subject
 
 SCRIPT = TEMPLATES / "chart.js"
+
+
+def render(
+    dots: Sequence[Dot], box_on_hard: Mapping[str, Any] | None = None
+) -> tuple[str, dict[str, str]]:
+    """The page (HTML) of the study `chart` and its picture (SVG). Dots of a quick run have
+    "quick"."""
+    picture = scatter.chart(dots)
+    quick = any(dot.get("quick") for dot in dots)
+    return html(dots, picture, quick, box_on_hard=box_on_hard), {"chart": picture}
 
 
 def html(
@@ -40,7 +50,7 @@ def html(
     header: Provenance | None = None,
 ) -> str:
     """The whole file. picture: SVG. quick: the figures mean nothing. left_out: what is missing, and
-    why. box_on_hard: what the box answers to T-HARD's sweeps, see chart_report.box_on_hard.
+    why. box_on_hard: the box's answers to T-HARD's sweeps, see pages.box_on_hard.
     accuracies: the axes, the first one first seen. source: the file beside the page that has all
     figures. header: where they are from, if the dots do not say so."""
     there = {

@@ -12,11 +12,10 @@ PROGRAM = Program(
     "train.studies.commands",
     {
         "experiments": {
-            "paper": "run the paper's experiment on the simulated skin and write a page about it",
-            "development": "evaluate methods on all development sets, and write a page about it",
-            "chart": "chart accuracy against cost: every method as a bundle, timed as on the box",
-            "fabrics": "evaluate methods on real fabrics with a condition left out, and write a"
-            " page about it",
+            "paper": "run the paper's experiment on the simulated skin",
+            "development": "evaluate methods on all development sets",
+            "chart": "measure accuracy and cost of every method as a bundle, timed as on the box",
+            "fabrics": "evaluate methods on real fabrics, one condition left out at a time",
             "stress": "test trained methods, and a bundle, on corrupted sweeps, one corruption at"
             " a time",
             "certainty": "measure how far a model's probabilities can be trusted: calibration,"
@@ -28,8 +27,9 @@ PROGRAM = Program(
             "references": "write the models that palpate bench times beside the bundle",
         },
         "pages": {
-            "reports": "make the project's results and pages again: the stale ones, or some by name",
-            "figures": "write the figures of results into README and pages",
+            "reports": "make the project's results again: the stale ones, or some by name",
+            "pages": "draw the pages of results, with their pictures",
+            "figures": "write figures and pictures of results into README and written pages",
             "matrix": "draw the results of evaluate: methods by protocols",
             "overview": "draw the README's picture: a simulated sweep and the box's answers",
         },
@@ -43,16 +43,8 @@ PROGRAM = Program(
             "alignment",
             "references",
         ),
-        "publish": (
-            "reports",
-            "figures",
-            "paper",
-            "chart",
-            "development",
-            "fabrics",
-            "matrix",
-            "overview",
-        ),
+        "experiments": ("paper", "chart", "development", "fabrics"),
+        "publish": ("reports", "pages", "figures", "matrix", "overview"),
     },
 )
 

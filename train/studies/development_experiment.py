@@ -1,30 +1,27 @@
-"""All methods on all development sets. In: methods, seeds. Out: the figures of the command
-`development`, as JSON.
+"""The study `development`: all methods on all development sets.
 
-One set is never enough to tune on: a recipe that was fitted to one shows here at once on the
-others. Accuracy comes from evaluate, whose finished folds are kept: an interrupted command goes on
+One set is never enough to tune on: a recipe that overfits one set shows it on the others. Accuracy comes from evaluate, whose finished folds are kept: an interrupted command goes on
 where it was, and `kept` reports what there is. The skin that was attached anew (T-HARD) is not
 among the sets: the simulator cannot be trusted with it, see decision 10.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset, digest
 from train.evaluation import evaluate
-from train.evaluation.evaluate import Plan, Where
+from train.evaluation.evaluate import Plan
 from train.metrics import score
 from train.models import methods
-from train.models.methods import FULL_EFFORT, Effort
-from train.studies.chart_report import FABRICS, SEVEN, ChartPart, joined
+from train.models.methods import Effort
+from train.studies.chart_experiment import FABRICS, SEVEN, joined
+from train.studies.study import NO_DATA, Study, StudyCase, StudyRun
 
 Json = dict[str, Any]
-Log = Callable[[str], None]
 OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
 """No peers; the first of them that is there is compared with the peers."""
 PEERS = (
@@ -40,116 +37,87 @@ EACH = (5, 10, 20)
 """Points of a learning curve, as far as a set has more sweeps of each material than that."""
 
 
-@dataclass(frozen=True)
-class DevelopmentCase:
-    """One set under one protocol. means_removed: each taxel's mean over the window is taken away.
-    curve: training sweeps of each material along its learning curve, before all of them."""
-
-    name: str
-    part: ChartPart
-    means_removed: bool = True
-    curve: tuple[int, ...] = ()
-
-    @property
-    def simulated(self) -> bool:
-        """Whether its sweeps are the simulator's."""
-        return any(name.startswith("sim:") for name in self.part.sets)
-
-
 FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
 
 
-def _fabrics(
-    name: str, protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()
-) -> DevelopmentCase:
-    return DevelopmentCase(name, ChartPart((FABRICS,), protocol, only, real=True), curve=curve)
+def _fabrics(protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> StudyCase:
+    return StudyCase((FABRICS,), protocol, only, real=True, means_removed=True, curve=curve)
 
 
-def _published(name: str, curve: tuple[int, ...] = ()) -> DevelopmentCase:
-    return DevelopmentCase(
-        f"{name}, published split", ChartPart((f"aeon:{name}",), "split:split=0->1"), curve=curve
-    )
+def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
+    return StudyCase((f"aeon:{name}",), "split:split=0->1", means_removed=True, curve=curve)
 
 
-REAL = ChartPart(("sim:T-REAL:1",), "leave:position")
-CASES = (
-    _fabrics("7 fabrics, a force out", "leave:force", SEVEN, EACH),
-    _fabrics("7 fabrics, a speed out", "leave:speed", SEVEN),
-    _fabrics("7 fabrics, a repetition out", "leave:rep", SEVEN),
-    _fabrics("4 fabrics, a force out", "leave:force", FOUR),
-    _fabrics("4 fabrics, a speed out", "leave:speed", FOUR),
-    _fabrics("4 fabrics, a direction out", "leave:direction", FOUR),
-    _published("ACSF1", (5,)),
-    _published("OSULeaf", (5, 10)),
-    _published("BasicMotions", (5,)),
-    _published("ArrowHead", (5, 10)),
-    _published("GunPoint", EACH),
-    DevelopmentCase("simulated tubes, a position out", REAL, means_removed=False, curve=EACH),
-)
+TUBES = "simulated tubes, a position out"
+CASES = {
+    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, EACH),
+    "7 fabrics, a speed out": _fabrics("leave:speed", SEVEN),
+    "7 fabrics, a repetition out": _fabrics("leave:rep", SEVEN),
+    "4 fabrics, a force out": _fabrics("leave:force", FOUR),
+    "4 fabrics, a speed out": _fabrics("leave:speed", FOUR),
+    "4 fabrics, a direction out": _fabrics("leave:direction", FOUR),
+    "ACSF1, published split": _published("ACSF1", (5,)),
+    "OSULeaf, published split": _published("OSULeaf", (5, 10)),
+    "BasicMotions, published split": _published("BasicMotions", (5,)),
+    "ArrowHead, published split": _published("ArrowHead", (5, 10)),
+    "GunPoint, published split": _published("GunPoint", EACH),
+    TUBES: StudyCase(("sim:T-REAL:1",), "leave:position", curve=EACH),
+}
 """In the order of the page."""
-QUICK = (
-    _published("GunPoint"),
-    DevelopmentCase(
-        "simulated tubes, a position out",
-        ChartPart(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",)),
-        means_removed=False,
-        curve=EACH,
-    ),
+STUDY = Study("development", CASES, (*OURS, *PEERS))
+QUICK = Study(
+    "development",
+    {
+        "GunPoint, published split": _published("GunPoint"),
+        TUBES: StudyCase(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",), curve=EACH),
+    },
+    ("compact-50k", "edge-spectral", "L-gauss"),
 )
-QUICK_METHODS = ("compact-50k", "edge-spectral", "L-gauss")
 QUICK_EFFORT = Effort(share=0.02)
 
 
-def usual_methods() -> tuple[str, ...]:
-    """OURS and PEERS, as far as they exist."""
+def usual_methods(study: Study) -> tuple[str, ...]:
+    """The methods of a study that exist here."""
     known = methods.every()
-    return tuple(name for name in (*OURS, *PEERS) if name in known)
+    return tuple(name for name in study.methods if name in known)
 
 
 @dataclass
 class Development:
-    """One run of the command. not_wanted: names of cases, or of points of their curves ("NAME, 5
-    each"), that are not run. left_out: what is missing, and why."""
+    """One run of the study. skipped: names of cases, or of points of their curves ("NAME, 5
+    each"), that are not run."""
 
-    cases: Sequence[DevelopmentCase]
+    cases: Mapping[str, StudyCase]
     names: Sequence[str]
-    where: Where
-    log: Log
-    data: Path | None = None
-    effort: Effort = FULL_EFFORT
-    seeds: Sequence[int] = (1,)
-    not_wanted: Sequence[str] = ()
-    left_out: dict[str, str] = field(default_factory=dict)
+    run: StudyRun
+    skipped: Sequence[str] = ()
 
     def results(self) -> Json:
-        """All figures: `cases` with what they were run on, and `results` by case, method and
-        training sweeps.
+        """`cases` with what they were run on, and `results` by case, method and number of training
+        sweeps.
 
-        Raises FormatError for an unknown method, and where what is not wanted does not exist.
+        Raises FormatError for an unknown method, and for a skipped case that does not exist.
         """
         methods.find(self.names)
-        self._require_known(self.not_wanted)
+        self._require_known(self.skipped)
         cases: list[Json] = []
         found: list[Json] = []
-        for number, case in enumerate(self.cases, 1):
-            sweeps = case.part.load(self.data)
+        for number, (name, case) in enumerate(self.cases.items(), 1):
+            sweeps = case.load(self.run.data)
             if sweeps is None:
-                self.left_out[case.name] = (
-                    "real sweeps; name their folder with --data or PALPATE_DATA"
-                )
+                self.run.left_out[name] = NO_DATA
                 continue
-            cases.append(_about(case, sweeps))
-            for each, name in _points(case):
-                if name in self.not_wanted or case.name in self.not_wanted:
-                    self.left_out[name] = f"not wanted in the run of {', '.join(self.names)}"
+            cases.append(_about(name, case, sweeps))
+            for each, point in _points(name, case):
+                if point in self.skipped or name in self.skipped:
+                    self.run.left_out[point] = f"skipped in the run of {', '.join(self.names)}"
                 else:
-                    found += self._evaluated(
-                        case, sweeps, each, f"{number}/{len(self.cases)} {name}"
-                    )
+                    progress = f"{number}/{len(self.cases)} {point}"
+                    found += self._evaluated(name, sweeps, each, progress)
         known = {
             "methods": list(self.names),
-            "seeds": list(self.seeds),
-            "effort": self.effort.share,
+            "seeds": list(self.run.seeds),
+            "effort": self.run.effort.share,
         }
         runs = [known | score.provenance()]
         return {
@@ -157,43 +125,39 @@ class Development:
             "runs": runs,
             "cases": cases,
             "results": found,
-            "left_out": self.left_out,
-        }
+            "left_out": self.run.left_out,
+        } | ({"quick": True} if self.run.quick else {})
 
     def _require_known(self, names: Sequence[str]) -> None:
-        known = [name for case in self.cases for _, name in _points(case)]
+        known = [point for name, case in self.cases.items() for _, point in _points(name, case)]
         for name in names:
             if name not in known:
                 raise FormatError(f"{name!r} is no case; leave out some of {'; '.join(known)}")
 
-    def _evaluated(
-        self, case: DevelopmentCase, sweeps: Dataset, each: int, what: str
-    ) -> Iterator[Json]:
-        """One entry for each method that can take the set and is complete with all seeds that were
-        found."""
-        plan = Plan(
-            self.names, (case.part.protocol,), self.seeds, case.means_removed, self.effort, each
-        )
+    def _evaluated(self, name: str, sweeps: Dataset, each: int, progress: str) -> Iterator[Json]:
+        """Yield one entry for each method that accepts the set, over all seeds that were found."""
+        run, case = self.run, self.cases[name]
+        plan = Plan(self.names, (case.protocol,), run.seeds, case.means_removed, run.effort, each)
         by_method: dict[str, list[Json]] = {}
 
         def log(line: str) -> None:
-            self.log(f"{what}: {line}")
+            run.log(f"{progress}: {line}")
 
-        for result in evaluate.evaluate(sweeps, plan, self.where, log):
+        for result in evaluate.evaluate(sweeps, plan, run.where, log):
             if result.refused:
-                self.left_out[f"{result.method}, {case.name}"] = result.refused
+                run.left_out[f"{result.method}, {name}"] = result.refused
             else:
                 by_method.setdefault(result.method, []).append(
                     result.json() | {"seed": result.seed}
                 )
         for method, results in by_method.items():
-            yield {"case": case.name, "each": each, "method": method} | _entry(results)
+            yield {"case": name, "each": each, "method": method} | _entry(results)
 
 
-def _points(case: DevelopmentCase) -> list[tuple[int, str]]:
-    """Training sweeps of each material (0 for all) and name of what is evaluated of a case: it, and
-    points of its curve."""
-    return [(each, _name(case.name, each)) for each in (0, *case.curve)]
+def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
+    """Training sweeps of each material (0 for all), and the name, of a case and of each point of
+    its curve."""
+    return [(each, _name(name, each)) for each in (0, *case.curve)]
 
 
 def _name(case: str, each: int) -> str:
@@ -244,13 +208,13 @@ def _require_same_sweeps(run: Json, earlier: Json) -> None:
             )
 
 
-def _about(case: DevelopmentCase, sweeps: Dataset) -> Json:
-    """What a case was run on."""
+def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
+    """The sweeps and the protocol of a case."""
     return {
-        "case": case.name,
+        "case": name,
         "set": sweeps.source,
-        "only": list(case.part.only),
-        "protocol": case.part.protocol,
+        "only": list(case.only),
+        "protocol": case.protocol,
         "means_removed": case.means_removed,
         "simulated": case.simulated,
         "sweeps": len(sweeps),

@@ -1,20 +1,16 @@
-"""The development page. In: the figures of development_experiment. Out: results.json, pictures and
-two pages.
+"""Renders the pages of the study `development`.
 
-Nothing is computed here but means and differences of what was measured.
+It computes nothing but means and differences of the measured figures.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from train.metrics import differences
 from train.reports import html, provenance
 from train.reports.formatting import estimate, exact_percent, points
@@ -57,18 +53,12 @@ REAL = "real and published"
 """Name of the first mean."""
 
 
-def write(figures: Json, out: Path, quick: bool = False) -> Path:
-    """results.json, the pictures and the pages in the folder `out`; the path of index.html.
+def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
+    """The pages (HTML) and pictures (SVG) by name; "chart" is there if something was timed.
 
     Raises FormatError where there is no result of a method of ours.
     """
-    pages, pictures = render(figures, quick)
-    put(out / "results.json", (json.dumps(figures, allow_nan=False) + "\n").encode(), parents=True)
-    return html.publish(out, pages, pictures, provenance.of(figures))
-
-
-def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str, str]]:
-    """The pages (HTML) and pictures (SVG) by name; "chart" is there where something was timed."""
+    quick: bool = figures.get("quick", False)
     table = by_case(figures["results"])
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
@@ -88,7 +78,7 @@ def render(figures: Json, quick: bool = False) -> tuple[dict[str, str], dict[str
             quick,
             times["left_out"],
             accuracies=axes,
-            source="results.json",
+            source="development.json",
             header=provenance.of(figures),
         )
     pictures["accuracy"] = development_plots.lines(cases, table, ours, peers)

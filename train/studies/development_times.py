@@ -23,7 +23,7 @@ from train.data.sets import Dataset
 from train.export import measure, precisions
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
-from train.studies.chart_report import kept_folder
+from train.studies.chart_experiment import kept_folder
 from train.studies.development_experiment import OURS
 
 Array = NDArray[Any]

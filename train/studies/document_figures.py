@@ -1,13 +1,11 @@
-"""Figures of results in README and pages. In: files of results. Out: documents, with each
-text between its markers.
+"""Texts and pictures of results in README and written pages.
 
-The one list of what stands where: `python -m train.studies figures` writes it all, and a test fails where a
-document differs.
+The lists below say what stands where. `python -m train.studies figures` writes all of it, and a
+test fails if a document or a picture differs.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,32 +14,28 @@ from typing import Any
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.reports import provenance
-from train.studies import bench_table, contact_table, marked_text
+from train.studies import (
+    bench_table,
+    contact_plot,
+    contact_table,
+    development_report,
+    marked_text,
+    matrix_table,
+    plots,
+)
+from train.studies.study import DATA, read, results_file
 
 README, ALIGN = "README.md", "docs/how-to/align.md"
 SPECIFICATIONS = "docs/reference/specifications.md"
-BENCH, ALIGNMENT, DEVELOPMENT = (
-    "docs/bench.json",
-    "docs/alignment/place.json",
-    "docs/development/results.json",
-)
-MADE_BY = {
-    BENCH: "make bench",
-    ALIGNMENT: "python -m train.studies alignment --out docs/alignment",
-    DEVELOPMENT: "python -m train.studies development",
-}
-
-
-def picture_note(figures: Any) -> str:
-    """Under a picture: that it tells of an older default, or nothing."""
-    older = provenance.of(figures).older
-    return f"*{older}*" if older else ""
+ALIGNMENT, FABRICS = "docs/alignment/README.md", "docs/fabricslide/README.md"
+MADE_BY = {"bench": "make bench"}
+"""The command that makes results which are not a study's."""
 
 
 @dataclass(frozen=True, slots=True)
 class DocumentFigure:
-    """What stands in a document between <!-- marker --> and <!-- /marker -->: `text` of a file of
-    results."""
+    """A text between <!-- marker --> and <!-- /marker --> of a document. results: name of the file
+    in docs/data. text: makes it of the results."""
 
     document: str
     marker: str
@@ -49,43 +43,90 @@ class DocumentFigure:
     text: Callable[[Any], str]
 
 
+@dataclass(frozen=True, slots=True)
+class DocumentPicture:
+    """A picture (SVG) that a document shows. results: name of the file in docs/data. draw: makes it
+    of the results."""
+
+    file: str
+    results: str
+    draw: Callable[[Any], str]
+
+
+def picture_note(figures: Any) -> str:
+    """The line under a picture of an older default; "" if it shows today's default."""
+    older = provenance.of(figures).older
+    return f"*{older}*" if older else ""
+
+
 FIGURES = (
-    DocumentFigure(README, "front", DEVELOPMENT, picture_note),
-    DocumentFigure(SPECIFICATIONS, "bench", BENCH, bench_table.table),
-    DocumentFigure(ALIGN, "moved", ALIGNMENT, contact_table.sentence),
-    DocumentFigure("docs/alignment/README.md", "alignment", ALIGNMENT, contact_table.table),
+    DocumentFigure(README, "front", "development", picture_note),
+    DocumentFigure(SPECIFICATIONS, "bench", "bench", bench_table.table),
+    DocumentFigure(ALIGN, "moved", "alignment", contact_table.sentence),
+    DocumentFigure(ALIGNMENT, "in short", "alignment", contact_table.headline),
+    DocumentFigure(ALIGNMENT, "alignment", "alignment", contact_table.table),
+    DocumentFigure(FABRICS, "matrix", "fabrics", matrix_table.headline),
 )
+PICTURES = (
+    DocumentPicture(
+        "docs/front.svg",
+        "development",
+        lambda figures: development_report.render(figures)[1]["front"],
+    ),
+    DocumentPicture("docs/alignment/place.svg", "alignment", contact_plot.draw),
+    DocumentPicture("docs/fabricslide/windows.svg", "fabrics", plots.matrix),
+    DocumentPicture(
+        "docs/fabricslide/recordings.svg",
+        "fabrics",
+        lambda results: plots.matrix(results, count="recording"),
+    ),
+)
+HEADED = {ALIGNMENT: "alignment", FABRICS: "fabrics"}
+"""Pages about one file of results, which have its provenance behind their title."""
 
 
 def written(document: str, root: Path) -> str:
-    """A document with all its figures. Raises FormatError where results are missing or of another
-    kind, or its markers are."""
+    """A document with all its figures. Raises FormatError if results or markers are missing, or if
+    the results are of another kind."""
     text = (root / document).read_text(encoding="utf-8")
     for figure in FIGURES:
         if figure.document == document:
-            text = marked_text.insert(text, figure.marker, _text(figure, root), document)
+            made = _of(figure.results, figure.marker, figure.text, root)
+            text = marked_text.insert(text, figure.marker, made, document)
+    if document in HEADED:
+        results = read(results_file(HEADED[document], root / DATA))
+        text = provenance.in_markdown(text, provenance.of(results))
     return text
 
 
+def drawn(picture: DocumentPicture, root: Path) -> str:
+    """A picture with its provenance. Raises FormatError as `written`."""
+    svg = _of(picture.results, picture.file, picture.draw, root)
+    about = provenance.of(read(results_file(picture.results, root / DATA)))
+    return provenance.in_svg(svg, about) + "\n"
+
+
 def write(root: Path = Path()) -> list[str]:
-    """Put all figures into the documents below `root`; the documents that were not as they are now.
-    Raises as `written`."""
+    """Write all figures and pictures below `root`; the files that changed. Raises as `written`."""
     texts = {
         name: written(name, root) for name in dict.fromkeys(figure.document for figure in FIGURES)
-    }
-    changed = [
-        name for name, text in texts.items() if text != (root / name).read_text(encoding="utf-8")
-    ]
+    } | {picture.file: drawn(picture, root) for picture in PICTURES}
+    changed = [name for name, text in texts.items() if _there(root / name) != text]
     for name in changed:
-        put(root / name, texts[name].encode())
+        put(root / name, texts[name].encode(), parents=True)
     return changed
 
 
-def _text(figure: DocumentFigure, root: Path) -> str:
+def _there(path: Path) -> str | None:
+    return path.read_text(encoding="utf-8") if path.exists() else None
+
+
+def _of(results: str, what: str, make: Callable[[Any], str], root: Path) -> str:
+    file = results_file(results, DATA)
     try:
-        return figure.text(json.loads((root / figure.results).read_bytes()))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as e:
-        made = MADE_BY[figure.results]
+        return make(read(root / file))
+    except (FormatError, LookupError, TypeError, AttributeError) as e:
+        command = MADE_BY.get(results, f"python -m train.studies {results}")
         raise FormatError(
-            f"{figure.results} does not hold the figures of {figure.marker!r}: {e!r}; run `{made}`"
+            f"{file} does not hold the figures of {what!r}: {e!r}; run `{command}`"
         ) from e

@@ -1,54 +1,44 @@
-"""The paper's experiment on the simulated sets, with more methods. In: a plan. Out: a folder with
-results.json, pictures, page.
+"""The study `paper`: the paper's experiment on the simulated sets, with more methods.
 
-The page is made by paper_report. Folds are kept by evaluate, so that an interrupted run goes on
-where it was.
+evaluate caches folds, so an interrupted run goes on where it was.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from appliance.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from appliance.sim import skin
-from train.data import sets
 from train.data.progress import spoken
 from train.data.sets import Dataset
-from train.evaluation.evaluate import Plan, Result, Where, evaluate
+from train.evaluation.evaluate import Plan, Result, evaluate
 from train.metrics import score
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort
 from train.models.peers import prior_work
-from train.reports import html, provenance
-from train.studies import paper_report, paper_values
-from train.studies.chart_report import BOX_ON_HARD, box_on_hard
+from train.studies import paper_values
+from train.studies.study import Study, StudyCase, StudyRun
 
 Array = NDArray[Any]
-Log = Callable[[str], None]
+Json = dict[str, Any]
 BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
 OWN = ("default", "default-reattached")
 BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
-"""Tables of results.json by method."""
-CURVE = "cnn-curve.json"
-"""Beside results.json: what `python -m train.studies cnn-curve --size whole` wrote, the paper's CNN as
-printed."""
-CURVE_PARTS = {"lopo": "new", "hard": "hard"}
-"""Its sets by the part that they stand for."""
+"""Tables of the results by method."""
+CURVE_CASES = {"lopo": "new", "hard": "hard"}
+"""The sets of cnn_curve by the case that they stand for."""
 SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
@@ -57,24 +47,13 @@ ATTACHMENTS = 20
 COST_POINTS = 160
 
 
-@dataclass(frozen=True)
-class PaperPart:
-    """A column of the paper's results: the sets to train and test on.
-
-    sets: joined; {w} stands for the simulated world, {a} and {b} for its first and last seed of
-    T-HARD. only: of each set.
-    """
-
-    sets: tuple[str, ...]
-    protocol: str
-    folds: int
-    only: tuple[str, ...] = ()
-
-    def load(self, world: int) -> Dataset:
-        """Its sweeps."""
-        last = ATTACHMENTS * world
-        names = [name.format(w=world, a=last - ATTACHMENTS + 1, b=last) for name in self.sets]
-        return sets.join([sets.load(name).select(self.only) for name in names])
+def load(case: StudyCase, world: int) -> Dataset:
+    """The sweeps of a case in one simulated world: {w} in its sets stands for the world, {a} and
+    {b} for the world's first and last seed of T-HARD."""
+    last = ATTACHMENTS * world
+    sweeps = case.load(w=world, a=last - ATTACHMENTS + 1, b=last)
+    assert sweeps is not None  # all are simulated
+    return sweeps
 
 
 @dataclass(frozen=True)
@@ -95,10 +74,10 @@ class Step:
 
 ALL = ("lopo", "hard", "lab", "random")
 FULL = {
-    "lopo": PaperPart(("sim:T-REAL:{w}",), "leave:position", 9),
-    "hard": PaperPart(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", 1),
-    "lab": PaperPart(("sim:T-LAB:{w}",), "random:10", 10),
-    "random": PaperPart(("sim:T-REAL:{w}",), "random:9", 9),
+    "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position", folds=9),
+    "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", folds=1),
+    "lab": StudyCase(("sim:T-LAB:{w}",), "random:10", folds=10),
+    "random": StudyCase(("sim:T-REAL:{w}",), "random:9", folds=9),
 }
 HARD, EASY = ("hard", "lopo"), ("lab", "random")
 FULL_STEPS = (
@@ -117,13 +96,12 @@ FULL_STEPS = (
 )
 """Hard parts come first, so that a run that was interrupted has the most important results: see
 `kept`."""
+NEAR = ("position<=2",)
 QUICK = {
-    "lopo": PaperPart(("sim:T-REAL:{w}:4",), "leave:position", 3, ("position<=2",)),
-    "hard": PaperPart(
-        ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", 1, ("position<=2",)
-    ),
-    "lab": PaperPart(("sim:T-LAB:{w}:10",), "random:3", 3),
-    "random": PaperPart(("sim:T-REAL:{w}:4",), "random:3", 3, ("position<=2",)),
+    "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
+    "hard": StudyCase(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", NEAR, folds=1),
+    "lab": StudyCase(("sim:T-LAB:{w}:10",), "random:3", folds=3),
+    "random": StudyCase(("sim:T-REAL:{w}:4",), "random:3", NEAR, folds=3),
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),
@@ -145,7 +123,7 @@ class Outcome:
     [n, K] of those tested.
 
     place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that
-    has them, [iterations, 2]. about: what results.json holds of it.
+    has them, [iterations, 2]. about: its entry in the results.
     """
 
     part: str
@@ -178,29 +156,21 @@ class Outcome:
         return np.asarray(self.logits.argmax(1) == self.labels)
 
 
-def run(
-    out: Path,
-    quick: bool,
-    where: Where,
-    log: Log = lambda line: None,
-    effort: Effort = FULL_EFFORT,
-    only: Sequence[str] = (),
-) -> Path:
-    """Train and test all of the plan, write results.json, the pictures and the page into `out`; the
-    page's path.
+STUDY = Study("paper", FULL, tuple(dict.fromkeys(m for step in FULL_STEPS for m in step.methods)))
 
-    quick: a few sweeps and iterations of everything, whatever `effort` says. only: methods that are
-    run; all others stay as an earlier run left them in `out`. Raises FormatError as evaluate, and
-    where `only` has none of the plan's methods.
+
+def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None) -> Json:
+    """Train and test all of the plan; the results.
+
+    only: methods that are run; all others stay as in `earlier` results. Raises FormatError as
+    evaluate, and where `only` has none of the plan's methods.
     """
-    parts, steps = (QUICK, QUICK_STEPS) if quick else (FULL, FULL_STEPS)
-    effort = QUICK_EFFORT if quick else effort
-    outcomes = list(_outcomes(parts, narrowed(steps, only) if only else steps, where, effort, log))
-    found = summary(outcomes, parts, effort) | score.provenance() | {"quick": quick}
-    if only:
-        found = joined(found, planned(_results(out), steps))
-    put(out / "results.json", _lines(found).encode(), parents=True)
-    return draw(out)
+    cases, steps = (QUICK, QUICK_STEPS) if how.quick else (FULL, FULL_STEPS)
+    if how.quick:
+        how = replace(how, effort=QUICK_EFFORT)
+    outcomes = list(_outcomes(cases, narrowed(steps, only) if only else steps, how))
+    found = summary(outcomes, cases, how.effort) | score.provenance() | {"quick": how.quick}
+    return joined(found, planned(earlier, steps)) if only and earlier else found
 
 
 def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
@@ -215,7 +185,7 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
     return [step for step in kept if step.methods]
 
 
-def planned(found: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
+def planned(found: Json, steps: Sequence[Step]) -> Json:
     """What `found` has of methods that are still in the plan."""
     known = {m for step in steps for m in step.methods}
     lists = {
@@ -235,8 +205,8 @@ def planned(found: dict[str, Any], steps: Sequence[Step]) -> dict[str, Any]:
     return found | lists | tables
 
 
-def joined(found: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """Two results.json as one: of what both have, `found` counts. Raises FormatError where one of
+def joined(found: Json, earlier: Json) -> Json:
+    """Two results as one: of what both have, `found` counts. Raises FormatError where one of
     them is a quick run."""
     if found["quick"] != earlier["quick"]:
         raise FormatError(
@@ -258,25 +228,24 @@ def _at(one: dict[str, Any]) -> tuple[Any, ...]:
     return one["part"], one["method"], one.get("means_removed"), one.get("world")
 
 
-def _results(out: Path) -> dict[str, Any]:
-    """results.json in `out`. Raises FormatError where it is not there."""
-    try:
-        results: dict[str, Any] = json.loads((out / "results.json").read_bytes())
-    except (OSError, ValueError) as e:
+def with_curve(found: Json, curve: Json) -> Json:
+    """Results with the paper's CNN as cnn_curve has followed it so far. Raises FormatError for the
+    curve of another training."""
+    if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
         raise FormatError(
-            f"{out}/results.json is not of the paper's experiment: {e}; run all of it first"
-        ) from e
-    return results
+            "this curve is not of the CNN as printed; run python -m train.studies cnn-curve --size whole"
+        )
+    return joined(as_printed(curve, FULL) | {"quick": found["quick"]}, found)
 
 
-def as_printed(curve: dict[str, Any], parts: dict[str, PaperPart]) -> dict[str, Any]:
+def as_printed(curve: Json, cases: Mapping[str, StudyCase]) -> Json:
     """A summary of the paper's CNN from what cnn_curve has followed so far, as its newest point."""
     point, ran = (
         curve["points"][-1],
         f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50",
     )
     outcomes = []
-    for part, name in CURVE_PARTS.items():
+    for part, name in CURVE_CASES.items():
         newest = {k: np.array(v) for k, v in curve["newest"][name].items()}
         about = {
             "part": part,
@@ -308,47 +277,29 @@ def as_printed(curve: dict[str, Any], parts: dict[str, PaperPart]) -> dict[str, 
             )
         )
     reached = {"step": point["step"], "steps": curve["steps"], "commit": curve["commit"]}
-    return summary(outcomes, parts, Effort(paper_steps=curve["steps"])) | {"curve": reached}
-
-
-def draw(out: Path) -> Path:
-    """The pictures and the page of results.json in `out`, which takes up CURVE where it lies there;
-    the page's path.
-
-    Raises FormatError where results.json is not there, or CURVE is of another training.
-    """
-    results = _results(out)
-    if (out / CURVE).exists():
-        curve = json.loads((out / CURVE).read_bytes())
-        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
-            raise FormatError(
-                f"{out / CURVE} is not the CNN as printed; run python -m train.studies cnn-curve --size whole"
-            )
-        results = joined(as_printed(curve, FULL) | {"quick": results["quick"]}, results)
-        put(out / "results.json", _lines(results).encode())
-    page, pictures = paper_report.render(results, box_on_hard(out.parent / BOX_ON_HARD))
-    return html.publish(out, {"index": page}, pictures, provenance.of(results))
+    return summary(outcomes, cases, Effort(paper_steps=curve["steps"])) | {"curve": reached}
 
 
 def _outcomes(
-    parts: dict[str, PaperPart], steps: Sequence[Step], where: Where, effort: Effort, log: Log
+    cases: Mapping[str, StudyCase], steps: Sequence[Step], how: StudyRun
 ) -> Iterator[Outcome]:
     """Step by step; after each fold `log` gets the progress and an estimate of the time left."""
     todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
-    expected = [len(step.methods) * parts[part].folds * step.fold_s for step, part, _ in todo]
+    expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
     pace = 1 / (os.cpu_count() or 1)
     for i, (step, part, world) in enumerate(todo):
-        start, done, folds = time.monotonic(), 0, len(step.methods) * parts[part].folds
+        start, done, folds = time.monotonic(), 0, len(step.methods) * cases[part].folds
 
         def count(line: str) -> None:
             nonlocal done
             done += 1
             left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
             where_now = f"{i + 1}/{len(todo)} {part}, world {world}"  # noqa: B023
-            log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
+            how.log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
 
-        plan = Plan(step.methods, (parts[part].protocol,), (world,), step.means_removed, effort)
-        for result in evaluate(parts[part].load(world), plan, where, count):
+        protocols = (cases[part].protocol,)
+        plan = Plan(step.methods, protocols, (world,), step.means_removed, how.effort)
+        for result in evaluate(load(cases[part], world), plan, how.where, count):
             yield Outcome.of(part, world, result)
         took = time.monotonic() - start
         if took > expected[i] * pace / 10:  # else it came from the cache
@@ -356,7 +307,7 @@ def _outcomes(
 
 
 def summary(
-    outcomes: Sequence[Outcome], parts: dict[str, PaperPart], effort: Effort = FULL_EFFORT
+    outcomes: Sequence[Outcome], cases: Mapping[str, StudyCase], effort: Effort = FULL_EFFORT
 ) -> dict[str, Any]:
     """All that paper_report needs, as plain numbers."""
     groups: dict[tuple[str, str], list[Outcome]] = {}
@@ -365,8 +316,8 @@ def summary(
     lopo = {method: those for (part, method), those in groups.items() if part == "lopo"}
     return {
         "parts": {
-            k: {"sets": part.sets, "only": part.only, "protocol": part.protocol}
-            for k, part in parts.items()
+            name: {"sets": case.sets, "only": case.only, "protocol": case.protocol}
+            for name, case in cases.items()
         },
         "table": [_row(*key, those) for key, those in groups.items()],
         "costs": {
@@ -482,14 +433,3 @@ def _thinned(cost: Array) -> Array:
     axis."""
     ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
     return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)
-
-
-def _lines(results: dict[str, Any]) -> str:
-    """JSON with one line for each figure and each result, so that differences can be read."""
-
-    def text(value: Any) -> str:
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            return "[\n" + ",\n".join(json.dumps(item) for item in value) + "\n]"
-        return json.dumps(value)
-
-    return "{\n" + ",\n".join(f"{json.dumps(k)}: {text(v)}" for k, v in results.items()) + "\n}\n"

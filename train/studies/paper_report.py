@@ -58,7 +58,7 @@ def render(
     """The page (HTML) of a summary, as paper_experiment.summary gives it, and its pictures (SVG) by
     name.
 
-    box_on_hard: what the box answers to T-HARD's sweeps, see chart_report.box_on_hard.
+    box_on_hard: what the box answers to T-HARD's sweeps, see pages.box_on_hard.
     """
     report = PaperReport(summary)
     pictures = report.pictures()

@@ -1,20 +1,15 @@
-"""The page of the command stress: what breaks each method first. In: what it measured. Out:
-results.json, pictures, a page.
+"""Renders the page of the study `stress`: which corruptions break each method first.
 
-Nothing is computed here but differences and orders. The first method is ours; five at most are
-drawn.
+It computes nothing but differences and orders. The first method is ours; five at most are drawn.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from appliance.core.errors import FormatError
-from appliance.core.storage import put
 from train.evaluation.robustness import POINTS, TARGETS, at_targets, breaks_first
 from train.reports import html, provenance
 from train.reports.formatting import exact_percent, level, points
@@ -32,25 +27,6 @@ SHOWN = 3
 """Corruptions of each method in the table of what breaks it first."""
 
 
-def write(result: Json, out: Path) -> Path:
-    """results.json, the pictures and the page in the folder `out`; the page's path. Raises
-    FormatError as `render`."""
-    page, pictures = render(result)
-    put(out / "results.json", (json.dumps(result, allow_nan=False) + "\n").encode(), parents=True)
-    return html.publish(out, {"index": page}, pictures, provenance.of(result))
-
-
-def read(out: Path) -> Json:
-    """What `write` put into the folder `out`. Raises FormatError where it is not there."""
-    try:
-        result: Json = json.loads((out / "results.json").read_bytes())
-    except (OSError, ValueError) as e:
-        raise FormatError(
-            f"{out}/results.json is not of the command stress: {e}; run it without --draw"
-        ) from e
-    return result
-
-
 def render(result: Json) -> tuple[str, dict[str, str]]:
     """The page (HTML) and its pictures (SVG) by name. Raises FormatError where no method has a
     result."""
@@ -59,7 +35,7 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
     }
     if not entries:
         raise FormatError(
-            "no method has a result; run the command without --kept, or with other methods"
+            "no method has a result; run the study without --kept, or with other methods"
         )
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]

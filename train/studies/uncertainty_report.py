@@ -1,21 +1,17 @@
-"""How far the box's probabilities can be trusted. In: the figures of
-train.evaluation.uncertainty_cases. Out: a page, pictures.
+"""Renders the page of the study `certainty`: how far the box's probabilities can be trusted.
 
-Nothing is computed here; every sentence with a number takes it from the figures, so that it is true
-of whatever was run.
+It computes nothing. Every sentence with a number takes it from the results, so it is true of each
+run.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from appliance.core.storage import put
 from train.calibration.novelty import KEPT
 from train.models.methods import PACKAGED, SHIPPED
 from train.reports import formatting, html, provenance
@@ -72,13 +68,6 @@ ORIGIN = {
 """What was run: names in the results and on the page."""
 FLOORS = {0.0: 0.2, 0.5: 0.1, 0.8: 0.05, 0.9: 0.02, 0.95: 0.01}
 """Where an axis of shares may begin, and the step of its ticks."""
-
-
-def write(figures: dict[str, Any], out: Path) -> Path:
-    """results.json, the pictures and the page in the folder `out`; the page's path."""
-    page, pictures = render(figures)
-    put(out / "results.json", (json.dumps(figures) + "\n").encode(), parents=True)
-    return html.publish(out, {"index": page}, pictures, provenance.of(figures))
 
 
 def render(figures: Json) -> tuple[str, dict[str, str]]:

@@ -18,7 +18,7 @@ from train.cli.main import main
 from train.export import measure, precisions
 from train.export.measure import Measurement
 from train.models.peers import minirocket
-from train.studies import chart_report
+from train.studies import chart_experiment
 from train.studies.command import main as study
 
 KEYS = (
@@ -169,11 +169,13 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
         )
         == 0
     )
-    monkeypatch.setattr(chart_report, "QUICK", replace(chart_report.QUICK, named=("L-gauss",)))
+    monkeypatch.setattr(
+        chart_experiment, "QUICK", replace(chart_experiment.QUICK, methods=("L-gauss",))
+    )
     command = "chart"
-    assert study(["chart", "--quick", "--out", str(tmp_path / "chart"), *where]) == 0
+    assert study(["chart", "--quick", "--out", str(tmp_path / "chart.json"), *where]) == 0
     (candidate,) = json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"]
-    (dot,) = json.loads((tmp_path / "chart" / "chart.json").read_text())
+    (dot,) = json.loads((tmp_path / "chart.json").read_text())
     assert digests["choose"] == digests["chart"]
     assert measured["choose"].bundle_bytes == measured["chart"].bundle_bytes
     assert candidate["kb"] == dot["bundle_kb"] == measured["chart"].bundle_kb

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +15,6 @@ from appliance.signal.contact import ContactPositions
 from tests.factories.contacts import MIDDLE
 from tests.factories.paths import ROOT
 from train.studies import alignment, contact_plot, contact_table
-from train.studies.command import main as study
 
 
 @pytest.fixture
@@ -84,8 +81,8 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
 
 
 def committed() -> dict:
-    """The figures of the page in docs/alignment."""
-    return json.loads((ROOT / "docs" / "alignment" / "place.json").read_text())
+    """The results of the study `alignment`."""
+    return json.loads((ROOT / "docs" / "data" / "alignment.json").read_text())
 
 
 def test_the_headline_says_what_was_missed():
@@ -118,30 +115,3 @@ def test_the_headline_says_what_was_missed():
         "0.8 to 3.2 mm: too little",
     ):
         assert part in text, part
-
-
-def test_the_page_is_drawn_again_without_measuring(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    """Tables between their markers, and the picture. A missing or wrong file is named, with a
-    remedy."""
-    folder = ROOT / "docs" / "alignment"
-    page = (folder / "README.md").read_text()
-    cleared = re.sub(r"(?s)(<!-- (in short|alignment) -->).*?(?=<!-- /)", r"\1\n", page)
-    (tmp_path / "README.md").write_text(cleared)
-    (tmp_path / "place.json").write_bytes((folder / "place.json").read_bytes())
-    assert study(["alignment", "--draw", "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "README.md").read_text() == page
-    assert (tmp_path / "place.svg").read_text() == (folder / "place.svg").read_text()
-    capsys.readouterr()
-    assert study(["alignment", "--draw", "--out", str(tmp_path / "none")]) == FormatError.exit_code
-    assert (
-        "place.json cannot be read: No such file or directory; leave --draw away"
-        in capsys.readouterr().err
-    )
-    (tmp_path / "place.json").write_text("[1]")
-    assert study(["alignment", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
-    assert (
-        "place.json is not what python -m train.studies alignment wrote; leave --draw away to measure"
-        in capsys.readouterr().err
-    )

@@ -15,7 +15,7 @@ from train.metrics import score
 from train.studies import bench_table
 
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
-FIGURES = ROOT / "docs" / "bench.json"
+FIGURES = ROOT / "docs" / "data" / "bench.json"
 DOCUMENTS = [ROOT / "README.md", ROOT / "docs" / "reference" / "specifications.md"]
 MEASURED = {
     "inference": r"\binference\b[^\n]{0,80}?\d ?(ms|µs)\b",
@@ -30,7 +30,7 @@ MEASURED = {
 
 @pytest.fixture
 def figures() -> dict[str, Any]:
-    """Those of docs/bench.json."""
+    """Those of docs/data/bench.json."""
     return json.loads(FIGURES.read_bytes())
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from tests.factories.chart_data import DOTS, FRONT, SHOWN
-from train.studies import chart_report, pareto
+from tests.factories.study_pages import published
+from train.studies import pareto
 
 NAMES = [pareto.name(one) for one in DOTS]
 
@@ -21,7 +22,7 @@ NAMES = [pareto.name(one) for one in DOTS]
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The page's address, in a folder."""
-    return chart_report.write(tmp_path_factory.mktemp("chart"), DOTS).as_uri()
+    return published("chart", DOTS, tmp_path_factory.mktemp("chart")).as_uri()
 
 
 class BrowsedChart:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from appliance.core.errors import FormatError
 from tests.factories import rendered
 from tests.factories.development_data import entry, figures
 from tests.factories.page_reader import PageReader
-from tests.factories.paths import ROOT
+from tests.factories.study_pages import published
 from tests.factories.sweep_sets import tones
 from train.evaluation.evaluate import Where
 from train.metrics.score import Score
@@ -28,9 +28,9 @@ from train.studies import (
     development_times,
     scatter,
 )
-from train.studies.chart_report import ChartPart
 from train.studies.command import main
-from train.studies.development_experiment import Development, DevelopmentCase
+from train.studies.development_experiment import Development
+from train.studies.study import StudyCase, StudyRun, save
 
 
 def test_the_page_shows_every_figure():
@@ -68,12 +68,12 @@ def test_the_page_shows_every_figure():
     assert (read.wrong, read.open) == ([], [])
     assert {link for link in read.links if not link.startswith("#")} == {
         "chart.html",
-        "results.json",
+        "development.json",
         "../../README.md",
     }
     assert all(
         "mean nothing" in page or "means anything" in page.replace("\n", " ")
-        for page in development_report.render(figures(), quick=True)[0].values()
+        for page in development_report.render(figures() | {"quick": True})[0].values()
     )
 
 
@@ -105,7 +105,7 @@ def test_the_chart_has_an_axis_for_each_line_and_their_mean():
         "seeds": [1, 2],
     }
     assert "older than" not in pages["chart"]
-    assert '<a href="results.json" download>' in pages["chart"]
+    assert '<a href="development.json" download>' in pages["chart"]
     assert "Palpate, as shipped: 90.0 % in 0.1 ms" in pictures["front"]
     assert "best peer, QUANT: 85.0 % in 22 ms" in pictures["front"]
 
@@ -126,17 +126,17 @@ def test_the_mean_of_lines_counts_one_set_once():
 
 def test_every_case_has_words_for_people():
     """No protocol or published set is shown as the command takes it."""
-    for case in development_experiment.CASES:
+    for name, case in development_experiment.CASES.items():
         about = {
-            "case": case.name,
-            "protocol": case.part.protocol,
+            "case": name,
+            "protocol": case.protocol,
             "simulated": case.simulated,
             "materials": 2,
         }
-        assert case.part.protocol not in development_chart.plain_case(about)
-        assert case.part.protocol not in development_chart.about_case(about)
-        name = case.name.partition(", ")[0]
-        assert (name in development_chart.PUBLISHED) == case.part.sets[0].startswith("aeon:")
+        assert case.protocol not in development_chart.plain_case(about)
+        assert case.protocol not in development_chart.about_case(about)
+        name = name.partition(", ")[0]
+        assert (name in development_chart.PUBLISHED) == case.sets[0].startswith("aeon:")
 
 
 def test_the_best_peer_of_each_line_is_bold():
@@ -165,28 +165,31 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
         FormatError,
         match="no result of default or default-reattached or filter-bank or compact-50k; run the command",
     ):
-        development_report.write(figures(results=[entry("one", "quant", 0.9)]), tmp_path / "page")
-    assert not (tmp_path / "page").exists()
+        published("development", figures(results=[entry("one", "quant", 0.9)]), tmp_path)
+    assert not (tmp_path / "pages").exists()
 
 
-def experiment(folder: Path, *names: str, **given: Any) -> Development:
+def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: Any) -> Development:
     """Two cases on tones, which lie in `folder` as a file of real sweeps; the first with a learning
     curve."""
     tones().save(folder / "tones.npz")
     replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
-    cases = [
-        DevelopmentCase(
-            "tones",
-            ChartPart(("tones.npz",), "leave:session", real=True),
-            curve=development_experiment.EACH,
+    curve = development_experiment.EACH
+    cases = {
+        "tones": StudyCase(
+            ("tones.npz",), "leave:session", real=True, means_removed=True, curve=curve
         ),
-        DevelopmentCase(
-            "short", ChartPart(("short.npz",), "split:session=0,1->2", ("material=a,c",), real=True)
+        "short": StudyCase(
+            ("short.npz",),
+            "split:session=0,1->2",
+            ("material=a,c",),
+            real=True,
+            means_removed=True,
         ),
-    ]
+    }
     where = Where(jobs=1, cache=folder / "cache")
     settings = {"where": where, "log": lambda line: None, "data": folder} | given
-    return Development(cases, names, **settings)
+    return Development(cases, names, StudyRun(**settings), skipped)
 
 
 @pytest.mark.slow
@@ -200,17 +203,17 @@ def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
     assert there == {("short", "L-gauss", 0)} | {
         ("tones", m, n) for m in run.names for n in (0, 5, 10, 20)
     }
-    assert list(run.left_out) == ["spectrogram-svm, short"]
+    assert list(run.run.left_out) == ["spectrogram-svm, short"]
     assert [case["case"] for case in found["cases"]] == ["tones", "short"]
     assert [case["materials"] for case in found["cases"]] == [3, 2]
     assert all(
         r["seeds"] == [1, 2] and r["low"] <= r["mean"] <= r["high"] for r in found["results"]
     )
     assert any(line.startswith("1/2 tones, 10 each: ") for line in lines)
-    kept = experiment(tmp_path, *run.names, seeds=(1, 2), where=replace(run.where, kept=True))
+    kept = experiment(tmp_path, *run.names, seeds=(1, 2), where=replace(run.run.where, kept=True))
     assert kept.results() == found
     assert (
-        experiment(tmp_path, "L-knn", where=replace(run.where, kept=True)).results()["results"]
+        experiment(tmp_path, "L-knn", where=replace(run.run.where, kept=True)).results()["results"]
         == []
     )
 
@@ -219,7 +222,7 @@ def test_without_real_sweeps_their_cases_are_left_out(tmp_path: Path):
     """With what to name."""
     run = experiment(tmp_path, "L-gauss", data=None)
     assert run.results()["results"] == []
-    assert run.left_out["tones"] == "real sweeps; name their folder with --data or PALPATE_DATA"
+    assert run.run.left_out["tones"] == "real sweeps; name their folder with --data or PALPATE_DATA"
 
 
 def test_an_unknown_method_ends_it_before_anything_is_trained(tmp_path: Path):
@@ -231,17 +234,17 @@ def test_an_unknown_method_ends_it_before_anything_is_trained(tmp_path: Path):
 def test_what_is_not_wanted_is_not_run_and_named(tmp_path: Path):
     """A case with its curve, or one point of the curve; a name that does not exist is an error,
     with those that do."""
-    run = experiment(tmp_path, "L-gauss", not_wanted=["short", "tones, 5 each", "tones, 10 each"])
+    run = experiment(tmp_path, "L-gauss", skipped=["short", "tones, 5 each", "tones, 10 each"])
     assert {(r["case"], r["each"]) for r in run.results()["results"]} == {
         ("tones", 0),
         ("tones", 20),
     }
-    why = "not wanted in the run of L-gauss"
-    assert run.left_out == dict.fromkeys(["tones, 5 each", "tones, 10 each", "short"], why)
+    why = "skipped in the run of L-gauss"
+    assert run.run.left_out == dict.fromkeys(["tones, 5 each", "tones, 10 each", "short"], why)
     with pytest.raises(
         FormatError, match="'tone' is no case; leave out some of tones; tones, 5 each"
     ):
-        experiment(tmp_path, "L-gauss", not_wanted=["tone"]).results()
+        experiment(tmp_path, "L-gauss", skipped=["tone"]).results()
 
 
 def test_other_precisions_of_a_method_are_counted_with_it():
@@ -259,12 +262,12 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 def test_the_usual_methods_and_cases_exist():
     """Every peer by its name; every set and protocol can be read, each set with a learning curve;
     the page ends with simulated sweeps."""
-    assert set(development_experiment.PEERS) < set(development_experiment.usual_methods())
-    assert set(development_experiment.usual_methods()) <= set(methods.every())
-    names = [case.name for case in development_experiment.CASES]
-    assert len(set(names)) == len(names) == 12
-    assert [case.name for case in development_experiment.CASES if case.simulated] == [names[-1]]
-    assert [len(case.curve) for case in development_experiment.CASES] == [
+    usual = set(development_experiment.usual_methods(development_experiment.STUDY))
+    assert set(development_experiment.PEERS) < usual <= set(methods.every())
+    cases = development_experiment.CASES
+    assert len(cases) == 12
+    assert [name for name, case in cases.items() if case.simulated] == [list(cases)[-1]]
+    assert [len(case.curve) for case in cases.values()] == [
         3,
         0,
         0,
@@ -322,7 +325,7 @@ def test_a_run_of_other_sweeps_is_not_joined():
 
 
 def cases_named(*names: str) -> list[dict[str, Any]]:
-    """Cases as results.json has them, each of a set of its own."""
+    """Cases as the results have them, each of a set of its own."""
     return [figures()["cases"][0] | {"case": name, "set": name} for name in names]
 
 
@@ -434,7 +437,7 @@ def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
     assert rows["7 fabrics: a force it never felt"]["met"] == (word == "reached")
     assert rows["7 fabrics: a force it never felt"]["target"] == "≥ 90 %"
     assert rows["7 fabrics: a force it never felt"]["here"].startswith("90.0 % [85.0, 95.0]")
-    assert set(development_report.WANTED) <= {one.name for one in development_experiment.CASES}
+    assert set(development_report.WANTED) <= development_experiment.CASES.keys()
 
 
 def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
@@ -514,36 +517,32 @@ def test_all_methods_are_timed_in_one_run(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("text", "why"),
-    [(None, "cannot be read"), ("{", "is not what"), ("[]", "is not what"), ("{}", "is not what")],
+    [(None, "No such file"), ("{", "not JSON"), ("[]", "has no"), ("{}", "has no")],
 )
-def test_what_is_no_result_is_not_joined_or_drawn(
+def test_other_results_are_not_joined_or_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, why: str
 ):
     """A missing file, half a file and another file: the error names it, nothing is written."""
     if text is not None:
-        (tmp_path / "results.json").write_text(text)
-    assert main(["development", "--draw", "--out", str(tmp_path)]) == FormatError.exit_code
-    shown = capsys.readouterr().err
-    assert why in shown
-    assert "results.json" in shown
-    assert not (tmp_path / "index.html").exists()
-
-
-def test_the_page_is_drawn_again_from_what_lies_there(tmp_path: Path):
-    """The same files, and nothing is run."""
-    development_report.write(figures(), tmp_path)
-    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
-    for name in before.keys() - {"results.json"}:
-        (tmp_path / name).unlink()
-    assert main(["development", "--draw", "--out", str(tmp_path)]) == 0
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == before
+        (tmp_path / "development.json").write_text(text)
+    file, out = str(tmp_path / "development.json"), str(tmp_path / "pages")
+    for command in (
+        ["pages", "development", "--results", str(tmp_path), "--out", out],
+        ["development", "--times", "--out", file],
+        ["paper", "--method", "L-gauss", "--out", file],
+    ):
+        assert main(command) == FormatError.exit_code
+        shown = capsys.readouterr().err
+        assert why in shown
+        assert "development.json" in shown
+    assert not (tmp_path / "pages").exists()
 
 
 def test_times_alone_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Of all methods of the results; accuracies stay; not together with --draw."""
-    development_report.write(figures(), tmp_path)
+    """Of all methods of the results; accuracies stay."""
+    file = save(tmp_path / "development.json", figures())
     asked: list[Any] = []
 
     def measured(names: list[str], *given: Any) -> dict[str, Any]:
@@ -552,83 +551,52 @@ def test_times_alone_are_measured_again(
 
     monkeypatch.setattr(development_times, "measured", measured)
     monkeypatch.setattr(Development, "results", lambda run: pytest.fail("accuracy was run"))
-    args = ["development", "--quick", "--out", str(tmp_path), "--times"]
-    assert main(args) == 0
+    assert main(["development", "--quick", "--out", str(file), "--times"]) == 0
     assert asked == [(figures()["methods"], 1)]
-    found = json.loads((tmp_path / "results.json").read_text())
+    found = json.loads(file.read_text())
     assert found["times"]["format"] == "measured again"
     assert found["results"] == figures()["results"]
-    with pytest.raises(SystemExit):
-        main([*args, "--draw"])
-    assert "not allowed with" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Results, pictures and a page that says what it is; --kept with fewer methods makes one of
-    these alone."""
+    """Results that say what they are; --kept with fewer methods reports these alone; their page has
+    all pictures and its warning."""
     args = ["development", "--quick", "--jobs", "1", "--cache", str(tmp_path / "cache")]
-    assert main([*args, "--out", str(tmp_path / "a")]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "a" / "index.html")
-    found = json.loads((tmp_path / "a" / "results.json").read_text())
-    assert {r["method"] for r in found["results"]} == set(development_experiment.QUICK_METHODS)
-    assert {path.name for path in (tmp_path / "a").iterdir()} == {
-        "results.json",
+    file, quick = tmp_path / "a.json", set(development_experiment.QUICK.methods)
+    assert main([*args, "--out", str(file)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(file)
+    found = json.loads(file.read_text())
+    assert {r["method"] for r in found["results"]} == quick
+    page = published("development", found, tmp_path)
+    assert {path.name for path in page.parent.iterdir()} == {
+        "development.json",
         "index.html",
         "chart.html",
-        "README.md",
         "accuracy.svg",
         "curves.svg",
         "front.svg",
     }
     assert {"commit", "machine", "seeds", "effort"} <= found["runs"][0].keys()
-    assert {one["method"] for one in found["times"]["entries"]} == set(
-        development_experiment.QUICK_METHODS
-    )
-    assert "mean nothing" in (tmp_path / "a" / "index.html").read_text()
+    assert {one["method"] for one in found["times"]["entries"]} == quick
+    assert "mean nothing" in page.read_text()
     assert (
-        main([*args, "--kept", "--method", "compact-50k,L-gauss", "--out", str(tmp_path / "b")])
+        main(
+            [*args, "--kept", "--method", "compact-50k,L-gauss", "--out", str(tmp_path / "b.json")]
+        )
         == 0
     )
-    again = json.loads((tmp_path / "b" / "results.json").read_text())
+    again = json.loads((tmp_path / "b.json").read_text())
     assert again["results"] == [r for r in found["results"] if r["method"] != "edge-spectral"]
-    assert (
-        main([*args, "--kept", "--method", "quant", "--out", str(tmp_path / "c")])
-        == FormatError.exit_code
-    )
-    assert "no result of default" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 def test_both_pages_can_be_read(browser: Any, tmp_path: Path, width: int, scheme: str):
-    """Nothing cut off, no axis without title, no raw brace, enough contrast; and so for the chart
-    of today's results."""
-    development_report.write(figures(), tmp_path)
+    """Nothing cut off, no axis without title, no raw brace, enough contrast."""
+    page = published("development", figures(), tmp_path)
     for name in ("index", "chart"):
-        assert (
-            rendered.faults(browser, rendered.address(tmp_path / f"{name}.html"), width, scheme)
-            == {}
-        ), name
-    for page in ("development/index.html", "development/chart.html", "chart/index.html"):
-        assert (
-            rendered.faults(browser, rendered.address(ROOT / "docs" / page), width, scheme) == {}
-        ), page
-
-
-@pytest.mark.slow
-def test_the_pages_show_the_results_beside_them(tmp_path: Path):
-    """Drawn again from results.json and chart.json they say what those in docs/ say, word by
-    word."""
-    for folder, file in (("development", "results.json"), ("chart", "chart.json")):
-        docs, again = ROOT / "docs" / folder, tmp_path / folder
-        again.mkdir()
-        shutil.copy(docs / file, again)
-        if folder == "chart":
-            shutil.copytree(ROOT / "docs" / "alignment", tmp_path / "alignment")
-        assert main([folder, "--draw", "--out", str(again)]) == 0
-        for path in (path for path in again.iterdir() if path.suffix in (".html", ".svg")):
-            shown, there = (PageReader(one.read_text()).text for one in (path, docs / path.name))
-            assert shown == there, f"{path.name}: palpate-train {folder} --draw"
+        address = rendered.address(page.with_name(f"{name}.html"))
+        assert rendered.faults(browser, address, width, scheme) == {}, name

@@ -1,5 +1,5 @@
-"""The pages under docs/ as their readers have them: each is in the list of `reports`, has its
-header, and can be read."""
+"""Results below docs/data, the pages that are drawn of them, and the pictures of written pages: each
+is in a list that commands know, has its header, and can be read."""
 
 from __future__ import annotations
 
@@ -12,18 +12,34 @@ import pytest
 
 from tests.factories import rendered
 from tests.factories.paths import ROOT
+from tests.factories.study_pages import RESULTS
+from tests.rig import soak, soak_page
 from train.reports import html, provenance
-from train.studies import docs_pages, paper_experiment
-from train.studies.docs_pages import DocsPage
+from train.studies import pages, reports
 
 DOCS = ROOT / "docs"
-HTML = sorted(DOCS.rglob("*.html"))
+HTML = (
+    *(f"{name}/index.html" for name in pages.PAGES),
+    "development/chart.html",
+    "soak/index.html",
+)
 SVG = sorted(DOCS.rglob("*.svg"))
 MARKDOWN = [*ROOT.glob("*.md"), *sorted(DOCS.rglob("*.md"))]
-CURVE = DOCS / "paper" / paper_experiment.CURVE
-"""Which the paper's page takes up into its results."""
+CURVE = RESULTS / "cnn-curve.json"
+"""Its newest point is in the results of `paper`."""
 METHODS = {"method", "methods", "shipped"}
-"""Keys of results that tell of methods, and so of the default."""
+"""Keys of results about methods, and so about the default."""
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all pages of the results in docs/data."""
+    out = tmp_path_factory.mktemp("site") / "results"
+    pages.write((), out, RESULTS)
+    results = json.loads((RESULTS / "soak.json").read_bytes())
+    page, svg = soak_page.render(results)
+    html.publish(out / "soak", {"index": page}, {"soak": svg}, provenance.of(results))
+    return out
 
 
 def name(path: Path) -> str:
@@ -31,82 +47,72 @@ def name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-def tells_of_a_default(figures: Any) -> bool:
+def about_a_default(figures: Any) -> bool:
     """Whether figures are of methods or of a bundle, wherever they say so."""
     if isinstance(figures, dict):
         return (
             bool(METHODS & figures.keys())
             or "bundle" in figures
-            or any(map(tells_of_a_default, figures.values()))
+            or any(map(about_a_default, figures.values()))
         )
-    return isinstance(figures, list) and any(map(tells_of_a_default, figures))
+    return isinstance(figures, list) and any(map(about_a_default, figures))
 
 
-def test_every_page_and_every_result_that_tells_of_a_default_is_listed():
-    """What lies under docs/ is found, not listed: a page that `reports` does not know would grow
-    stale unseen."""
-    folders = {
-        (DOCS / page.file).parent for page in docs_pages.PAGES if page.file.endswith(".html")
-    }
-    assert [name(path) for path in HTML if path.parent not in folders] == []
+def test_every_result_about_a_default_is_listed():
+    """A file of results that `reports` does not know would grow stale unseen; git holds no page
+    that is built."""
+    assert list(DOCS.rglob("*.html")) == []
     results = [
-        path for path in DOCS.rglob("*.json") if tells_of_a_default(json.loads(path.read_bytes()))
+        path for path in DOCS.rglob("*.json") if about_a_default(json.loads(path.read_bytes()))
     ]
     assert len(results) >= 5
-    listed = {CURVE, *(DOCS / page.results for page in docs_pages.PAGES)}
+    listed = {CURVE, *(DOCS / report.file for report in reports.REPORTS)}
     assert [name(path) for path in results if path not in listed] == []
 
 
-@pytest.mark.parametrize("page", docs_pages.PAGES, ids=lambda page: page.name)
-def test_a_page_shows_its_results_and_says_first_if_they_are_older(page: DocsPage):
-    """Its header is that of the file beside it: commit, sets, seeds; where the default was another
-    one, the first line behind the title says so."""
-    shown = provenance.read(DOCS / page.results)
-    assert shown.commit
-    beside = HTML if page.file.endswith(".html") else []
-    for path in {
-        DOCS / page.file,
-        *(other for other in beside if other.parent == (DOCS / page.file).parent),
-    }:
-        assert provenance.read(path) == shown, path
-        if path.suffix == ".html":
-            first = re.search(r"</h1>\s*(?:<p[^>]*>(.*?)</p>)?", path.read_text(), re.DOTALL)
-            assert shown.older in (first[1] or ""), (
-                f"{path}: python -m train.studies reports, or reports --draw"
-            )
-        elif path.suffix == ".md":
-            assert f" -->\n> **{shown.older}**\n" in path.read_text() or not shown.older
+def test_every_picture_is_shown_once_at_least():
+    """No picture without a page that shows it."""
+    text = "".join(path.read_text() for path in MARKDOWN)
+    pictures = [*SVG, *DOCS.rglob("*.png")]
+    assert [name(path) for path in pictures if f"{path.name})" not in text] == []
 
 
-@pytest.mark.parametrize(
-    "page", [page for page in docs_pages.PAGES if "/" in page.file], ids=lambda page: page.name
-)
-def test_a_page_and_its_pictures_are_of_the_same_run(page: DocsPage):
-    """Every picture in its folder has the header of its results."""
-    pictures = [path for path in SVG if path.parent == (DOCS / page.file).parent]
-    assert {provenance.read(path) for path in pictures} <= {provenance.read(DOCS / page.results)}
+@pytest.mark.parametrize("report", reports.REPORTS, ids=lambda report: report.name)
+def test_results_say_where_they_are_from(report: reports.ResultFile):
+    """Commit, and what else their provenance finds."""
+    assert provenance.read(DOCS / report.file).commit
 
 
-@pytest.mark.parametrize("path", HTML, ids=name)
-def test_a_page_leads_home_and_has_its_pictures_beside_it(path: Path):
-    """To README, which is there; for those who see no HTML a README.md in its folder shows a
-    picture and names the page."""
-    assert f'<nav><a href="{html.HOME}">' in path.read_text()
-    assert (path.parent / html.HOME).resolve() == ROOT / "README.md"
-    beside = (path.parent / "README.md").read_text()
-    assert re.search(r"!\[[^\]]+\]\([^)]+\.(svg|png)\)", beside)
-    assert "(index.html)" in beside
+def test_a_page_shows_its_results_and_says_first_if_they_are_older(drawn: Path):
+    """Its header, and that of its pictures, is that of its results; if the default was another one,
+    the first line behind the title says so."""
+    for page in drawn.glob("*/*.html"):
+        shown = provenance.read(RESULTS / f"{page.parent.name}.json")
+        assert provenance.read(page) == shown, page
+        assert {provenance.read(path) for path in page.parent.glob("*.svg")} <= {shown}
+        first = re.search(r"</h1>\s*(?:<p[^>]*>(.*?)</p>)?", page.read_text(), re.DOTALL)
+        assert shown.older in (first[1] or ""), page
+        assert f'<nav><a href="{html.HOME}">' in page.read_text()
+    assert {str(path.relative_to(drawn)) for path in drawn.glob("*/*.html")} == set(HTML)
+
+
+def test_the_soak_is_drawn_of_its_results(tmp_path: Path):
+    """Without a new record results stay byte by byte, as the site's build needs it."""
+    file = tmp_path / "soak.json"
+    file.write_bytes((RESULTS / "soak.json").read_bytes())
+    assert soak.draw([tmp_path], file, tmp_path / "page")
+    assert file.read_bytes() == (RESULTS / "soak.json").read_bytes()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
-@pytest.mark.parametrize("path", HTML, ids=name)
-def test_a_page_can_be_read(browser: Any, path: Path, width: int, scheme: str):
+@pytest.mark.parametrize("page", HTML)
+def test_a_page_can_be_read(browser: Any, drawn: Path, page: str, width: int, scheme: str):
     """On a phone, a tablet and a desk, by day and by night: no column or text is cut off, every
     axis has a title, contrast is 4.5 at least, tables have heads and take the focus where they
     scroll, and no brace was left."""
-    assert rendered.faults(browser, rendered.address(path), width, scheme) == {}
+    assert rendered.faults(browser, rendered.address(drawn / page), width, scheme) == {}
 
 
 @pytest.mark.slow
@@ -118,12 +124,12 @@ def test_a_picture_can_be_read(browser: Any, path: Path, scheme: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", HTML, ids=name)
-def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, path: Path):
+@pytest.mark.parametrize("name", HTML)
+def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, drawn: Path, name: str):
     """The first Tab is on the way back to README; the focus can be seen there."""
     context = browser.new_context()
     page = context.new_page()
-    page.goto(rendered.address(path))
+    page.goto(rendered.address(drawn / name))
     page.keyboard.press("Tab")
     found = page.evaluate(
         "[document.activeElement.getAttribute('href'), getComputedStyle(document.activeElement).outlineStyle]"

@@ -17,10 +17,11 @@ from train.metrics import score
 from train.reports import provenance
 from train.studies import document_figures
 from train.studies.command import main
-from train.studies.document_figures import ALIGN, FIGURES, SPECIFICATIONS
+from train.studies.document_figures import ALIGN, FIGURES, PICTURES, SPECIFICATIONS, DocumentPicture
+from train.studies.study import results_file
 
 DOCUMENTS = sorted({figure.document for figure in FIGURES})
-MARKED = re.compile(r"<!-- (?!provenance|/)([a-z-]+) -->\n")
+MARKED = re.compile(r"<!-- (?!provenance|/)([a-z -]+) -->\n")
 PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+\.svg)\)")
 Break = Callable[[Path], Any]
 
@@ -28,7 +29,9 @@ Break = Callable[[Path], Any]
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the documents and results of this project, as the working folder."""
-    for name in {*DOCUMENTS, *(figure.results for figure in FIGURES)}:
+    results = {figure.results for figure in (*FIGURES, *document_figures.PICTURES)}
+    pictures = [picture.file for picture in document_figures.PICTURES]
+    for name in {*DOCUMENTS, *pictures, *(str(results_file(name)) for name in results)}:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
     monkeypatch.chdir(tmp_path)
@@ -48,12 +51,20 @@ def test_all_markers_of_a_document_are_written(name: str):
     assert set(MARKED.findall((ROOT / name).read_text(encoding="utf-8"))) == known
 
 
+@pytest.mark.parametrize("picture", PICTURES, ids=lambda picture: picture.file)
+def test_pictures_show_their_results(picture: DocumentPicture):
+    """To the byte: `python -m train.studies figures` writes a picture that differs."""
+    assert (ROOT / picture.file).read_text(encoding="utf-8") == document_figures.drawn(
+        picture, ROOT
+    )
+
+
 def test_the_command_writes_what_has_changed_and_nothing_else(
     project: Path, capsys: pytest.CaptureFixture[str]
 ):
     """A changed figure changes its documents, and text beside the markers stays; a second run
     changes nothing."""
-    results, before = project / document_figures.BENCH, (project / SPECIFICATIONS).read_text()
+    results, before = project / results_file("bench"), (project / SPECIFICATIONS).read_text()
     figures = json.loads(results.read_bytes())
     figures["rss_mb"]["after_1000"] = 1234.5
     results.write_text(json.dumps(figures))
@@ -74,16 +85,16 @@ def test_the_command_writes_what_has_changed_and_nothing_else(
     ("damage", "said"),
     [
         (
-            lambda root: (root / document_figures.BENCH).unlink(),
-            "docs/bench.json does not hold the figures of 'bench': .*make bench",
+            lambda root: (root / results_file("bench")).unlink(),
+            "docs/data/bench.json does not hold the figures of 'bench': .*make bench",
         ),
         (
-            lambda root: (root / document_figures.BENCH).write_text("{"),
-            "docs/bench.json .* run `make bench`",
+            lambda root: (root / results_file("bench")).write_text("{"),
+            "docs/data/bench.json .* run `make bench`",
         ),
         (
-            lambda root: (root / document_figures.ALIGNMENT).write_text('{"moved": {"rows": []}}'),
-            "place.json .* run `python -m train.studies alignment",
+            lambda root: (root / results_file("alignment")).write_text('{"moved": {"rows": []}}'),
+            "alignment.json .* run `python -m train.studies alignment",
         ),
         (
             lambda root: (root / "README.md").write_text("# no markers"),

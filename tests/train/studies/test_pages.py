@@ -3,7 +3,6 @@ and needs nothing else."""
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 from tests.factories import choice_data
 from tests.factories.page_reader import PageReader
 from tests.factories.paths import ROOT
+from tests.factories.study_pages import committed
 from tests.rig import soak_page
 from train.evaluation.robustness import at_targets
 from train.reports import formatting, html, selection_report
@@ -26,11 +26,6 @@ from train.studies import chart_page, paper_report, scatter, stress_report, unce
 from train.studies.method_names import plain_name
 
 Facts = Iterator[str]
-
-
-def committed(path: str) -> Any:
-    """What an earlier run has left in docs/."""
-    return json.loads((ROOT / "docs" / path).read_text())
 
 
 def number(value: float, places: int = 1) -> str:
@@ -152,24 +147,24 @@ def choice_facts(choice: Any) -> Facts:
 
 
 SMALL = '"metal or plastic <smooth>" may count as one, 96.5 % of sweeps are right among 2 names'
-CHART = committed("chart/chart.json")
+CHART = committed("chart")
 PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
     "paper": (
-        lambda: paper_report.render(committed("paper/results.json"))[0],
-        lambda: paper_facts(committed("paper/results.json")),
+        lambda: paper_report.render(committed("paper"))[0],
+        lambda: paper_facts(committed("paper")),
     ),
     "certainty": (
-        lambda: uncertainty_report.render(committed("certainty/results.json"))[0],
-        lambda: certainty_facts(committed("certainty/results.json")),
+        lambda: uncertainty_report.render(committed("certainty"))[0],
+        lambda: certainty_facts(committed("certainty")),
     ),
     "chart": (lambda: chart_page.html(CHART, scatter.chart(CHART)), lambda: chart_facts(CHART)),
     "stress": (
-        lambda: stress_report.render(committed("stress/results.json"))[0],
-        lambda: stress_facts(committed("stress/results.json")),
+        lambda: stress_report.render(committed("stress"))[0],
+        lambda: stress_facts(committed("stress")),
     ),
     "soak": (
-        lambda: soak_page.render(committed("soak/results.json"))[0],
-        lambda: soak_facts(committed("soak/results.json")),
+        lambda: soak_page.render(committed("soak"))[0],
+        lambda: soak_facts(committed("soak")),
     ),
     "choice": (
         lambda: selection_report.page(choice_data.choice()),

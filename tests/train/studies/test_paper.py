@@ -14,10 +14,13 @@ import pytest
 from appliance.core.errors import FormatError
 from appliance.sim.skin import MATERIALS
 from tests.factories.page_reader import PageReader
+from tests.factories.study_pages import published
 from train.evaluation.evaluate import Where
 from train.reports.html import picture
-from train.studies import paper_experiment, paper_report, paper_values
-from train.studies.paper_experiment import Outcome, PaperPart, Step
+from train.studies import paper_experiment, paper_report, paper_values, study
+from train.studies.command import main
+from train.studies.paper_experiment import Outcome, Step
+from train.studies.study import StudyCase, StudyRun, save
 
 SURE = 9.0
 FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
@@ -53,7 +56,7 @@ def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: 
 
 
 def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
-    """What `run` would write of made-up outcomes, as it reads back from results.json."""
+    """The results of made-up outcomes, as they are read back."""
     outcomes = [
         outcome(p, m, w)
         for p in paper_experiment.FULL
@@ -62,9 +65,7 @@ def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
     ]
     outcomes += [outcome(p, cnn, right=0.9) for p in ("lopo", "hard") if cnn]
     more = {"quick": quick}
-    return json.loads(
-        paper_experiment._lines(paper_experiment.summary(outcomes, paper_experiment.FULL) | more)
-    )
+    return json.loads(study.text(paper_experiment.summary(outcomes, paper_experiment.FULL) | more))
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +246,7 @@ def curve(step: int = 400) -> dict[str, Any]:
     taken for the next."""
     made = {
         part: outcome(part, "paper-cnn", right=1.0, places=9)
-        for part in paper_experiment.CURVE_PARTS
+        for part in paper_experiment.CURVE_CASES
     }
     for one in made.values():
         one.logits[one.place == 10_008] = np.eye(6)[1]
@@ -255,7 +256,7 @@ def curve(step: int = 400) -> dict[str, Any]:
             "position": made[part].place.tolist(),
             "logits": made[part].logits.tolist(),
         }
-        for part, name in paper_experiment.CURVE_PARTS.items()
+        for part, name in paper_experiment.CURVE_CASES.items()
     }
     points = [
         {
@@ -277,11 +278,12 @@ def curve(step: int = 400) -> dict[str, Any]:
 
 
 def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
-    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training beside
-    results.json is refused."""
-    (tmp_path / "results.json").write_text(json.dumps(summary(cnn=paper_values.CNNS[1])))
-    (tmp_path / paper_experiment.CURVE).write_text(json.dumps(curve()))
-    text = " ".join(PageReader(paper_experiment.draw(tmp_path).read_text()).text.split())
+    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training is refused."""
+    file = save(tmp_path / "paper.json", summary(cnn=paper_values.CNNS[1]))
+    followed = save(tmp_path / "cnn-curve.json", curve())
+    assert main(["paper", "--curve", str(followed), "--out", str(file)]) == 0
+    taken = json.loads(file.read_text())
+    text = " ".join(PageReader(published("paper", taken, tmp_path).read_text()).text.split())
     for fact in (
         "the CNN (400 of 4000 iterations of 50)",
         "at iteration 400 of 4000",
@@ -290,7 +292,6 @@ def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
         "Ours ended at 0.0025",
     ):
         assert fact in text, fact
-    taken = json.loads((tmp_path / "results.json").read_text())
     assert [row["ran"] for row in taken["table"] if row["method"] == "paper-cnn"] == [
         "400 of 4000 iterations of 50"
     ] * 2
@@ -303,14 +304,11 @@ def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
         None,
     )
     assert found["several"]["paper-cnn"]["product"][0][0] == lopo["share"][0]
-    (tmp_path / paper_experiment.CURVE).write_text(
-        json.dumps(curve() | {"about": ["small", 1, False]})
-    )
     with pytest.raises(
         FormatError,
-        match=r"is not the CNN as printed; run python -m train\.studies cnn-curve --size whole",
+        match=r"is not of the CNN as printed; run python -m train\.studies cnn-curve --size whole",
     ):
-        paper_experiment.draw(tmp_path)
+        paper_experiment.with_curve(taken, curve() | {"about": ["small", 1, False]})
 
 
 def test_some_methods_are_run_again_and_the_others_stay():
@@ -392,24 +390,23 @@ def test_plans_name_methods_and_parts_that_exist():
 def test_run_writes_everything_and_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A tiny plan writes page, pictures and results; a second run takes the kept folds and gives
-    the same figures."""
+    """A tiny plan: page and pictures are made of its results; a second run takes the cached folds
+    and gives the same figures."""
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
     parts = {
-        "lopo": PaperPart((real,), "leave:position", 2, one),
-        "hard": PaperPart((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", 1, one),
-        "lab": PaperPart(("sim:T-LAB:100{w}:2",), "random:2", 2),
-        "random": PaperPart((real,), "random:2", 2, one),
+        "lopo": StudyCase((real,), "leave:position", one, folds=2),
+        "hard": StudyCase((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", one, folds=1),
+        "lab": StudyCase(("sim:T-LAB:100{w}:2",), "random:2", folds=2),
+        "random": StudyCase((real,), "random:2", one, folds=2),
     }
     monkeypatch.setattr(paper_experiment, "QUICK", parts)
     monkeypatch.setattr(
         paper_experiment, "QUICK_STEPS", (Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1),)
     )
     where, lines = Where(jobs=1, cache=tmp_path / "cache"), []
-    made = paper_experiment.run(tmp_path / "a", True, where, lines.append)
-    assert made == tmp_path / "a" / "index.html"
+    results = paper_experiment.results(StudyRun(where, lines.append, quick=True))
+    made = published("paper", results, tmp_path)
     assert 'class="stop"' in made.read_text()
-    results = json.loads((tmp_path / "a" / "results.json").read_text())
     assert {p.stem for p in made.parent.glob("*.svg")} == {
         f"figure-{n}" for n in (4, 5, 6, 7, 13)
     } | {"methods"}
@@ -418,7 +415,6 @@ def test_run_writes_everything_and_goes_on_where_it_was(
     assert "4/4 random, world 1" in lines[-1]
     assert all(" left" in line for line in lines)
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
-    paper_experiment.run(tmp_path / "b", True, where)
+    again = paper_experiment.results(StudyRun(where, lines.append, quick=True))
     assert kept == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
-    again = json.loads((tmp_path / "b" / "results.json").read_text())
     assert results == again

@@ -14,9 +14,9 @@ import pytest
 from appliance.core.errors import FormatError
 from tests.factories import rendered, stress_data
 from tests.factories.page_reader import PageReader
+from tests.factories.study_pages import published
 from train.reports import formatting, html
 from train.studies import stress_plots, stress_report
-from train.studies.command import main
 from train.studies.method_names import plain_name
 
 OURS, EARLIER = plain_name("default"), plain_name("compact")
@@ -147,21 +147,21 @@ def test_without_a_box_and_with_nothing_that_breaks():
     assert "As the box answers" not in text
     assert "box, rightly" not in text
     figures["methods"] = {}
-    with pytest.raises(FormatError, match="no method has a result; run the command without --kept"):
+    with pytest.raises(FormatError, match="no method has a result; run the study without --kept"):
         stress_report.render(figures)
 
 
-def test_the_page_is_drawn_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """--draw makes page and pictures of results.json alone, and says where there is none."""
-    assert main(["stress", "--draw", "--out", str(tmp_path / "none")]) == 65
-    assert "run it without --draw" in capsys.readouterr().err
-    stress_report.write(stress_data.figures(), tmp_path)
-    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    assert set(made) == {"results.json", "index.html", "README.md", "curves.svg", "box.svg"}
-    (tmp_path / "index.html").unlink()
-    assert main(["stress", "--draw", "--out", str(tmp_path)]) == 0
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == made
-    assert json.loads(made["results.json"])["test_sweeps"] == 100
+def test_the_page_is_drawn_from_its_results(tmp_path: Path):
+    """Page, pictures, and the results to which the page links."""
+    page = published("stress", stress_data.figures(), tmp_path)
+    assert {path.name for path in page.parent.iterdir()} == {
+        "stress.json",
+        "index.html",
+        "curves.svg",
+        "box.svg",
+    }
+    assert json.loads((page.parent / "stress.json").read_text())["test_sweeps"] == 100
+    assert "stress.json" in PageReader(page.read_text()).links
 
 
 @pytest.mark.slow
@@ -170,5 +170,5 @@ def test_the_page_is_drawn_again(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_reader_sees_all_of_it(browser: Any, tmp_path: Path, width: int, scheme: str):
     """On a phone and on a wide screen, light and dark: nothing is cut off, every axis has a title,
     all can be read."""
-    page = stress_report.write(stress_data.figures(), tmp_path)
+    page = published("stress", stress_data.figures(), tmp_path)
     assert rendered.faults(browser, rendered.address(page), width, scheme) == {}

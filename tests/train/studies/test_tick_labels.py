@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from appliance.core.types import SweepFormat
 from tests.factories import choice_data, development_data, stress_data
 from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
+from tests.factories.study_pages import committed
 from tests.rig import soak_page
 from train.reports import bundle_report, plot_style, selection_plots, sweep_plot
 from train.studies import (
@@ -34,13 +34,9 @@ from train.studies import (
 
 DRAWN_HERE = [
     *sorted((ROOT / "train" / "reports").glob("*.py")),
+    *sorted((ROOT / "train" / "studies").glob("*.py")),
     ROOT / "tests" / "rig" / "soak_page.py",
 ]
-
-
-def committed(path: str) -> Any:
-    """What an earlier run has left in docs/."""
-    return json.loads((ROOT / "docs" / path).read_text())
 
 
 def image() -> str:
@@ -55,21 +51,21 @@ def image() -> str:
 
 
 PICTURES: dict[str, Callable[[], Any]] = {
-    "paper": lambda: paper_report.render(committed("paper/results.json")),
+    "paper": lambda: paper_report.render(committed("paper")),
     "long training": lambda: plots.curve(
         [np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"
     ),
-    "certainty": lambda: uncertainty_report.render(committed("certainty/results.json")),
-    "chart": lambda: scatter.chart(committed("chart/chart.json")),
+    "certainty": lambda: uncertainty_report.render(committed("certainty")),
+    "chart": lambda: scatter.chart(committed("chart")),
     "small chart": lambda: scatter.chart(DOTS, ("speed", "lopo")),
     "stress": lambda: stress_report.render(stress_data.figures()),
-    "matrix": lambda: plots.matrix(committed("fabricslide/results.json")),
-    "alignment": lambda: contact_plot.draw(committed("alignment/place.json")),
+    "matrix": lambda: plots.matrix(committed("fabrics")),
+    "alignment": lambda: contact_plot.draw(committed("alignment")),
     "choice": lambda: selection_plots.sizes(
         choice_data.choice()["rungs"], "compact-4k", 0.9, "sizes"
     ),
     "less": lambda: selection_plots.reductions(choice_data.choice()["less"], "less"),
-    "soak": lambda: soak_page.charts(committed("soak/results.json")),
+    "soak": lambda: soak_page.charts(committed("soak")),
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
     "image": image,
     "development": lambda: development_report.render(development_data.figures()),

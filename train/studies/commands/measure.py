@@ -24,16 +24,8 @@ from train.evaluation.corruptions import EvaluationSweeps
 from train.export import bundle_stress, quantized_bundle
 from train.metrics import score
 from train.models import methods
-from train.reports import provenance
-from train.studies import (
-    alignment,
-    contact_plot,
-    contact_table,
-    marked_text,
-    sim_calibration,
-    stress_report,
-    uncertainty_report,
-)
+from train.studies import alignment, sim_calibration
+from train.studies.study import results_file, save
 
 STRESSED = "sim:T-REAL:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
@@ -49,6 +41,13 @@ def register(add: Add) -> None:
     _add_alignment(add)
     references = add("references", run_references)
     references.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _add_out(command: argparse.ArgumentParser, name: str) -> None:
+    file = results_file(name)
+    command.add_argument(
+        "--out", type=Path, default=file, metavar="FILE", help=f"file of results ({file})"
+    )
 
 
 def _add_calibrate(add: Add) -> None:
@@ -115,14 +114,7 @@ def _add_alignment(add: Add) -> None:
     command.add_argument(
         "--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead"
     )
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="where place.json and place.svg go"
-    )
-    command.add_argument(
-        "--draw",
-        action="store_true",
-        help="measure nothing: picture and tables of place.json in --out again",
-    )
+    _add_out(command, "alignment")
 
 
 def _add_stress(add: Add) -> None:
@@ -146,20 +138,9 @@ def _add_stress(add: Add) -> None:
     command.add_argument(
         "--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)"
     )
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path("docs/stress"),
-        metavar="DIR",
-        help="for results.json, pictures and page (docs/stress)",
-    )
+    _add_out(command, "stress")
     command.add_argument(
         "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
-    command.add_argument(
-        "--draw",
-        action="store_true",
-        help="run nothing: draw the page of results.json in --out again",
     )
     options.add_effort(command)
     options.add_where(command)
@@ -183,13 +164,7 @@ def _add_certainty(add: Add) -> None:
     command.add_argument(
         "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
     )
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path("docs/certainty"),
-        metavar="DIR",
-        help="where it goes (docs/certainty)",
-    )
+    _add_out(command, "certainty")
     command.add_argument(
         "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
     )
@@ -198,11 +173,7 @@ def _add_certainty(add: Add) -> None:
 
 
 def run_stress(args: argparse.Namespace) -> None:
-    """Write the figures, the pictures and the page; print the page's path. With --draw only the
-    pictures and the page."""
-    if args.draw:
-        print(stress_report.write(stress_report.read(args.out), args.out))
-        return
+    """Write the results; print their path."""
     train, seeds, log = options.load(args), options.seeds(args), options.Log()
     test = (
         EvaluationSweeps.simulated(args.test)
@@ -232,7 +203,7 @@ def run_stress(args: argparse.Namespace) -> None:
         "format": str(train.format),
         "seeds": list(seeds),
     } | score.provenance()
-    print(stress_report.write(result, args.out))
+    print(save(args.out, result))
 
 
 def _box_under_stress(
@@ -257,7 +228,7 @@ def _box_under_stress(
 
 
 def run_certainty(args: argparse.Namespace) -> None:
-    """Write the figures and the page; print the page's path."""
+    """Write the results; print their path."""
     test = sets.load(args.test).select(args.only) if args.test else None
     result = uncertainty.run(
         options.load(args),
@@ -269,7 +240,7 @@ def run_certainty(args: argparse.Namespace) -> None:
         options.effort(args),
         args.seed,
     )
-    print(uncertainty_report.write(result, args.out))
+    print(save(args.out, result))
 
 
 def run_calibrate(args: argparse.Namespace) -> None:
@@ -298,36 +269,12 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the figures and the plot, the tables into the page where one lies there, and
-    print a summary."""
-    if args.draw:
-        result = options.earlier_run(
-            args.out / "place.json",
-            "alignment",
-            {"bundle", "moved", "T-HARD", "other positions"},
-            "leave --draw away to measure",
-        )
-    else:
-        box = Classifier(bundle.load(args.bundle), SystemClock())
-        displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
-        progress = Progress(displacements, options.Log())
-        result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
-        put(args.out / "place.json", (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    about = provenance.of(result)
-    put(
-        args.out / "place.svg",
-        (provenance.in_svg(contact_plot.draw(result), about) + "\n").encode(),
-        parents=True,
-    )
-    page = args.out / "README.md"
-    if page.exists():
-        text = page.read_text(encoding="utf-8")
-        for name, content in (
-            ("in short", contact_table.headline(result)),
-            ("alignment", contact_table.table(result)),
-        ):
-            text = marked_text.insert(text, name, content, str(page))
-        put(page, provenance.in_markdown(text, about).encode())
+    """Measure, write the results, and print a summary."""
+    box = Classifier(bundle.load(args.bundle), SystemClock())
+    displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
+    progress = Progress(displacements, options.Log())
+    result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
+    save(args.out, result)
     print("\n".join(alignment.lines(result)))
 
 

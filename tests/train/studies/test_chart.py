@@ -19,7 +19,7 @@ from appliance.sim import skin
 from tests.factories.chart_data import DOTS, FRONT, SHOWN, dot
 from tests.factories.loud_model import loudness, sweeps
 from tests.factories.page_reader import PageReader
-from tests.factories.paths import ROOT
+from tests.factories.study_pages import committed, published
 from train.evaluation.evaluate import Where
 from train.metrics import score
 from train.models import methods
@@ -27,7 +27,16 @@ from train.models.recipe import graph
 from train.models.recipe.architectures import ARCHITECTURES
 from train.onnx_tools import cost
 from train.onnx_tools.quantize import quantize
-from train.studies import chart_page, chart_report, comparison, method_names, pareto, scatter
+from train.studies import (
+    chart_experiment,
+    chart_page,
+    comparison,
+    method_names,
+    pages,
+    pareto,
+    scatter,
+)
+from train.studies.study import Study, StudyCase, StudyRun
 
 KEYS = (
     "method",
@@ -112,11 +121,11 @@ def test_chance_is_that_of_the_sets():
     results say."""
     (fabrics,) = {
         one["materials"]
-        for one in json.loads((ROOT / "docs/development/results.json").read_text())["cases"]
-        if one["only"] == list(chart_report.SEVEN)
+        for one in committed("development")["cases"]
+        if one["only"] == list(chart_experiment.SEVEN)
     }
-    for key, part in chart_report.FULL.parts.items():
-        classes = fabrics if part.real else len(skin.MATERIALS)
+    for key in pareto.ACCURACIES.keys() & chart_experiment.STUDY.cases.keys():
+        classes = fabrics if chart_experiment.STUDY.cases[key].real else len(skin.MATERIALS)
         assert pareto.ACCURACIES[key].chance == pytest.approx(1 / classes), key
 
 
@@ -231,7 +240,7 @@ def test_seeds_are_joined():
         }
         for right, seed in ((80, 2), (90, 1))
     ]
-    assert chart_report.joined(results) == {
+    assert chart_experiment.joined(results) == {
         "mean": 0.85,
         "low": 0.75,
         "high": 0.9,
@@ -262,7 +271,7 @@ def test_stress_is_given_by_the_worst_and_at_the_targets():
         "gain-down": curve([0, 0.2], [0.9, 0.85]),
         "dead": curve([0, 1, 2], [0.9, 0.88, 0.1]),
     }
-    shown = chart_report.under_stress({"curves": curves, "seeds": [1, 2]})
+    shown = chart_experiment.under_stress({"curves": curves, "seeds": [1, 2]})
     assert (shown["stress"]["name"], shown["stress"]["mean"], shown["stress"]["n"]) == (
         "hum",
         0.4,
@@ -280,12 +289,12 @@ def test_touch_time_is_read_or_refused(tmp_path: Path):
     """A file of another kind is named."""
     path = tmp_path / "results.json"
     path.write_text(json.dumps({"method": "compact", "early": {"share": 0.5}}))
-    assert chart_report.touch_shares([path]) == {"compact": 0.5}
+    assert chart_experiment.touch_shares([path]) == {"compact": 0.5}
     path.write_text("[1]")
     with pytest.raises(
         FormatError, match=r"results\.json: not what python -m train.studies certainty wrote"
     ):
-        chart_report.touch_shares([path])
+        chart_experiment.touch_shares([path])
 
 
 @pytest.mark.slow
@@ -293,19 +302,19 @@ def test_touch_time_is_read_or_refused(tmp_path: Path):
 def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
     """A small chart end to end; real sweeps that nobody named are left out; kept, the accuracies
     are the same."""
-    parts = {
-        "lopo": chart_report.ChartPart(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
-        "force": chart_report.FULL.parts["force"],
+    cases = {
+        "lopo": StudyCase(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
+        "force": chart_experiment.STUDY.cases["force"],
+        chart_experiment.TRAIN: StudyCase(("sim:T-REAL:1001:2",)),
+        chart_experiment.STRESS: StudyCase(("sim:T-LAB:1002:1",)),
     }
-    chart = chart_report.Chart(
-        parts, "sim:T-REAL:1001:2", "sim:T-LAB:1002:1", ("L-gauss", "nobody"), ("H-knn",), rounds=1
-    )
+    study = Study("chart", cases, ("L-gauss", "nobody"), ("H-knn",))
     where = Where(1, "", tmp_path / "cache")
     found = []
     for one in (where, replace(where, kept=True)):
-        charting = chart_report.Charting(chart, one, lambda line: None)
-        found.append(charting.dots())
-        assert charting.left_out.keys() == {"nobody", "force"}
+        run = StudyRun(one, lambda line: None, quick=True)
+        found.append(chart_experiment.Chart(study, run).dots())
+        assert run.left_out.keys() == {"nobody", "force"}
     ((first,), (again,)) = found
     assert first["accuracy"] == again["accuracy"]
     assert {"lopo", "stress", "stress:none"} <= first["accuracy"].keys()
@@ -316,14 +325,13 @@ def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
 
 
 def test_the_files(tmp_path: Path):
-    """chart.json is a list of dots; picture and page name them; what is left out is named; a quick
-    run is marked."""
-    page = chart_report.write(tmp_path, DOTS, True, {"force": "no <data>"})
-    assert json.loads((tmp_path / "chart.json").read_text()) == DOTS
+    """chart.json is a list of dots; picture and page name them; a quick run is marked."""
+    quick = [one | {"quick": True} for one in DOTS]
+    page = published("chart", quick, tmp_path)
+    assert json.loads((page.parent / "chart.json").read_text()) == quick
     text = page.read_text()
     assert "quick run" in text
-    assert "Left out: force (no &lt;data&gt;)" in text
-    assert "quick run" not in chart_page.html(DOTS, "")
+    assert "quick run" not in chart_page.render(DOTS)[0]
     assert not re.search(
         r'(src|href)="(?!#|chart\.json|data:text/csv|\.\./)|https?://(?!www\.w3\.org)|@import|url\((?!#)',
         text,
@@ -332,8 +340,8 @@ def test_the_files(tmp_path: Path):
 
 
 def test_what_the_box_answers_stands_beside_what_networks_name(tmp_path: Path):
-    """The page takes it from the alignment's figures beside its folder; without them, or of an
-    older form, it says nothing."""
+    """The page takes it from the results of `alignment`; without them, or if they are older, it says
+    nothing."""
     share = [0.88, 0.85, 0.91]
     point = {
         "n": 432,
@@ -342,17 +350,13 @@ def test_what_the_box_answers_stands_beside_what_networks_name(tmp_path: Path):
         "wrong_share": [0.04, 0.02, 0.07],
         "network": [0.93, 0.9, 0.95],
     }
-    file = tmp_path / chart_report.BOX_ON_HARD
-    assert (
-        "the box also answers"
-        not in chart_report.write(tmp_path / "chart", DOTS).read_text().lower()
-    )
-    file.parent.mkdir()
-    for text in ("{", json.dumps({"T-HARD": {"accuracy": share}}), json.dumps({"rows": point})):
+    file = tmp_path / "data" / "alignment.json"
+    assert "the box also answers" not in published("chart", DOTS, tmp_path).read_text().lower()
+    for text in (json.dumps({"T-HARD": {"accuracy": share}}), json.dumps({"rows": point})):
         file.write_text(text)
-        assert chart_report.box_on_hard(file) is None
+        assert pages.box_on_hard(file.parent) is None
     file.write_text(json.dumps({"T-HARD": point}))
-    page = " ".join(chart_report.write(tmp_path / "chart", DOTS).read_text().split())
+    page = " ".join(published("chart", DOTS, tmp_path).read_text().split())
     for told in ("432 sweeps of T-HARD at 36 attachments", "88.0", "4.0", "93.0"):
         assert told in page
 
@@ -430,7 +434,7 @@ def test_methods_have_names_for_people():
     assert method_names.about("compact")
     assert not method_names.about("recurrent")
     assert method_names.NAMES.keys() <= methods.every().keys()
-    assert {method_names.family(name) for name in (*chart_report.COMPACT, "nobody")} == {
+    assert {method_names.family(name) for name in (*chart_experiment.OURS, "nobody")} == {
         "Palpate",
         "related work",
     }

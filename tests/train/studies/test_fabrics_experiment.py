@@ -13,12 +13,11 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
-from train.studies import fabrics_report
+from train.studies import fabrics_experiment, matrix_table
 from train.studies.command import main
 from train.studies.development_experiment import FOUR
 
 MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Linen", "WovenFabric")
-PAGE = "# Fabrics\n\n<!-- matrix -->\nold\n<!-- /matrix -->\n"
 
 
 @pytest.fixture
@@ -46,7 +45,7 @@ def data(tmp_path: Path) -> Path:
 
 def run(data: Path, *more: str, method: str = "static-svm") -> int:
     """The command on the made set, its folds kept beside it."""
-    out, cache = data / "page", data / "cache"
+    out, cache = data / "fabrics.json", data / "cache"
     return main(
         [
             "fabrics",
@@ -67,7 +66,7 @@ def run(data: Path, *more: str, method: str = "static-svm") -> int:
 
 def results(data: Path) -> list[dict[str, Any]]:
     """What the command wrote."""
-    found: list[dict[str, Any]] = json.loads((data / "page" / "results.json").read_bytes())
+    found: list[dict[str, Any]] = json.loads((data / "fabrics.json").read_bytes())
     return found
 
 
@@ -76,14 +75,12 @@ def results(data: Path) -> list[dict[str, Any]]:
 def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.CaptureFixture[str]):
     """Twelve tests, means removed first; a second method joins them, and what lay there of the
     first is as it was."""
-    (data / "page").mkdir()
-    (data / "page" / "README.md").write_text(PAGE)
     assert run(data) == 0
     first = results(data)
     assert [(r["means_removed"], r["protocol"]) for r in first] == [
         (removed, protocol)
         for removed in (True, False)
-        for _, protocols in fabrics_report.PARTS
+        for _, protocols in fabrics_experiment.PROTOCOLS
         for protocol in protocols
     ]
     assert Counter(len(r["materials"]) for r in first) == {7: 6, 4: 6}
@@ -92,30 +89,25 @@ def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.Captur
     both = results(data)
     assert [r for r in both if r["method"] == "static-svm"] == first
     assert len(both) == 24
-    page = (data / "page" / "README.md").read_text()
-    assert "| 7 classes: a force it never felt | removed |" in page
-    assert "old" not in page
-    assert {path.name for path in (data / "page").iterdir()} >= {"windows.svg", "recordings.svg"}
+    assert "| 7 classes: a force it never felt | removed |" in matrix_table.headline(both)
 
 
 def test_what_is_missing_is_named(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Real sweeps, a method that cannot take these, results to draw, a page to draw into: each by
+    """Real sweeps, results that cannot be read, a method that cannot use these sweeps: each by
     name."""
     monkeypatch.delenv("PALPATE_DATA", raising=False)
     assert (
-        main(["fabrics", "--method", "static-svm", "--out", str(data / "page")])
+        main(["fabrics", "--method", "static-svm", "--out", str(data / "fabrics.json")])
         == FormatError.exit_code
     )
     assert "name their folder with --data or PALPATE_DATA" in capsys.readouterr().err
+    (data / "fabrics.json").write_text("{")
     assert run(data) == FormatError.exit_code
-    assert "README.md is not there" in capsys.readouterr().err
+    assert "fabrics.json: not JSON" in capsys.readouterr().err
     assert not (data / "cache").exists()
-    (data / "page").mkdir()
-    (data / "page" / "README.md").write_text(PAGE)
-    assert run(data, "--draw") == FormatError.exit_code
-    assert "results.json is not of the command fabrics" in capsys.readouterr().err
+    (data / "fabrics.json").unlink()
     assert run(data, method="H-svm,static-svm") == 0
     assert "left out: H-svm: 40 frames" in capsys.readouterr().out
     assert {r["method"] for r in results(data)} == {"static-svm"}

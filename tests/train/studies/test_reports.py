@@ -1,9 +1,8 @@
-"""`python -m train.studies reports`: which pages are stale and why, what is run for them, and what happens
-where one fails."""
+"""`python -m train.studies reports`: which results are stale and why, which commands run for them, and
+what happens if one fails."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.metrics import score
-from train.reports import html, provenance
-from train.studies import docs_pages
+from train.studies import document_figures, reports
 from train.studies.command import main
-from train.studies.docs_pages import DocsPage
+from train.studies.reports import ResultFile
+from train.studies.study import save
 
 TODAY: dict[str, Any] = {
     "method": "default",
@@ -34,42 +33,23 @@ def today() -> dict[str, Any]:
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project with four pages: of today, older, never made, and one that needs what is not
-    here."""
+    """A project with four reports: of today, older, never made, and one with a need that is not
+    met here."""
     (tmp_path / "README.md").write_text("# Project\n")
+    (tmp_path / "docs" / "data").mkdir(parents=True)
     for name, results in (("current", today()), ("older", TODAY | {"shipped": "0badbead"})):
-        lay(tmp_path / "docs" / name, results, results)
-    monkeypatch.setitem(docs_pages.NEEDS, NEED, lambda: False)
-    pages = [
-        DocsPage(
-            "older",
-            "older/index.html",
-            "older/results.json",
-            ("train", "older"),
-            folds=True,
-            drawn=True,
-        ),
-        DocsPage(
-            "current",
-            "current/index.html",
-            "current/results.json",
-            ("train", "current", "--out", "x"),
-        ),
-        DocsPage(
-            "lacking", "lacking/index.html", "lacking/results.json", ("tests.lacking",), (NEED,)
-        ),
-        DocsPage("new", "new/index.html", "new/results.json", ("appliance", "new")),
-    ]
-    monkeypatch.setattr(docs_pages, "PAGES", tuple(pages))
+        save(tmp_path / "docs" / "data" / f"{name}.json", results)
+    monkeypatch.setitem(reports.NEEDS, NEED, lambda: False)
+    made = (
+        ResultFile("older", "data/older.json", ("train", "older"), folds=True),
+        ResultFile("current", "data/current.json", ("train", "current", "--out", "x")),
+        ResultFile("lacking", "data/lacking.json", ("tests.lacking",), (NEED,)),
+        ResultFile("new", "data/new.json", ("appliance", "new")),
+    )
+    monkeypatch.setattr(reports, "REPORTS", made)
+    monkeypatch.setattr(document_figures, "write", list)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def lay(folder: Path, results: dict[str, Any], shown: dict[str, Any]) -> None:
-    """Write results, and a page of those that it shows."""
-    page = html.render("base.html.j2", header=provenance.of(shown), home=html.HOME)
-    html.publish(folder, {"index": page}, {}, provenance.of(shown))
-    (folder / "results.json").write_text(json.dumps(results))
 
 
 class RunCommands:
@@ -95,9 +75,9 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
         "         python -m train older",
         "current  of today",
         "         python -m train current --out x",
-        f"lacking  stale: docs/lacking/index.html: No such file or directory; left out: it needs {NEED}",
+        f"lacking  stale: docs/data/lacking.json: No such file or directory; left out: it needs {NEED}",
         "         python -m tests.lacking",
-        "new      stale: docs/new/index.html: No such file or directory",
+        "new      stale: docs/data/new.json: No such file or directory",
         "         palpate new",
     ]
     assert main(["reports", "--list", "current"]) == 0
@@ -108,7 +88,7 @@ def test_stale_pages_are_made_in_order(project: Path):
     """The first tells most; what is of today is not made; only commands of folds get the options of
     where they run."""
     run, lines = RunCommands(), []
-    docs_pages.make((), ("--scheduler", "tcp://here"), lines.append, run)
+    reports.make((), ("--scheduler", "tcp://here"), lines.append, run)
     assert run.words == [["train", "older", "--scheduler", "tcp://here"], ["appliance", "new"]]
     assert lines[0].startswith("1/3 older: Made with an older default")
     assert lines[1] == f"lacking is left out: it needs {NEED}"
@@ -116,16 +96,16 @@ def test_stale_pages_are_made_in_order(project: Path):
 
 def test_after_an_interruption_only_what_is_left_is_made(project: Path):
     """A page that was made is of today then; the next run begins behind it."""
-    lay(project / "docs" / "older", today(), today())
+    save(project / "docs" / "data" / "older.json", today())
     run = RunCommands()
-    docs_pages.make((), (), lambda line: None, run)
+    reports.make((), (), lambda line: None, run)
     assert run.words == [["appliance", "new"]]
 
 
 def test_a_named_page_is_made_again_whatever_it_is(project: Path):
     """In the order of the list, not of the names."""
     run = RunCommands()
-    docs_pages.make(("current", "older"), (), lambda line: None, run)
+    reports.make(("current", "older"), (), lambda line: None, run)
     assert [words[1] for words in run.words] == ["older", "current"]
 
 
@@ -136,43 +116,21 @@ def test_a_failure_is_named_and_the_others_are_made(project: Path):
     with pytest.raises(
         FormatError, match="older ended with exit code 3; see above, and run the command again"
     ):
-        docs_pages.make((), (), lambda line: None, run)
+        reports.make((), (), lambda line: None, run)
     assert len(run.words) == 2
     with pytest.raises(FormatError, match="lacking is left out"):
-        docs_pages.make(("lacking",), (), lambda line: None, RunCommands())
+        reports.make(("lacking",), (), lambda line: None, RunCommands())
 
 
-def test_pages_are_drawn_again_without_measuring(project: Path):
-    """Those that are stale and whose command can do that; the others are named, and so is what
-    fails."""
-    run, lines = RunCommands(), []
-    docs_pages.draw((), lines.append, run)
-    assert run.words == [["train", "older", "--draw"]]
-    assert lines == [
-        f"{name} is left out: its command has no --draw" for name in ("lacking", "new")
-    ]
-    with pytest.raises(FormatError, match="older could not be drawn"):
-        docs_pages.draw(("older",), lines.append, RunCommands(older=1))
-
-
-def test_an_unknown_page_or_another_folder_is_an_error(
+def test_an_unknown_report_or_another_folder_is_an_error(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """One line that says which there are, or where to go."""
     assert main(["reports", "olde"]) == FormatError.exit_code
-    assert "no page olde; there are older, current, lacking, new" in capsys.readouterr().err
+    assert "no report olde; there are older, current, lacking, new" in capsys.readouterr().err
     monkeypatch.chdir(project / "docs")
     assert main(["reports"]) == FormatError.exit_code
     assert "has no docs/ and README.md; run this in the project's folder" in capsys.readouterr().err
-
-
-def test_a_page_that_shows_other_results_is_stale(project: Path):
-    """Its header is not that of the file beside it; a page that cannot be read is stale, too."""
-    page = docs_pages.PAGES[1]
-    lay(project / "docs" / "current", today(), today() | {"commit": "def"})
-    assert page.stale() == "shows other figures than current/results.json"
-    (project / "docs" / "current" / "index.html").write_text("<h1>no header</h1>")
-    assert page.stale() == "docs/current/index.html: no header that says where it is from"
 
 
 def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPatch):
@@ -180,8 +138,8 @@ def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPat
     (project / "made.py").write_text(
         "import pathlib, sys; pathlib.Path('said').write_text(sys.argv[1]); sys.exit(7)"
     )
-    page = DocsPage("made", "made/index.html", "made/results.json", ("made", "word"))
-    monkeypatch.setattr(docs_pages, "PAGES", (page,))
+    report = ResultFile("made", "data/made.json", ("made", "word"))
+    monkeypatch.setattr(reports, "REPORTS", (report,))
     with pytest.raises(FormatError, match="made ended with exit code 7"):
-        docs_pages.make((), (), lambda line: None)
+        reports.make((), (), lambda line: None)
     assert (project / "said").read_text() == "word"

@@ -1,0 +1,25 @@
+"""Pages of studies for tests: drawn from results that a test makes, or from those in docs/data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.factories.paths import ROOT
+from train.studies import pages
+from train.studies.study import DATA, results_file, save
+
+RESULTS = ROOT / DATA
+
+
+def committed(name: str) -> Any:
+    """The results of a study in docs/data."""
+    return json.loads(results_file(name, RESULTS).read_bytes())
+
+
+def published(name: str, results: Any, folder: Path) -> Path:
+    """The page of a study, drawn of `results` in the folder; its path."""
+    save(results_file(name, folder / "data"), results)
+    (page,) = pages.write([name], folder / "pages", folder / "data")
+    return page

@@ -1,0 +1,199 @@
+"""The studies that compare methods: paper, development, chart, fabrics.
+
+Each writes one file of results. `python -m train.studies pages` draws them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from appliance.core.errors import FormatError
+from train.arguments import options
+from train.arguments.types import Add
+from train.models.methods import Effort
+from train.studies import (
+    chart_experiment,
+    development_experiment,
+    development_times,
+    fabrics_experiment,
+    paper_experiment,
+)
+from train.studies.pages import PAGES
+from train.studies.study import StudyRun, read, results_file, save
+
+
+def register(add: Add) -> None:
+    """Add all commands of this module."""
+    paper = add("paper", run_paper)
+    _add_method(paper)
+    paper.add_argument(
+        "--curve",
+        type=Path,
+        metavar="FILE",
+        help="run nothing: take the CNN's newest point from the results of cnn-curve --size whole"
+        " into those in --out",
+    )
+    chart = add("chart", run_chart)
+    _add_seeds(chart)
+    chart.add_argument(
+        "--certainty",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="results of the study certainty, for the touch time of its method",
+    )
+    development = add("development", run_development)
+    _add_development(development)
+    fabrics = add("fabrics", run_fabrics)
+    _add_method(fabrics)
+    fabrics.set_defaults(method="all")
+    for name, command in (
+        ("paper", paper),
+        ("chart", chart),
+        ("development", development),
+        ("fabrics", fabrics),
+    ):
+        _add_run(command, name)
+
+
+def _add_run(command: argparse.ArgumentParser, name: str) -> None:
+    """Options of every study."""
+    file = results_file(name)
+    command.add_argument(
+        "--out", type=Path, default=file, metavar="FILE", help=f"file of results ({file})"
+    )
+    if name != "fabrics":
+        command.add_argument(
+            "--quick",
+            action="store_true",
+            help="small sets, hardly trained: to try everything out, not for figures",
+        )
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
+    if name != "paper":
+        command.add_argument(
+            "--data",
+            type=Path,
+            default=os.environ.get("PALPATE_DATA"),
+            metavar="DIR",
+            help="folder of real sweeps (PALPATE_DATA)",
+        )
+    options.add_effort(command)
+    options.add_where(command)
+
+
+def _add_method(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--method",
+        metavar="NAME[,NAME...]",
+        help="run these; all others stay as in the results in --out (all)",
+    )
+
+
+def _add_seeds(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)"
+    )
+
+
+def _add_development(command: argparse.ArgumentParser) -> None:
+    _add_seeds(command)
+    command.add_argument(
+        "--method", metavar="NAME[,NAME...]", help="(ours, as fit trains it, and the peers)"
+    )
+    command.add_argument(
+        "--leave-out",
+        action="append",
+        default=[],
+        metavar="CASE",
+        help="a case, or a point of its learning curve, that is not run, as the page names it",
+    )
+    command.add_argument(
+        "--join",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="results of an earlier run, whose methods join those of this one",
+    )
+    command.add_argument(
+        "--times",
+        action="store_true",
+        help="measure the times of the results in --out again, and keep their accuracies",
+    )
+
+
+def _run(args: argparse.Namespace, quick_effort: Effort | None = None) -> StudyRun:
+    quick: bool = getattr(args, "quick", False)
+    effort = quick_effort if quick and quick_effort else options.effort(args)
+    seeds = options.seeds(args) if hasattr(args, "seeds") else (1,)
+    data: Path | None = getattr(args, "data", None)
+    return StudyRun(options.where(args), options.Log(), data, effort, seeds, quick)
+
+
+def _done(run: StudyRun, path: Path) -> None:
+    """Print what was left out, and where the results are."""
+    for name, why in run.left_out.items():
+        print(f"left out: {name}: {why}")
+    print(path)
+
+
+def run_paper(args: argparse.Namespace) -> None:
+    """Run the experiment and write its results. With --curve only add the CNN's newest point."""
+    run = _run(args)
+    keys = PAGES["paper"].keys
+    if args.curve:
+        found = paper_experiment.with_curve(read(args.out, *keys), read(args.curve, "points"))
+    else:
+        only = args.method.split(",") if args.method else ()
+        earlier = read(args.out, *keys) if only else None
+        found = paper_experiment.results(run, only, earlier)
+    _done(run, save(args.out, found))
+
+
+def run_fabrics(args: argparse.Namespace) -> None:
+    """Evaluate and write the results."""
+    run = _run(args)
+    earlier = read(args.out) if args.out.exists() else ()
+    found = fabrics_experiment.results(options.names(args), run, earlier)
+    _done(run, save(args.out, found))
+
+
+def run_chart(args: argparse.Namespace) -> None:
+    """Measure and write the results. Raises FormatError if no model is left."""
+    run = _run(args, chart_experiment.QUICK_EFFORT)
+    study = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
+    touch = chart_experiment.touch_shares(args.certainty)
+    dots = chart_experiment.Chart(study, run, touch).dots()
+    if not dots:
+        for name, why in run.left_out.items():
+            print(f"left out: {name}: {why}")
+        raise FormatError("no model is left to chart; see above, and run it without --kept")
+    _done(run, save(args.out, dots))
+
+
+def run_development(args: argparse.Namespace) -> None:
+    """Evaluate, time and write the results; with --times after timing alone."""
+    run = _run(args, development_experiment.QUICK_EFFORT)
+    keys = PAGES["development"].keys
+    study = development_experiment.QUICK if run.quick else development_experiment.STUDY
+    names = args.method.split(",") if args.method else development_experiment.usual_methods(study)
+    if args.times:
+        figures = read(args.out, *keys)
+    else:
+        made = development_experiment.Development(study.cases, tuple(names), run, args.leave_out)
+        earlier = [read(path, *keys) for path in args.join]
+        figures = development_experiment.join(made.results(), earlier)
+    if args.times or not args.kept:
+        timed = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
+        train = timed.cases[chart_experiment.TRAIN].load()
+        assert train is not None  # it is simulated
+        figures["times"] = development_times.measured(
+            figures["methods"], train, 1, run.where.cache, run.log, run.effort
+        )
+    run.left_out = dict(figures["left_out"])
+    _done(run, save(args.out, figures))
