@@ -1,5 +1,4 @@
-"""The command import. In: a folder of recordings as laboratories keep them. Out: a sweep set, and a
-line for each file."""
+"""The command import: makes a sweep set of a folder of recordings, and reports on each file."""
 
 from __future__ import annotations
 
@@ -18,24 +17,34 @@ from train.data.file_names import EXAMPLE, NamePattern
 from train.data.importing import Cut, Imported, ImportPlan, LeftOut, Length, import_folder
 
 SHOWN = 5
-"""Files that were left out for the same reason and have a line each."""
+"""Largest number of files with a line each that were left out for the same reason."""
 
 
 def register(add: Add) -> None:
-    """import."""
+    """Add the command import."""
     command = add("import", run)
     command.add_argument(
-        "folder", type=Path, metavar="FOLDER", help="of recordings, and the folders in it"
+        "folder", type=Path, metavar="FOLDER", help="the recordings, in all folders below it"
     )
     command.add_argument(
         "--pattern",
         required=True,
         metavar="PATTERN",
-        help=f"what the names below FOLDER say: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
+        help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
     )
     command.add_argument(
         "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
     )
+    command.add_argument(
+        "--report", type=Path, metavar="FILE", help="a line for each file, imported or not"
+    )
+    _add_layout(command)
+    _add_windows(command)
+    options.add_rename(command)
+
+
+def _add_layout(command: argparse.ArgumentParser) -> None:
+    """Options that say where the counts stand in a file."""
     command.add_argument(
         "--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3"
     )
@@ -43,47 +52,50 @@ def register(add: Add) -> None:
         "--columns",
         default="",
         metavar="COLUMNS",
-        help="those of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
+        help="columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
     )
+    command.add_argument(
+        "--variable", default="", metavar="NAME", help="the array to read if a file holds several"
+    )
+    command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
+    command.add_argument(
+        "--dtype",
+        default="",
+        metavar="TYPE",
+        help=f"type of the counts: {', '.join(DATA_TYPES)} "
+        "(as recorded, else the first that holds all)",
+    )
+
+
+def _add_windows(command: argparse.ArgumentParser) -> None:
+    """Options that say when frames were recorded and which become sweeps."""
     command.add_argument(
         "--time",
         default="",
         metavar="COLUMN:UNIT",
-        help="of sampling times in s, ms, us or ns: t:ms, 1:s",
+        help="column of the sampling times, in s, ms, us or ns: t:ms, 1:s",
     )
     command.add_argument(
         "--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second"
     )
     command.add_argument(
-        "--window", default="2s", metavar="LENGTH", help="of a sweep: 2s, 500ms or 1500 frames (2s)"
+        "--window",
+        default="2s",
+        metavar="LENGTH",
+        help="length of a sweep: 2s, 500ms or 1500 frames (2s)",
     )
     command.add_argument(
         "--every",
         metavar="LENGTH",
         help="cut windows from the start on, one each LENGTH (the middle window alone)",
     )
-    command.add_argument(
-        "--dtype",
-        default="",
-        metavar="TYPE",
-        help=f"of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)",
-    )
-    command.add_argument(
-        "--variable",
-        default="",
-        metavar="NAME",
-        help="the array to take, where a file holds several",
-    )
-    command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
-    command.add_argument(
-        "--report", type=Path, metavar="FILE", help="a line for each file, taken or not"
-    )
-    options.add_rename(command)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Import, print what was left out and what is in the set. Raises FormatError at the end where a
-    file was broken."""
+    """Import a folder, and print the files that were left out and the contents of the set.
+
+    Raises FormatError at the end if a file was broken.
+    """
     plan = ImportPlan(
         NamePattern(args.pattern),
         args.grid,
@@ -113,12 +125,13 @@ def run(args: argparse.Namespace) -> None:
     print("\n".join([*_taken(made), *summary.description(made.sweeps, {}), f"set: {args.out}"]))
     if broken := sum(one.broken for one in left_out):
         raise FormatError(
-            f"{broken} of {broken + len(taken)} files could not be used, as said above; {args.out} is of the others"
+            f"{broken} of {broken + len(taken)} files could not be used, as said above; "
+            f"{args.out} is of the others"
         )
 
 
 def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
-    """A line for each file; of many with the same reason for the first ones."""
+    """A line for each file; with the same reason, only for the first SHOWN files."""
     lines, reasons = [], Counter(one.why for one in left_out)
     seen: Counter[str] = Counter()
     for one in sorted(left_out, key=lambda one: one.name):
@@ -127,7 +140,8 @@ def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
             lines.append(f"left out: {one.name}: {one.why}")
         elif seen[one.why] == reasons[one.why]:
             lines.append(
-                f"left out: {seen[one.why] - SHOWN} more for the same reason: {one.why}; --report FILE lists all"
+                f"left out: {seen[one.why] - SHOWN} more for the same reason: {one.why}; "
+                "--report FILE lists all"
             )
     return lines
 

@@ -55,8 +55,8 @@ MOST_BYTES = 1 << 31
 
 
 def arrays(data: bytes) -> dict[str, Array]:
-    """All numeric arrays of a file, by name. Raises FormatError if the file is damaged or of another
-    version."""
+    """All numeric arrays of a file, by name. Raises FormatError if the file is damaged or has
+    another version."""
     order = ENDIAN.get(data[126:128], "")
     if not order:
         raise FormatError("is not a MAT file of version 5 to 7.3; save it with -v7")

@@ -1,6 +1,6 @@
-"""Reads sweep sets. In: an .npz, an HDF5 file, a folder of the box's recordings. Out: a SweepSet.
+"""Reads sweep sets from an .npz, an HDF5 file or a folder of the box's recordings.
 
-appliance.core.sweep_set names the arrays and checks them, wherever they were read from. Nothing is
+appliance.core.sweep_set names the arrays and checks them, whatever file they come from. Nothing is
 unpickled, and nothing outside the named file or folder is read.
 """
 
@@ -25,24 +25,24 @@ from appliance.signal.unloaded import UnloadedSkin
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
-"""Rate of the TactMat data, which neither the file nor its page states: that of the same
-laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
+"""Frame rate of the TactMat data. Neither the file nor its page states it, so we use the rate of
+the same laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
 SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
 NAMED_GROUPS = ("position", "session")
-"""What a recording may name, beside its material."""
+"""Names that a recording can have beside its material. Each becomes a group."""
 REFUSED = tuple(status for status in Status if status.faulty)
-"""The box's answers to a window that it does not classify."""
+"""The box's answers to windows that it does not classify."""
 FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
-"""Suffixes of files in which laboratories keep the frames of one recording; importing.py makes a
-set of a folder of them."""
+"""Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
+such files."""
 IMPORT = "palpate-train import {} makes a set of such files"
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
-"""A name that is a whole number; 07 is not one, or it would equal 7."""
+"""A name that is a whole number. 07 is not, or it would equal 7."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedSweep:
-    """One sweep as the box recorded it. path: of its .npy; about: the contents of its sidecar."""
+    """One sweep as the box recorded it. path: its .npy file; about: the contents of its sidecar."""
 
     path: Path
     sweep: Sweep
@@ -51,16 +51,15 @@ class RecordedSweep:
 
     @classmethod
     def load(cls, path: Path) -> RecordedSweep:
-        """Read an .npy with its sidecar. Raises FormatError where it is broken."""
+        """Read an .npy with its sidecar. Raises FormatError if either is broken."""
         return cls(path, *load_recording(path), sidecar(path))
 
     @property
     def exclusion(self) -> str:
-        """Why it is not trained on, in one word: not a whole window, or a skin that the box
-        refused; "" where it is.
+        """One word that says why we do not train on this sweep; "" if we do.
 
-        A material that the box did not know, or was uncertain about, is trained on: it was recorded
-        for that.
+        Reasons are an incomplete window or a skin that the box refused. Sweeps whose answer was
+        unsure or unknown are kept: they were recorded to teach the box their material.
         """
         verdict = self.about.get("verdict")
         answer = verdict.get("status") if isinstance(verdict, dict) else ""
@@ -70,8 +69,8 @@ class RecordedSweep:
 
     @property
     def unloaded(self) -> Array:
-        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN
-        where the sidecar does not know them. Raises FormatError where it has something else."""
+        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN if
+        the sidecar does not hold them. Raises FormatError if their shape is wrong."""
         found = self.about.get("unloaded")
         shape = self.format.shape
         if found is None:
@@ -82,18 +81,19 @@ class RecordedSweep:
             level = np.empty(0)
         if level.shape != (2, *shape):
             raise FormatError(
-                f"{self.path}: `unloaded` of its sidecar has no level and noise of the shape {list(shape)}; "
-                "take one that was not changed, or remove the entry"
+                f"{self.path}: `unloaded` in its sidecar lacks a level and noise of shape "
+                f"{list(shape)}; restore the original sidecar, or remove the entry"
             )
         return level if np.isfinite(level).all() else np.full(level.shape, np.nan)
 
 
 def read(path: Path, kind: type[Set]) -> Set:
-    """The set at `path`, in whatever format. Raises FormatError naming what is missing or of the
-    wrong form, and where."""
+    """The set at `path`, in any format. Raises FormatError that says which array is missing or has
+    a wrong shape, and in which file."""
     if not path.exists():
         raise FormatError(
-            f"{path.name}: not a sweep set: there is no such file; name an .npz, an HDF5 file or a folder of recordings"
+            f"{path.name}: not a sweep set: there is no such file; "
+            "name an .npz, an HDF5 file or a folder of recordings"
         )
     if path.is_dir():
         return read_folder(path, kind)
@@ -137,16 +137,17 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
 
 
 def array_in(file: h5py.File, name: str) -> Array:
-    """One array that the file itself holds: what a link or a virtual array refers to may be
-    missing, or read as zeros."""
+    """An array that is stored in this file. Links and virtual arrays are refused, because their
+    data may be missing or read as zeros. Raises FormatError."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
         raise FormatError(
-            f"{name} is a link to {getattr(link, 'path', None)!r}; put the data itself into the file"
+            f"{name} is a link to {getattr(link, 'path', None)!r}; "
+            "put the data itself into the file"
         )
     data = file[name]
     if not isinstance(data, h5py.Dataset) or data.shape is None:
-        raise FormatError(f"{name} is no array but {data!r}; give one")
+        raise FormatError(f"{name} is not an array but {data!r}; store an array")
     if data.is_virtual or data.external:
         raise FormatError(f"{name} lies in other files; put the data itself into the file")
     if not _complete(data):
@@ -159,8 +160,8 @@ def array_in(file: h5py.File, name: str) -> Array:
 
 
 def _complete(data: h5py.Dataset) -> bool:
-    """Whether all of its chunks are present: HDF5 reads zeros for missing ones, which an
-    interrupted recording leaves."""
+    """Whether all chunks of an array are present. An interrupted recording leaves some out, and
+    HDF5 reads zeros for them."""
     if not data.chunks:
         return not data.size or bool(data.id.get_storage_size() > 0)
     chunks = math.prod(-(-n // size) for n, size in zip(data.shape, data.chunks, strict=True))
@@ -168,16 +169,17 @@ def _complete(data: h5py.Dataset) -> bool:
 
 
 def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
-    """TactMat (Tulbure and Baeuml, Humanoids 2018): samples [materials, repetitions, T, R, C],
-    names -> a set's arrays.
+    """The arrays of a set, from TactMat's samples [materials, repetitions, T, R, C] and names
+    (Tulbure and Baeuml, Humanoids 2018).
 
-    Its raw counts are 0 to 255 (paper, sec. II.B) whatever type they are stored in. Raises
+    Raw counts are 0 to 255 (paper, sec. II.B), whatever type they are stored in. Raises
     FormatError.
     """
     x, materials = arrays["samples"], arrays.get("materials", np.empty(0, str))
     if len(materials) != len(x):
         raise FormatError(
-            f"{source}: samples {list(x.shape)} are of {len(x)} materials, {len(materials)} are named"
+            f"{source}: samples {list(x.shape)} are of {len(x)} materials, "
+            f"{len(materials)} are named"
         )
     if x.dtype.kind in "iuf":
         with np.errstate(invalid="ignore"):
@@ -192,8 +194,8 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
 
 
 def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
-    """The arrays, named as in an .npz, as an HDF5 file that `hdf5` reads; samples are
-    compressed."""
+    """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
+    Samples are compressed."""
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
             file.create_dataset(
@@ -202,10 +204,10 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def read_recorded(folder: Path) -> list[RecordedSweep]:
-    """All sweeps that the box recorded in `folder` (.npy with .json) and below, in the order of
+    """All sweeps that the box recorded in and below `folder` (.npy with .json), in the order of
     their names.
 
-    Raises FormatError naming the file that is broken, or the folder where it may not be read or
+    Raises FormatError with the name of a broken file, or with the folder if it cannot be read or
     holds no recorded sweep.
     """
     check_folder(folder)
@@ -218,8 +220,8 @@ def read_recorded(folder: Path) -> list[RecordedSweep]:
 
 
 def check_folder(folder: Path) -> None:
-    """Raises FormatError where what is in the folder may not be seen: a search in it would find
-    nothing, without a word."""
+    """Raise FormatError if the folder cannot be listed: a search in it would silently find
+    nothing."""
     try:
         next(folder.iterdir(), None)
     except OSError as e:
@@ -229,7 +231,7 @@ def check_folder(folder: Path) -> None:
 
 
 def _advice(folder: Path) -> str:
-    """What to do with a folder without recordings of the box."""
+    """The advice for a folder that holds no recordings of the box."""
     others = Counter(
         path.suffix.lower()
         for path in folder.rglob("*")
@@ -243,23 +245,24 @@ def _advice(folder: Path) -> str:
 
 
 def usable(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
-    """Those that are trained on."""
+    """The sweeps that we train on."""
     return [one for one in recorded if not one.exclusion]
 
 
 def read_folder(folder: Path, kind: type[Set]) -> Set:
-    """The set of all sweeps that the box recorded in `folder` and below; each is a recording.
+    """The set of all sweeps that the box recorded in and below `folder`; each sweep is a recording.
 
-    Its label is its material. Groups are position and session, with the numbers that they have as
-    names where all have one, else numbered in the order of their names; and the object where NEW
-    OBJECT was ever signalled. Sweeps that are not trained on are counted in `source`. Raises
-    FormatError naming the file that is broken, lacks a name or is of another format.
+    Labels are materials. Groups are position and session: a group keeps its numbers if all its
+    names are whole numbers, else names are numbered in alphabetical order. A third group is the
+    object, if NEW OBJECT was ever signalled. Sweeps that we do not train on are counted in
+    `source`. Raises FormatError with the name of a file that is broken, lacks a name or has another
+    format.
     """
     return from_recorded(read_recorded(folder), folder, kind)
 
 
 def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
-    """What `recordings` gives, of sweeps that were read already."""
+    """The same as `read_folder`, for sweeps that were read already."""
     kept = usable(recorded)
     left = Counter(one.exclusion for one in recorded if one.exclusion)
     source = f"{folder} (left out: {counted(left)})" if left else str(folder)
@@ -275,10 +278,11 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
         if any(texts):
             if "" in texts:
                 raise FormatError(
-                    f"{kept[texts.index('')].path}: has no {name} though others have; name it in its .json"
+                    f"{kept[texts.index('')].path}: has no {name} though others have; "
+                    "name it in its .json"
                 )
             groups[f"group_{name}"] = numbered(texts)
-    if any(one.sweep.object for one in kept):  # each run counts from 1 again
+    if any(one.sweep.object for one in kept):  # each run of the service counts objects from 1 again
         groups["group_object"] = _ranks(
             [
                 (str(one.path.parent), str(one.about.get("run", "")), one.sweep.object)
@@ -299,23 +303,25 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
 
 
 def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
-    """Raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times, as if
-    they had been tared alike: those whose unloaded skin lies elsewhere than that of most, by what
-    counts as a load, are moved by the difference.
+    """Bring raw counts [n, T, R, C] or [n, T, R, C, A] of skins that were tared at different times
+    to a common level.
 
-    unloaded: as RecordedSweep.unloaded, of each [n, 2, R, C] or [n, 2, R, C, A]; a sweep of which
-    it is not known stays as it is. Smaller differences stay, too: a skin drifts like that in
-    service. Whole counts stay whole, and in the range of their type. Returns both as they are then,
-    and words for the set's source: how many were moved, "" for none.
+    The common level is that of the sweep whose unloaded skin is closest to the median. A sweep is
+    shifted to it if the difference would count as a load. Smaller differences stay: a skin drifts
+    as much in service. Sweeps with an unknown level stay as they are. Whole counts stay whole and
+    within the range of their type.
+
+    unloaded: as RecordedSweep.unloaded, for each sweep, [n, 2, R, C] or [n, 2, R, C, A]. Returns
+    the shifted samples and levels, and words for the set's source that say how many sweeps were
+    shifted, "" if none.
     """
     known = np.isfinite(unloaded).all(axis=tuple(range(1, unloaded.ndim)))
     if not known.any():
         return samples, unloaded, ""
     levels = unloaded[known, 0]
     away = np.abs(levels - np.median(levels, axis=0)).sum(axis=tuple(range(1, levels.ndim)))
-    usual = levels[
-        away.argmin()
-    ]  # one that was there: the median of two halves would be a skin that nobody has
+    # a level that occurred: the median of two equal halves would be the level of no skin
+    usual = levels[away.argmin()]
     samples, unloaded, moved = samples.copy(), unloaded.copy(), 0
     for i in np.flatnonzero(known):
         level, noise = unloaded[i]
@@ -329,17 +335,21 @@ def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
             samples[i] = np.clip(samples[i] + change, limits.min, limits.max).astype(samples.dtype)
         unloaded[i, 0] += change
         moved += 1
-    told = f" ({moved} of {len(samples)} brought to the unloaded skin of the others: it was tared between)"
-    return samples, unloaded, told if moved else ""
+    remark = (
+        f" ({moved} of {len(samples)} brought to the unloaded skin of the others: "
+        "it was tared between)"
+    )
+    return samples, unloaded, remark if moved else ""
 
 
 def counted(reasons: Counter[str]) -> str:
-    """How many sweeps for each reason, in a line."""
+    """The number of sweeps for each reason, as text."""
     return ", ".join(f"{n} {reason}" for reason, n in sorted(reasons.items()))
 
 
 def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
-    """Raises FormatError where its format differs from `wanted`, or no material is named."""
+    """Raise FormatError if the format differs from `wanted`, or if the recording has no
+    material."""
     path, n = one.path, len(one.sweep.frames)
     if one.format != wanted or n != wanted.window:
         raise FormatError(
@@ -347,12 +357,13 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
         )
     if not one.sweep.material:
         raise FormatError(
-            f'{path}: has no material; write it into {path.with_suffix(".json").name}, "material": "…"'
+            f"{path}: has no material; write it into {path.with_suffix('.json').name}, "
+            '"material": "…"'
         )
 
 
 def numbered(names: Sequence[str]) -> Array:
-    """A number for each name: its value, where all are whole numbers, else its rank among the
+    """A number for each name: its value if all names are whole numbers, else its rank among the
     different names."""
     return (
         np.array([int(name) for name in names])
@@ -362,6 +373,6 @@ def numbered(names: Sequence[str]) -> Array:
 
 
 def _ranks(values: Sequence[Any]) -> Array:
-    """The rank of each value among the different ones."""
+    """The rank of each value among the different values."""
     rank = {value: i for i, value in enumerate(sorted(set(values)))}
     return np.array([rank[value] for value in values])

@@ -1,9 +1,9 @@
-"""Sweep sets to train and test on. In: a user's file, or the name of a simulated or published set.
-Out: a checked Dataset.
+"""Sweep sets for training and testing, from a user's file or by the name of a simulated or
+published set.
 
-A set knows which sweeps belong together (`groups`); it can be narrowed to some of them and split so
-that no recording is on both sides. appliance.core.sweep_set says what a file must hold; readers.py
-reads it.
+The groups of a set say which sweeps belong together. A set can be narrowed to some sweeps, and
+split so that no recording is on both sides. appliance.core.sweep_set defines the contents of a
+file; readers.py reads it.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ SIMULATED = re.compile(
 )
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
 OWN_NUMBERS = ("recording", "position", "session", "object")
-"""Groups whose numbers only mean something within their set."""
+"""Groups whose numbers only have a meaning within their set."""
 LIMITS: dict[str, Callable[[Array, Any], Array]] = {"<=": np.less_equal, ">=": np.greater_equal}
 
 
 @dataclass(frozen=True)
 class Dataset(sweep_set.SweepSet):
-    """A SweepSet to train and test on: it can also be narrowed, split and saved."""
+    """A SweepSet that can be narrowed, split and saved."""
 
     def require_materials(self) -> Dataset:
-        """The set itself. Raises FormatError where all its sweeps are of one material."""
+        """The set itself. Raises FormatError if all its sweeps have the same material."""
         if len(present := np.unique(self.labels)) < 2:
             raise self._error(
                 f"only one class, {self.materials[present[0]]!r}; a classifier needs two"
@@ -45,8 +45,8 @@ class Dataset(sweep_set.SweepSet):
         return self
 
     def require_pure_recordings(self) -> Dataset:
-        """The set itself. Raises FormatError where a recording is of several materials: no answer
-        for it could be right."""
+        """The set itself. Raises FormatError if a recording has several materials: no answer to it
+        could be right."""
         values, _, counts = self.counts_by("recording")
         if len(several := values[(counts > 0).sum(axis=1) > 1]):
             raise self._error(
@@ -56,7 +56,7 @@ class Dataset(sweep_set.SweepSet):
         return self
 
     def take(self, index: Array) -> Dataset:
-        """The sweeps `index` (mask or numbers) with all materials, so that labels keep their
+        """The sweeps at `index` (mask or numbers). All materials stay, so labels keep their
         meaning."""
         groups = {k: v[index] for k, v in self.groups.items()}
         unloaded = None if self.unloaded is None else self.unloaded[index]
@@ -69,11 +69,11 @@ class Dataset(sweep_set.SweepSet):
         )
 
     def select(self, conditions: Sequence[str]) -> Dataset:
-        """The sweeps for which all conditions hold, without materials that do not occur.
+        """The sweeps that meet all conditions, without materials that no longer occur.
 
-        A condition is a group and a limit ("force<=180") or any of several values
-        ("force=100,150"); materials go by name ("material=Canvas,Linen"). Raises FormatError where
-        a condition cannot be read, its group or a value of it does not occur, or fewer than two
+        A condition is a group with a limit ("force<=180") or with alternative values
+        ("force=100,150"). Materials are given by name ("material=Canvas,Linen"). Raises FormatError
+        if a condition cannot be read, if its group or a value does not occur, or if fewer than two
         classes remain.
         """
         keep = np.ones(len(self), bool)
@@ -86,10 +86,11 @@ class Dataset(sweep_set.SweepSet):
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
     def _matches(self, condition: str) -> Array:
-        """bool [N], the sweeps for which one condition holds."""
+        """The sweeps that meet one condition, bool [N]."""
         if not (found := CONDITION.fullmatch(condition)):
             raise self._error(
-                f"condition {condition!r} cannot be read; write a group, one of = <= >=, whole numbers"
+                f"condition {condition!r} cannot be read; "
+                "write a group, one of = <= >=, whole numbers"
             )
         name, operator, text = found.groups()
         if name == "material":
@@ -105,31 +106,34 @@ class Dataset(sweep_set.SweepSet):
                 )
             except ValueError:
                 raise self._error(
-                    f"condition {condition!r} cannot be read; {text.strip()!r} is no whole number"
+                    f"condition {condition!r} cannot be read; "
+                    f"{text.strip()!r} is not a whole number"
                 ) from None
         if operator in LIMITS:
             if name == "material" or len(values) > 1:
                 raise self._error(
-                    f"condition {condition!r} cannot be read; {operator} takes a group and one whole number"
+                    f"condition {condition!r} cannot be read; "
+                    f"{operator} takes a group and one whole number"
                 )
             return LIMITS[operator](column, values[0])
         for value in values:
             if not (column == value).any():
                 raise self._error(
-                    f"no sweep fulfils {name}={value}; it has {shortened(np.unique(column).tolist())}"
+                    f"no sweep fulfils {name}={value}; "
+                    f"it has {shortened(np.unique(column).tolist())}"
                 )
         return np.isin(column, values)
 
     def without_means(self) -> Dataset:
-        """The set with each taxel's mean over the window subtracted: samples float32, zero where a
-        taxel is constant.
+        """The set without each taxel's mean over the window: samples float32, zero if a taxel is
+        constant.
 
-        What is left is texture: the mean alone often reveals the session in which a material was
+        Only texture remains. The mean alone often reveals the session in which a material was
         recorded.
         """
         means = self.samples.mean(
             axis=1, keepdims=True, dtype=np.float64
-        )  # exact where a taxel is constant
+        )  # exact if a taxel is constant
         samples = np.subtract(
             self.samples, means, out=np.empty(self.samples.shape, np.float32), casting="same_kind"
         )
@@ -144,11 +148,11 @@ class Dataset(sweep_set.SweepSet):
         return values, member, counts
 
     def split(self, by: str, share: float, seed: int) -> tuple[Dataset, Dataset]:
-        """Two parts, the first with about `share` of each material's groups `by`; no group is in
+        """Two parts; the first has about `share` of each material's groups `by`. No group is in
         both.
 
-        Raises FormatError where a recording would be in both, where the groups are too few, or
-        where the first part would lack a material.
+        Raises FormatError if a recording would be in both parts, if there are too few groups, or if
+        the first part would lack a material.
         """
         if not 0 < share < 1:
             raise self._error(f"a share of {share} splits nothing; use more than 0 and less than 1")
@@ -165,13 +169,14 @@ class Dataset(sweep_set.SweepSet):
         if inside.all() or len(missing := np.setdiff1d(self.labels, self.labels[inside])):
             lacks = "is everything" if inside.all() else f"lacks {self.materials[missing[0]]!r}"
             raise self._error(
-                f"split by {by!r}: the first part {lacks}; it has {len(names)} groups, use a finer one"
+                f"split by {by!r}: the first part {lacks}; "
+                f"it has {len(names)} groups, use a finer one"
             )
         return self.take(inside), self.take(~inside)
 
     def save(self, path: Path) -> None:
-        """Write the set for `load`: as HDF5 where the name ends in .h5 or .hdf5, else as a
-        compressed .npz."""
+        """Write the set as HDF5 if the name ends in .h5 or .hdf5, else as a compressed .npz; `load`
+        reads both."""
         groups = {f"group_{k}": v for k, v in self.groups.items()}
         rate = np.array(self.rate_hz)
         arrays: dict[str, Array] = {
@@ -194,9 +199,9 @@ def load(spec: str, seed: int = 0) -> Dataset:
     """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings,
     sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME.
 
-    x3: of a skin with three axes. SWEEPS: per material and position. SEED-LAST: one set of several
-    simulated scenes, each with positions of its own. seed: for a simulated set that names none.
-    Raises FormatError where the set is missing, broken or unknown.
+    x3: a skin with three axes. SWEEPS: number of sweeps for each material and position. SEED-LAST:
+    several simulated scenes joined, each with positions of its own. seed: for a simulated set whose
+    name holds none. Raises FormatError if the set is missing, broken or unknown.
     """
     if spec.startswith("sim:"):
         return _simulated(spec, seed)
@@ -207,13 +212,13 @@ def load(spec: str, seed: int = 0) -> Dataset:
 
 
 def join(sets: Sequence[Dataset]) -> Dataset:
-    """One set of several with the same format and materials, the groups that all have, and the
-    group `set`, its index.
+    """Join sets that have the same format and materials. Groups are those that all sets have, and
+    `set`, the index of the set.
 
-    Recordings, positions, sessions and objects are renumbered, since number 0 of two sets is not
-    the same one; a force or a speed is. Where the skin was tared between, all are brought to one
-    level, as in a folder. A single set is not changed. Raises FormatError where the sets differ in
-    format or materials.
+    Recordings, positions, sessions and objects are renumbered, because number 0 means another
+    position in another set; a force or a speed keeps its value. If the skin was tared between the
+    sets, they are brought to one level, as in a folder. A single set is not changed. Raises
+    FormatError if formats or materials differ.
     """
     if len(sets) == 1:
         return sets[0]
@@ -227,7 +232,8 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     for s in others:
         if (s.format, s.materials) != (head.format, head.materials):
             raise FormatError(
-                f"{s.source} ({s.format}) and {head.source} ({head.format}) differ; join sets of one kind"
+                f"{s.source} ({s.format}) and {head.source} ({head.format}) differ; "
+                "join sets of one kind"
             )
     names = set.intersection(*(set(s.groups) for s in sets))
     if any("recording" in s.groups for s in sets):
@@ -243,14 +249,14 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
         np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels")
     )
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
-    if unloaded is not None:  # each set is at a level by itself; that of the other may be another
+    if unloaded is not None:  # each set is consistent, but levels may differ between sets
         samples, unloaded, moved = readers.align_tare(samples, unloaded)
         source += moved
     return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded)
 
 
 def _unloaded(sets: Sequence[Dataset]) -> Array | None:
-    """What all sets know of the unloaded skin, one after the other."""
+    """The unloaded skin of all sets, one after the other; None if no set has it."""
     if all(s.unloaded is None for s in sets):
         return None
     known: Array = np.concatenate(
@@ -266,9 +272,10 @@ def _simulated(spec: str, seed: int) -> Dataset:
     found, known = SIMULATED.fullmatch(spec), get_args(skin.SetName)
     if not found or found["name"] not in known:
         raise FormatError(
-            f"set {spec!r} is unknown; use sim:NAME[x3][:SEED[-LAST][:SWEEPS]], NAME one of {', '.join(known)}"
+            f"set {spec!r} is unknown; use sim:NAME[x3][:SEED[-LAST][:SWEEPS]], "
+            f"NAME one of {', '.join(known)}"
         )
-    name: skin.SetName = found["name"]  # type: ignore[assignment]  # one of its values, as was just checked
+    name: skin.SetName = found["name"]  # type: ignore[assignment]  # was just checked
     first = int(found["seed"] or seed)
     each = int(found["each"]) if found["each"] else None
     physics, scenes = skin.World(shear=bool(found["shear"])), []
@@ -282,8 +289,8 @@ def _simulated(spec: str, seed: int) -> Dataset:
 
 
 def digest(sweeps: Dataset) -> str:
-    """16 hex digits (SHA-256) of everything but the source: the same for the same data, whatever
-    file it came from."""
+    """The first 16 hex digits of the SHA-256 of all arrays: equal for equal data, in whatever file.
+    The source does not count."""
     x, names = sweeps.samples, sorted(sweeps.groups)
     total = hashlib.sha256(
         repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode()
@@ -297,6 +304,6 @@ def digest(sweeps: Dataset) -> str:
 
 
 def shortened(values: Sequence[object]) -> str:
-    """Values in a line; of more than nine those in the middle are left out."""
+    """Values as text; of more than nine, those in the middle are left out."""
     texts = [str(value) for value in values]
     return ", ".join(texts if len(texts) <= 9 else [*texts[:8], "…", texts[-1]])

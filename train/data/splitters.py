@@ -1,8 +1,8 @@
-"""Evaluation protocols: which sweeps train and which test. In: a text such as "leave:position".
-Out: a splitter.
+"""Evaluation protocols: a text such as "leave:position" says which sweeps train and which test.
 
-Each is a scikit-learn splitter over the sweeps' numbers: split(X, y, groups) -> pairs (training,
-test), with recordings as `groups`. No splitter ever has parts of one recording on both sides.
+Each protocol is a scikit-learn splitter over the numbers of the sweeps: split(X, y, groups) yields
+pairs (training, test); `groups` are the recordings. A splitter never puts parts of one recording on
+both sides.
 """
 
 from __future__ import annotations
@@ -29,29 +29,31 @@ SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
 
 
 class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
-    """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's
-    overestimate."""
+    """Whole recordings divided into `folds` parts at random, materials in equal shares. The paper's
+    protocol, which overestimates accuracy."""
 
     def __init__(self, folds: int, seed: int, materials: Sequence[str]) -> None:
         self.folds, self.seed, self.materials = folds, seed, materials
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """How many folds there are."""
+        """The number of folds."""
         return self.folds
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
         """Pairs (training, test) of sweep numbers. y: labels [N]; groups: recordings [N].
 
-        Raises FormatError where a material has fewer recordings than there are folds.
+        Raises FormatError if a material has fewer recordings than there are folds.
         """
         for label in np.unique(y):
             if (n := len(np.unique(groups[y == label]))) < 2:
                 raise FormatError(
-                    f"material {self.materials[label]!r} has one recording; record two of each or more, to test on one"
+                    f"material {self.materials[label]!r} has one recording; "
+                    "record two of each or more, to test on one"
                 )
             if n < self.folds:
                 raise FormatError(
-                    f"random:{self.folds} needs {self.folds} recordings of each material; {self.materials[label]!r} has {n}: "
+                    f"random:{self.folds} needs {self.folds} recordings of each material; "
+                    f"{self.materials[label]!r} has {n}: "
                     f"use random:{n} or less"
                 )
         yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(
@@ -60,22 +62,23 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
 
 
 class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
-    """Tested on one value of the group `name` at a time, trained on all others, as in
+    """Test on one value of the group `name` at a time and train on all others, as in
     leave-one-position-out."""
 
     def __init__(self, name: str, group: Array) -> None:
         self.name, self.group = name, group
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """How many values the group has."""
+        """The number of values of the group."""
         return len(np.unique(self.group))
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """Pairs (training, test) of sweep numbers. Raises FormatError where the group cannot be
-        left out."""
+        """Pairs (training, test) of sweep numbers. Raises FormatError if the group has only one
+        value or cuts a recording in two."""
         if (n := self.get_n_splits()) < 2:
             raise FormatError(
-                f"leave:{self.name} needs two values of the group {self.name!r}; all sweeps have {self.group[0]} "
+                f"leave:{self.name} needs two values of the group {self.name!r}; "
+                f"all sweeps have {self.group[0]} "
                 f"({n} value): choose another group"
             )
         for value in np.unique(self.group):
@@ -84,24 +87,25 @@ class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
 
 
 class TrainTest(BaseCrossValidator):  # type: ignore[misc]
-    """Trained on some values of the group `name`, tested on others: T-REAL against T-HARD, first
-    block against last."""
+    """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD, or
+    the first and the last block."""
 
     def __init__(self, name: str, group: Array, train: Sequence[int], test: Sequence[int]) -> None:
         self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """One."""
+        """There is one fold."""
         return 1
 
     def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """The pair (training, test) of sweep numbers. Raises FormatError where a value is on both
-        sides or unknown."""
+        """The pair (training, test) of sweep numbers. Raises FormatError if a value is unknown or
+        on both sides."""
         present = np.unique(self.group)
         for value in (*self.train, *self.test):
             if value not in present:
                 raise FormatError(
-                    f"group {self.name!r} has no {value}; it has {', '.join(map(str, present[:20]))}"
+                    f"group {self.name!r} has no {value}; "
+                    f"it has {', '.join(map(str, present[:20]))}"
                 )
         if both := set(self.train) & set(self.test):
             raise FormatError(
@@ -118,7 +122,7 @@ class TrainTest(BaseCrossValidator):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class Protocol:
-    """A protocol by its text. Raises FormatError where the text has none of the FORMS."""
+    """A protocol by its text. Raises FormatError if the text matches none of FORMS."""
 
     text: str
 
@@ -129,7 +133,7 @@ class Protocol:
             raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
 
     def splitter(self, sweeps: Dataset, seed: int) -> BaseCrossValidator:
-        """The scikit-learn splitter for `sweeps`; seed: of random folds. Raises FormatError for an
+        """The scikit-learn splitter for `sweeps`. seed: for random folds. Raises FormatError for an
         unknown group."""
         if found := RANDOM.fullmatch(self.text):
             return RandomFolds(int(found[1]), seed, sweeps.materials)
@@ -143,8 +147,8 @@ class Protocol:
         )
 
     def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
-        """All pairs (training, test) of sweep numbers. Raises FormatError where `sweeps` cannot be
-        split so."""
+        """All pairs (training, test) of sweep numbers. Raises FormatError if the protocol cannot
+        split `sweeps`."""
         sweeps.require_materials().require_pure_recordings()
         return list(
             self.splitter(sweeps, seed).split(
@@ -153,8 +157,9 @@ class Protocol:
         )
 
     def clusters(self, sweeps: Dataset) -> Array | None:
-        """Which sweeps [N] succeed or fail together, for the interval: the left-out groups, else
-        recordings of several windows; None where sweeps are independent."""
+        """A cluster number for each sweep [N], for intervals: sweeps of a cluster succeed or fail
+        together. Clusters are the left-out groups, or else recordings of several windows. None if
+        sweeps are independent."""
         if found := LEAVE.fullmatch(self.text):
             return sweeps.group(found[1])
         recording = sweeps.group("recording")
@@ -162,11 +167,11 @@ class Protocol:
 
 
 def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
-    """At most `each` of the sweeps `train` of every material, their numbers in order. labels: int
+    """At most `each` sweeps of every material, from the sweep numbers `train`; sorted. labels: int
     [N], of all sweeps.
 
-    The same seed draws more of the same sweeps for a larger `each`, so that a learning curve adds
-    to what was there.
+    With the same seed, a larger `each` adds to the sweeps of a smaller value, so a learning curve
+    only grows.
     """
     rng = np.random.default_rng(seed)
     mine = labels[train]
@@ -176,11 +181,12 @@ def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
 
 
 def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
-    """The masks as numbers. Raises FormatError where the sides share a recording or there is too
+    """The masks as numbers. Raises FormatError if both sides share a recording or there is too
     little to train on."""
     if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
         raise FormatError(
-            f"{what}: {len(shared)} recordings, {min(shared)} among them, would be trained on and tested on; "
+            f"{what}: {len(shared)} recordings, {min(shared)} among them, "
+            "would be trained on and tested on; "
             "choose a group that does not cut recordings"
         )
     if len(np.unique(labels[train])) < 2:
@@ -191,27 +197,26 @@ def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Ar
 
 
 OF_THE_SET = ("recording", "set", "split", "trial", "world")
-"""Groups that say where a sweep is from, and no condition that a user would vary."""
+"""Groups that say where a sweep comes from. They are not conditions that a user would vary."""
 RANDOM_PARTS = 5
 
 
 @dataclass(frozen=True)
 class InnerPart:
-    """Sweeps of a training set that judge what was fitted to the others. group: what their values
-    belong to. out: [N]."""
+    """Sweeps of a training set that are held out to judge a model fitted to the other sweeps.
+    group: the name of the group that is left out. out: bool [N]."""
 
     group: str
     out: Array
 
 
 def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
-    """Each group that can be left out, in `most` parts at most; recordings, materials spread
-    evenly, where there is none.
+    """The parts of each group that can be left out, at most `most` for a group. If no group can,
+    the parts are recordings, with materials spread evenly.
 
-    The first part of every group comes first, then the second ones.
-
-    A group can be left out where it does not cut recordings in two, and where every material that
-    is tested remains. Raises FormatError where nothing can be left out.
+    The first part of every group comes first, then the second parts, and so on. A group can be left
+    out if it does not cut recordings in two, and if the other sweeps hold every material that is
+    tested. Raises FormatError if nothing can be left out.
     """
     of_all = [
         _parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET
@@ -224,7 +229,8 @@ def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
     )
     if fewest < 2:
         raise FormatError(
-            f"{sweeps.source}: a material has one recording; two of each are needed to choose a model by"
+            f"{sweeps.source}: a material has one recording; "
+            "two of each are needed to choose a model by"
         )
     drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
     return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]

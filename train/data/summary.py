@@ -1,7 +1,7 @@
-"""Describes sweep sets. In: the name of a set. Out: its counts, gaps and faults as lines of text.
+"""Describes the counts, gaps and faults of a sweep set as lines of text.
 
-An incomplete folder of recordings is described too: recordings without a name are counted, and the
-reason why the folder cannot be trained on yet is given.
+An incomplete folder of recordings is described too: recordings without a name are counted, with the
+reason why the folder cannot be trained on yet.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from train.data.readers import RecordedSweep
 from train.data.sets import Dataset, shortened
 
 Names = Mapping[str, Mapping[int, str]]
-"""Of each group the names of its numbers."""
+"""The names of each group's numbers."""
 MAX_COLUMNS = 12
-"""Of a table; a group of more values has only its line."""
+"""Largest number of columns of a table. A group with more values has only its line."""
 UNNAMED = "(none)"
 
 
 def describe(spec: str) -> str:
-    """The contents of the set that `spec` names, as lines. Raises FormatError where it is missing,
-    broken or unknown."""
+    """The contents of the set that `spec` names, as lines. Raises FormatError if the set is
+    missing, broken or unknown."""
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
@@ -48,7 +48,8 @@ def describe(spec: str) -> str:
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
         lines.append(
-            f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, filled in from their neighbours"
+            f"  frames lost: {sum(lost)} of {frames}, in {len(lost)} sweeps, "
+            "filled in from their neighbours"
         )
     try:
         readers.from_recorded(recorded, folder, Dataset).require_materials()
@@ -63,39 +64,42 @@ def describe(spec: str) -> str:
 
 
 def warnings_of(sweeps: Dataset) -> list[str]:
-    """What a model can be trained on, but should not be without a look: one line each."""
+    """Warnings about a set that training accepts, a line each."""
     lines = []
     if still := np.argwhere(
         sweeps.samples.min(axis=(0, 1)) == sweeps.samples.max(axis=(0, 1))
     ).tolist():
         listed = shortened([".".join(str(i + 1) for i in place) for place in still])
         lines.append(
-            f"warning: taxels that never change in any sweep: {listed}; check the skin with `palpate skin show`"
+            f"warning: taxels that never change in any sweep: {listed}; "
+            "check the skin with `palpate skin show`"
         )
     counts = np.bincount(sweeps.labels, minlength=len(sweeps.materials))
     if empty := [name for name, n in zip(sweeps.materials, counts, strict=True) if not n]:
         lines.append(
-            f"warning: materials without a sweep: {', '.join(empty)}; record some, or leave them out with --only"
+            f"warning: materials without a sweep: {', '.join(empty)}; "
+            "record some, or leave them out with --only"
         )
     return lines + partly_unknown_tare(sweeps)
 
 
 def partly_unknown_tare(sweeps: Dataset) -> list[str]:
-    """A line where some sweeps know the unloaded skin and others do not: whether these compare
-    cannot be told."""
+    """A warning if only some sweeps know the unloaded skin: the others cannot be brought to the
+    same level."""
     if sweeps.unloaded is None:
         return []
     known = int(np.isfinite(sweeps.unloaded).all(axis=tuple(range(1, sweeps.unloaded.ndim))).sum())
     if known == len(sweeps):
         return []
     return [
-        f"warning: {known} sweeps know the unloaded skin and {len(sweeps) - known} do not; these are taken as they are, and do not "
-        "compare with the others where the skin was tared between; record with palpate record, and send TARE first"
+        f"warning: {known} sweeps know the unloaded skin and {len(sweeps) - known} do not; these "
+        "are taken as they are, and do not compare with the others if the skin was tared between; "
+        "record with palpate record, and send TARE first"
     ]
 
 
 def _unsendable(materials: Iterable[str]) -> list[str]:
-    """A line where `fit` refuses names of materials."""
+    """A line if the box cannot send a material's name; `fit` refuses it."""
     return (
         [f"  cannot be trained on yet: {why}; {labels.REMEDY}"]
         if (why := labels.unsendable(materials))
@@ -104,8 +108,7 @@ def _unsendable(materials: Iterable[str]) -> list[str]:
 
 
 def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
-    """The recordings, UNNAMED where some have a name and others none, and the names of the groups'
-    numbers."""
+    """The recordings, with UNNAMED for each missing name, and the names of the groups' numbers."""
     kept, names = [one.sweep for one in readers.usable(recorded)], {}
     groups = [by for by in readers.NAMED_GROUPS if any(getattr(sweep, by) for sweep in kept)]
 
@@ -123,18 +126,20 @@ def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Name
 
 
 def description(sweeps: Dataset, names: Names) -> list[str]:
-    """The contents of a set: sweeps and their form, materials, recordings, groups and what is
-    confounded."""
+    """The contents of a set as lines: sweeps and their format, materials, recordings, groups, and
+    groups that are confounded with the material."""
     format = sweeps.format
     _, _, per_recording = sweeps.counts_by("recording")
     least, most = (windows := per_recording.sum(axis=1)).min(), windows.max()
     lines = [
-        f"{sweeps.source}: {len(sweeps)} sweeps of {format.window / format.rate_hz:.3g} s; {format}; digest {sets.digest(sweeps)}",
+        f"{sweeps.source}: {len(sweeps)} sweeps of {format.window / format.rate_hz:.3g} s; "
+        f"{format}; digest {sets.digest(sweeps)}",
         f"  recordings: {len(windows)}, of {least if least == most else f'{least} to {most}'} each",
     ]
     if several := np.count_nonzero((per_recording > 0).sum(axis=1) > 1):
         lines.append(
-            f"    {several} of them hold sweeps of several materials: number recordings within one material"
+            f"    {several} of them hold sweeps of several materials: "
+            "number recordings within one material"
         )
     each = zip(sweeps.materials, per_recording.sum(axis=0), strict=True)
     lines.append(
@@ -157,8 +162,8 @@ def description(sweeps: Dataset, names: Names) -> list[str]:
 
 
 def table(materials: Sequence[str], columns: Sequence[str], counts: Array) -> list[str]:
-    """Lines: sweeps of each material in each column, with totals; a dot where there is none.
-    counts: [columns, K]."""
+    """Lines of a table: sweeps of each material (row) in each column, with totals, and a dot for
+    none. counts: [columns, K]."""
     totals = np.vstack([counts, counts.sum(axis=0)]).T
     totals = np.vstack([totals, totals.sum(axis=0)])
     rows = [["", *columns, "all"]]
@@ -171,36 +176,44 @@ def table(materials: Sequence[str], columns: Sequence[str], counts: Array) -> li
 
 
 def _confounded(values: Sequence[str], holds: Array, materials: Sequence[str]) -> Iterator[str]:
-    """How a group of several values reveals the material, or removes one when left out. holds: bool
-    [V, K]."""
+    """Each way in which a group reveals the material, or removes a material when a value is left
+    out. holds: bool [V, K]."""
     if len(values) < 2:
         return
     if len(single := np.flatnonzero(holds.sum(axis=1) == 1)):
         yield f"one material only at {shortened([values[v] for v in single])}"
     for k in np.flatnonzero(holds.sum(axis=0) == 1).tolist():
-        yield f"{materials[k]!r} only at {values[int(holds[:, k].argmax())]}; leaving that out leaves none to train on"
+        place = values[int(holds[:, k].argmax())]
+        yield f"{materials[k]!r} only at {place}; leaving that out leaves none to train on"
 
 
 def known() -> str:
-    """The sets that can be named, as lines."""
+    """The names of sets, with their meaning, as lines."""
     tubes = len(skin.MATERIALS)
     lines = [
-        "FILE.npz, .h5, .hdf5   samples [N, T, R, C] or [N, T, R, C, A], labels [N], materials [K], rate_hz, group_NAME [N]",
+        "FILE.npz, .h5, .hdf5   samples [N, T, R, C] or [N, T, R, C, A], labels [N], "
+        "materials [K], rate_hz, group_NAME [N]",
         "FILE.h5, .hdf5         TactMat: samples [materials, repetitions, T, R, C], materials",
-        "                       of CSV, text, MAT, HDF5 and .npy files palpate-train import makes a set",
-        "FOLDER                 what palpate record wrote and palpate-train pull fetched, and the folders in it",
-        "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at each position, SEED to LAST joined",
+        "                       palpate-train import makes a set of CSV, text, MAT, HDF5 and "
+        ".npy files",
+        "FOLDER                 recordings of palpate record or palpate-train pull, in all "
+        "folders below",
+        "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at "
+        "each position, SEED to LAST joined",
     ]
     for name, (positions, each) in skin.SETS.items():
         total = positions * each * tubes
         lines.append(
-            f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes at {positions} position(s)"
+            f"  sim:{name:<12}{total:>5} sweeps, {each} of each of {tubes} tubes "
+            f"at {positions} position(s)"
         )
     lines.append(
-        f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty simulated scenes joined, for narrow intervals"
+        f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty simulated scenes joined, "
+        "for narrow intervals"
     )
     lines.append(
-        f"{published.PREFIX}NAME              published series that aeon ships, taken to have {published.RATE_HZ:g} Hz; "
+        f"{published.PREFIX}NAME              published series that aeon ships, taken to have "
+        f"{published.RATE_HZ:g} Hz; "
         "--protocol 'split:split=0->1'"
     )
     lines += [f"  {published.PREFIX}{name:<17} {what}" for name, what in published.SETS.items()]

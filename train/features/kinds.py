@@ -1,8 +1,7 @@
-"""All feature sets by name. In: raw counts of one sweep's window, frame rate. Out: float32
-features.
+"""All feature sets by name. They map the raw counts of one sweep's window to float32 features.
 
-They are those that the box computes and those of prior work, for the desktop alone. A bundle may
-name only a feature set of appliance.signal.features.
+KINDS holds the features that the box computes and those of prior work, which only the desktop
+computes. A bundle may name only a feature set of appliance.signal.features.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
 
 
 def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float32]:
-    """The feature set `kind` of KINDS of raw counts [T, R, C] at `rate_hz`, as float32 [n]. Raises
+    """The feature set `kind` of KINDS for raw counts [T, R, C] at `rate_hz`, float32 [n]. Raises
     FormatError."""
     return features.compute(kind, taxels, rate_hz, KINDS)
 
 
 def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
-    """The input `kind` of a graph for raw counts [T, R, C]: the counts themselves where it is
-    "raw", else `compute`."""
+    """The input `kind` of a graph: the raw counts [T, R, C] themselves if it is "raw", else their
+    features, as `compute` gives them."""
     return features.graph_input(kind, taxels, rate_hz, KINDS)

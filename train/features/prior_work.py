@@ -1,12 +1,11 @@
-"""Features of the work that the paper compares itself with. In: raw counts of one window, frame
-rate. Out: float64 [n].
+"""Features of the work that the paper compares itself with, float64 [n], from raw counts of one
+window.
 
 Static features (Hoelscher et al. 2015), spectrogram (Sinapov et al. 2011), correlation features
 (Kaboli et al. 2015, Chathuranga et al. 2015). The papers used other sensors (BioTac,
-accelerometers, three magnetic axes); each function says how it was adapted to a pressure skin. Any
-grid, rate and data type is accepted; the functions are pure. Raw counts are [T, R, C], or [T, R, C,
-A] where a taxel has several axes: each axis is a series, load and place are those of the normal
-one.
+accelerometers, three magnetic axes), so each function says how we adapted it to a pressure skin.
+Any grid, frame rate and data type is accepted. Raw counts are [T, R, C], or [T, R, C, A] if a taxel
+has several axes: each axis is a series, and load and centre are those of the normal axis.
 """
 
 from __future__ import annotations
@@ -24,21 +23,25 @@ from appliance.signal.features import axes
 Array = NDArray[np.float64]
 
 LOADED = 0.1
-"""A taxel is in contact where its mean is more than this share of the strongest taxel's."""
+"""A taxel is in contact if its mean exceeds this share of the strongest taxel's mean."""
 TIME_BINS, FREQUENCY_BINS = 5, 25
-"""The spectrogram of Sinapov et al. 2011 after down-sampling."""
+"""Size of the spectrogram of Sinapov et al. 2011 after down-sampling."""
 
 
 def static(taxels: NDArray[Any], rate_hz: float) -> Array:
     """Features that do not depend on the order of the frames (Hoelscher et al. 2015), [2 M + 7]
     with M = R * C * A.
 
-    taxels: raw counts; rate_hz is not used. Each series' mean [M] and standard deviation over time
-    [M]; mean, standard deviation, minimum and maximum of the pressure, which is the mean count of a
-    frame; the centre of pressure (row, column; in taxels from the middle of the grid, weights by
-    eq. 4); the share of taxels in contact. The choice is ours: a pressure skin has none of their
-    best features, temperature and thermal flow. One frame is enough. Raises FormatError for an
-    array that is not a sweep.
+    taxels: raw counts; rate_hz is not used. The features are:
+
+    - mean [M] and standard deviation over time [M] of each series
+    - mean, standard deviation, minimum and maximum of the pressure, the mean count of a frame
+    - row and column of the centre of pressure, in taxels from the middle of the grid, with the
+      weights of eq. 4
+    - the share of taxels in contact
+
+    The choice is ours: a pressure skin lacks their best features, temperature and thermal flow. One
+    frame is enough. Raises FormatError for an array that is not a sweep.
     """
     x = time_series.of(taxels)
     load = x[axes(taxels) - 1 :: axes(taxels)]
@@ -55,13 +58,13 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
     """Log power in 5 parts of the sweep x 25 bands of frequency (Sinapov et al. 2011), [125],
     log(counts^2).
 
-    taxels: raw counts; rate_hz is not used. The number of bins is theirs, the rest our
-    interpretation: equal parts of the sweep, equal bands from 0 to Nyquist. Each part loses its
-    mean and is weighted with a Hann window; the power of its bins without DC is averaged within
-    each band, and the taxels are added by eq. 4 as the paper does for H. The spectrum of a part
-    shorter than 50 frames has fewer than 25 bins and is interpolated (zeros are appended). Power is
-    at least FLOOR: a silent skin gives log(FLOOR). Raises FormatError for an array that is not a
-    sweep, and where a part would have fewer than four frames.
+    taxels: raw counts; rate_hz is not used. Only the number of bins is published; the rest is our
+    interpretation: equal parts of the sweep, and equal bands from 0 to Nyquist. We subtract each
+    part's mean, apply a Hann window, and average the power of the bins without DC within each band.
+    Taxels are added with the weights of eq. 4, as the paper does for H. A part shorter than 50
+    frames has fewer than 25 bins, so its spectrum is interpolated by appending zeros. Power is at
+    least FLOOR: a silent skin gives log(FLOOR). Raises FormatError for an array that is not a
+    sweep, and if a part would have fewer than four frames.
     """
     x = time_series.of(taxels)
     if x.shape[1] < 4 * TIME_BINS:
@@ -85,14 +88,20 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     """Nine numbers for any grid: how each taxel varies, and how taxels vary together. taxels: raw
     counts.
 
-    Of Kaboli et al. 2015: Hjorth's activity (log of the variance, in log(counts^2)), mobility
-    (deviation of the change per second over that of the counts, in 1/s) and complexity (mobility of
-    the change over mobility), each summed over taxels by eq. 4; mean and spread over all pairs of
-    taxels of the linear (Pearson) and non-linear (Spearman, by ranks) correlation. Of Chathuranga
-    et al. 2015: the log of the Frobenius norm of the covariance matrix, in log(counts^2), and the
-    mean count. Their axes and cells are our taxels; a constant one is left out of correlations,
-    which are 0 where fewer than two vary. Variances are at least FLOOR: for a silent skin mobility
-    is `rate_hz` and complexity 1. Raises FormatError for an array that is not a sweep, fewer than
+    From Kaboli et al. 2015, summed over taxels with the weights of eq. 4:
+
+    - Hjorth's activity, the log of the variance, in log(counts^2)
+    - mobility, the deviation of the change per second divided by the deviation of the counts, in
+      1/s
+    - complexity, the mobility of the change divided by the mobility
+
+    Also from Kaboli et al., over all pairs of taxels: mean and spread of the linear (Pearson) and
+    non-linear (Spearman, by ranks) correlation. From Chathuranga et al. 2015: the log of the
+    Frobenius norm of the covariance matrix, in log(counts^2), and the mean count.
+
+    Their axes and cells are our taxels. Constant taxels are left out of correlations, which are 0
+    if fewer than two taxels vary. Variances are at least FLOOR: for a silent skin mobility is
+    `rate_hz` and complexity 1. Raises FormatError for an array that is not a sweep, fewer than
     three frames, or an invalid rate.
     """
     x = time_series.of(taxels)
@@ -112,7 +121,7 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
 
 
 def _hjorth(x: Array, rate_hz: float) -> Array:
-    """Activity, mobility and complexity of each series in `x` [M, T]: [3, M]."""
+    """Activity, mobility and complexity [3, M] of each series in `x` [M, T]."""
     change = np.diff(x, axis=1)
     variances = [
         np.maximum(s.var(axis=1), time_series.FLOOR) for s in (x, change, np.diff(change, axis=1))
@@ -122,7 +131,7 @@ def _hjorth(x: Array, rate_hz: float) -> Array:
 
 
 def _ranks(one: Array) -> Array:
-    """Ranks of the values in `one` [T] less their mean; equal values share their mean rank."""
+    """Ranks of the values in `one` [T] minus their mean. Equal values share their mean rank."""
     _, inverse, counts = np.unique(one, return_inverse=True, return_counts=True)
     rank = np.cumsum(counts) - (counts - 1) / 2
     shared: Array = rank[inverse] - (len(one) + 1) / 2
@@ -130,17 +139,17 @@ def _ranks(one: Array) -> Array:
 
 
 def _sum_of_squared_products(z: Array) -> float:
-    """Sum over all i and j of (z_i . z_j)^2 for `z` [M, T], by whichever of the two Gram matrices
-    is smaller."""
+    """Sum over all i and j of (z_i . z_j)^2 for `z` [M, T], computed from the smaller of its two
+    Gram matrices."""
     gram = z @ z.T if len(z) <= z.shape[1] else z.T @ z
     return float((gram**2).sum())
 
 
 def _pairs(varying: Array) -> tuple[float, float]:
-    """Mean and standard deviation of the correlation over all pairs in `varying` [m, T], each of
-    mean 0 and not constant.
+    """Mean and standard deviation of the correlation over all pairs in `varying` [m, T], whose
+    series have mean 0 and are not constant.
 
-    From sums over all taxels, so that a large grid needs no matrix of all its pairs.
+    Computed from sums over all taxels, so a large grid needs no matrix of all pairs.
     """
     m = len(varying)
     if m < 2:

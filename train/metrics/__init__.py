@@ -1,1 +1,1 @@
-"""Accuracy with its interval."""
+"""Accuracy, its intervals, and calibration of probabilities."""

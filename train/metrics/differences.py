@@ -1,9 +1,9 @@
-"""Means and differences of accuracies of which only the intervals are known. In: estimates. Out: an
-estimate.
+"""Means and differences of accuracies that are known only by their intervals.
 
-An interval of a sum or difference is put together of the distances from each estimate to its ends,
-as if those estimates were independent (the method of variance estimates recovery: Zou and Donner,
-Statistics in Medicine 2008, and for two shares Newcombe, Statistics in Medicine 1998, method 10).
+The interval of a sum or difference is computed from the distances between each estimate and the
+ends of its interval, as if the estimates were independent (method of variance estimates recovery:
+Zou and Donner, Statistics in Medicine 2008; for two shares Newcombe, Statistics in Medicine 1998,
+method 10).
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 Estimate = tuple[float, float, float]
-"""A share or a difference of shares, and the lower and upper end of its 95 % interval."""
+"""A share or a difference of shares, with the lower and upper end of its 95 % interval."""
 
 
 def of(entry: Mapping[str, Any]) -> Estimate:
-    """An entry of results, with `mean`, `low` and `high`."""
+    """The estimate in an entry of results, with `mean`, `low` and `high`."""
     return entry["mean"], entry["low"], entry["high"]
 
 
 def entry(estimate: Estimate) -> dict[str, float]:
-    """The same as an entry of results."""
+    """An estimate as an entry of results."""
     return dict(zip(("mean", "low", "high"), estimate, strict=True))
 
 
 def difference(one: Estimate, other: Estimate) -> Estimate:
-    """`one` less `other`. Methods that were tested on the same sweeps mostly fail together, so its
-    interval is too wide."""
+    """`one` minus `other`. If both methods were tested on the same sweeps, the interval is too
+    wide, because they mostly fail on the same sweeps."""
     gap = one[0] - other[0]
     below = math.hypot(one[0] - one[1], other[2] - other[0])
     above = math.hypot(one[2] - one[0], other[0] - other[1])
@@ -36,10 +36,10 @@ def difference(one: Estimate, other: Estimate) -> Estimate:
 
 
 def mean(groups: Mapping[str, Sequence[Estimate]]) -> Estimate:
-    """The mean of all estimates. Those of one group, which share their sweeps, are taken to err
-    together, groups independently.
+    """The mean of all estimates.
 
-    Raises ZeroDivisionError where there is none.
+    Estimates of one group share their sweeps: their errors are assumed equal, and errors of
+    different groups independent. Raises ZeroDivisionError if `groups` is empty.
     """
     every = [one for group in groups.values() for one in group]
     middle = math.fsum(one[0] for one in every) / len(every)

@@ -1,5 +1,4 @@
-"""Scores: right answers of how many, with a 95 % interval. In: right or wrong, logits. Out: figures
-for results."""
+"""Counts of right answers, with 95 % intervals, as figures for results."""
 
 from __future__ import annotations
 
@@ -20,32 +19,33 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 
 Array = NDArray[Any]
 DRAWS = 2000
-"""Of the bootstrap."""
+"""Number of draws of the bootstrap."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """`right` of `total`."""
+    """`right` of `total` answers are right."""
 
     right: int
     total: int
 
     @classmethod
     def of(cls, right: Array) -> Score:
-        """Of booleans [n]."""
+        """The score of answers that are right or wrong, bool [n]."""
         return cls(int(right.sum()), len(right))
 
     def json(self) -> dict[str, int]:
-        """As scripts read it."""
+        """The entry of a result file, as scripts read it."""
         return {"right": self.right, "total": self.total}
 
 
 def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]:
     """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
 
-    Without clusters it is Wilson's. Where sweeps succeed or fail together, as those of one position
-    do (clusters [n]), it is that of the cluster bootstrap (percentiles of 2,000 draws), or Wilson's
-    where that is wider: a bootstrap of few clusters, or where all answers are right, is too narrow.
+    Without `clusters` it is Wilson's interval. Sweeps of one cluster (numbers [n], such as
+    positions) succeed or fail together; then it is the wider of Wilson's interval and that of the
+    cluster bootstrap (percentiles of DRAWS draws). The bootstrap alone is too narrow if there are
+    few clusters or all answers are right.
     """
     low, high = widen(wilson(float(right.sum()), len(right)), right, clusters)
     return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
@@ -54,11 +54,11 @@ def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]
 def widen(
     bounds: tuple[float, float], values: Array, clusters: Array | None
 ) -> tuple[float, float]:
-    """The interval `bounds` of the mean of `values` [n], extended to that of the bootstrap over
-    `clusters` [n].
+    """The interval `bounds` of the mean of `values` [n], extended to the interval of the bootstrap
+    over `clusters` [n].
 
-    The bootstrap's is from 2.5 to 97.5 % of DRAWS draws; without clusters `bounds` stay as they
-    are.
+    The bootstrap's interval is from 2.5 to 97.5 % of DRAWS draws. Without clusters, `bounds` are
+    returned unchanged.
     """
     if clusters is None:
         return bounds
@@ -72,9 +72,11 @@ def widen(
 
 
 def fuse(logits: Array, together: Array) -> tuple[Array, Array]:
-    """Fuse the sweeps with the same value of `together` [n]: log scores [G, K], each the logarithm
-    of the product of the probabilities of `logits` [n, K], and the number [G] of the first sweep of
-    each."""
+    """Fuse the sweeps that have the same value in `together` [n].
+
+    Returns log scores [G, K], the logarithm of the product of the probabilities of `logits` [n, K],
+    and the number [G] of the first sweep of each value.
+    """
     _, first, member = np.unique(together, return_index=True, return_inverse=True)
     scores = np.zeros((len(first), logits.shape[1]))
     np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
@@ -92,7 +94,7 @@ def provenance() -> dict[str, str]:
     """The origin that a result file records beside its sets and seeds. shipped: the id of the
     packaged bundle.
 
-    All is of the first call: other commits, and another day, may follow during a long run.
+    Cached at the first call, because the commit and the day may change during a long run.
     """
     return {
         "commit": commit(),

@@ -23,8 +23,8 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 
 Array = NDArray[Any]
 TEMPERATURES = np.geomspace(1, 100, 200)
-"""Candidates of the first and the last policy. Posteriors of LDA (temperature 1) are never too
-modest; at 100 they are almost uniform."""
+"""Candidates of `platt_temperature` and `sufficient_temperature`. Posteriors of LDA (temperature 1)
+are never underconfident; at 100 they are almost uniform."""
 LOG_TEMPERATURES = (-6, 4)
 """Range that `weighted_platt_temperature` searches."""
 SLACK = 0.5
@@ -66,12 +66,12 @@ def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> 
 
 def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float:
     """The lowest of TEMPERATURES whose log loss is within SLACK standard errors of the smallest
-    loss (after the one-standard-error rule; Breiman et al. 1984).
+    loss (a variant of the one-SE rule; Breiman et al. 1984).
 
     The standard error is that of a mean over `groups` [n], because sweeps of a group are right or
-    wrong together; with a single group it is that over sweeps. Platt's correction is left out: the
-    logits of a good head are so large that its assumed share of wrong labels would outweigh all
-    sweeps, and the temperature would be three times too high.
+    wrong together; with a single group it is that of a mean over sweeps. Platt's correction is left
+    out: the logits of a good head are so large that its assumed share of wrong labels would
+    outweigh all sweeps, and the temperature would be three times too high.
     """
     if len(np.unique(groups)) < 2:
         groups = np.arange(len(labels))

@@ -1,1 +1,1 @@
-"""ONNX graphs: written, quantized, compared, counted."""
+"""Builds, quantizes, compares and measures ONNX graphs."""

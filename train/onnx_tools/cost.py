@@ -1,7 +1,6 @@
-"""Costs that are counted in a graph. In: an ONNX graph, the form of a sweep. Out: weights,
-multiply-accumulates.
+"""Costs that are counted in an ONNX graph: weights and multiply-accumulates.
 
-They are the same on every machine; train.export.measure measures time and memory.
+They are the same on every machine. train.export.measure measures time and memory.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from appliance.signal import time_series
 from train.features import kinds
 
 NUMBERS = {TensorProto.FLOAT, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT32}
-"""Types of trained constants: shapes and indices are int64."""
+"""Data types of trained constants. Shapes and indices are int64."""
 SCALED = {"QuantizeLinear", "DequantizeLinear"}
 GATES = 3
-"""Of a GRU."""
+"""Number of gates of a GRU."""
 
 
 def precision(model: onnx.ModelProto) -> str:
-    """ "int8" where nodes of the graph compute in it, else "float"."""
+    """ "int8" if the graph has quantized nodes, else "float"."""
     return "int8" if any(node.op_type in SCALED for node in model.graph.node) else "float"
 
 
 def weights(model: onnx.ModelProto) -> int:
-    """How many trained numbers the graph holds, float or int8: its constants and the tables of its
-    classifiers.
+    """The number of trained numbers in the graph, float or int8: its constants and the tables of
+    its classifiers.
 
     Scalars and the scales and zero points of int8 are not counted.
     """
@@ -49,10 +48,10 @@ def weights(model: onnx.ModelProto) -> int:
 
 
 def macs(model: onnx.ModelProto) -> int:
-    """Multiply-accumulates of one sweep: convolutions, matrix products, GRU, kernels of an SVM,
+    """Multiply-accumulates for one sweep: convolutions, matrix products, GRU, kernels of an SVM,
     distances to neighbours.
 
-    Shapes are inferred. Raises FormatError naming a node with an unknown shape.
+    Shapes are inferred. Raises FormatError with the name of a node whose shape is unknown.
     """
     graph = onnx.shape_inference.infer_shapes(model).graph
     known = {
@@ -61,7 +60,7 @@ def macs(model: onnx.ModelProto) -> int:
     }
     known |= {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in graph.input}
     known |= {c.name: list(c.dims) for c in graph.initializer}
-    # what does not depend on the sweep is computed once, when the box loads the graph
+    # nodes that do not depend on the sweep are computed once, when the box loads the graph
     dependent = {v.name for v in graph.input}
     for node in graph.node:
         dependent |= set(node.output) if dependent & set(node.input) else set()
@@ -96,11 +95,11 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
 
 
 def feature_macs(kind: str, format: SweepFormat) -> int:
-    """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for one of n
-    real numbers.
+    """Multiply-accumulates of the Fourier transforms in the features `kind`: n log2 n for a
+    transform of n real numbers.
 
-    A transform of n real numbers takes n/4 log2 n complex products of four each. Everything else is
-    not counted.
+    Such a transform takes n/4 log2 n complex products of four multiplications each. Everything else
+    is not counted.
     """
     if kind == "raw":
         return 0
@@ -111,7 +110,7 @@ def feature_macs(kind: str, format: SweepFormat) -> int:
         transforms.append(round(x.size * log2(max(x.shape[-1], 1))))
         return power(x, frames)
 
-    rng = np.random.default_rng(0)  # no transform may be computed for a silent sweep
+    rng = np.random.default_rng(0)  # noise, because a transform of a silent sweep might be skipped
     counts = rng.integers(0, 100, (format.window, *format.shape)).astype(format.numpy_type)
     with mock.patch.object(time_series, "power", counted):
         kinds.compute(kind, counts, format.rate_hz)

@@ -1,8 +1,7 @@
-"""ONNX graphs written by hand. In: operators and weights, node by node. Out: checked models that
-the box runs.
+"""Builds ONNX graphs node by node, and checks them.
 
-Shapes are fixed and nothing is traced: a graph holds exactly the nodes that are written. Graphs
-take the sensor's raw counts, or features; all scaling is inside.
+Shapes are fixed and nothing is traced: a graph holds exactly the nodes that are written here.
+Graphs take the skin's raw counts, or features; all scaling is inside.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ TENSOR = {
 }
 OPSET, IR = 17, 8
 MULTIPLYING = ("Conv", "Gemm", "MatMul")
-"""Operators whose outputs people look at."""
+"""Operators whose outputs keep their names in `slim`, because people look at them."""
 FLOAT = TensorProto.FLOAT
 MAX_TAP = 64
-"""Largest integer tap, seven bits: two products of eight bits overflow the 16-bit sums of an x86
-without VNNI, and the answer there would differ from that on Arm."""
+"""Largest integer weight, seven bits. Two products of eight bits overflow the 16-bit sums of an x86
+without VNNI, and the answer there would differ from the answer on Arm."""
 MIDDLE = 128
-"""The byte that stands for 0 where bytes have a sign."""
+"""The byte that stands for 0 if bytes are signed."""
 
 
 class GraphBuilder:
@@ -52,7 +51,7 @@ class GraphBuilder:
         return name
 
     def __call__(self, op: str, *inputs: str, output: str = "", **attributes: Any) -> str:
-        """Add one node; the name of its output."""
+        """Add one node; returns the name of its output."""
         output = output or f"{op.lower()}{len(self.nodes)}"
         self.nodes.append(helper.make_node(op, inputs, [output], name=output, **attributes))
         return output
@@ -79,8 +78,8 @@ def centred(g: GraphBuilder, format: SweepFormat) -> tuple[str, str]:
     """Nodes that subtract the mean of each taxel and axis: `sweep` -> ([1, R * C * A, T], sums over
     time [1, R * C * A]), float32.
 
-    Matrix products do it, five times as fast in onnxruntime as ReduceMean and Sub along time, and
-    exactly for whole counts, in whatever order a processor adds them.
+    They are matrix products, five times as fast in onnxruntime as ReduceMean and Sub along time.
+    For whole counts they are exact, whatever the order in which a processor adds.
     """
     taxels = format.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
@@ -110,16 +109,16 @@ def counts_of(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
 
 
 def channels_first(g: GraphBuilder, x: str, step: float, zero: int) -> str:
-    """Bytes [n, T, R * C] -> the values they stand for [n, R * C, T]."""
+    """Bytes [n, T, R * C] -> the values that they stand for, [n, R * C, T]."""
     return counts_of(g, g("Transpose", x, perm=[0, 2, 1]), step, zero)
 
 
 def int8_weights(
     g: GraphBuilder, weight: Array, bias: Array, step: float, zero_sum: bool
 ) -> tuple[str, str]:
-    """Weight [filters, inputs, kernel] in seven bits, a step for each filter; bias in 32 bits, in
-    the product of both steps."""
-    least = np.abs(bias) / (step * 2**30)  # a silent filter's bias must fit as well
+    """Weight [filters, inputs, kernel] in seven bits, with a step for each filter; bias in 32 bits,
+    in units of the product of both steps."""
+    least = np.abs(bias) / (step * 2**30)  # the bias of a silent filter must fit too
     steps = np.maximum(np.maximum(np.abs(weight).max(axis=(1, 2)) / MAX_TAP, least), 1e-12).astype(
         np.float32
     )
@@ -150,14 +149,14 @@ def zero_sum_taps(taps: Array) -> Array:
     """Taps [filters, taxels, kernel] rounded so that each kernel sums to zero, as it did before
     rounding.
 
-    The sum after rounding is the surplus. As many taps, those nearest to being rounded the other
-    way, are rounded that way instead. None leaves the range: a tap at its end is whole and was not
-    rounded, and there are enough others.
+    The surplus is the sum after rounding. It is removed by rounding as many taps the other way,
+    those that are nearest to it. No tap leaves the range: a tap at the end of the range is whole,
+    so it was not rounded, and there are enough others.
     """
     taps = taps - taps.mean(axis=2, keepdims=True)
     rounded = np.rint(taps)
     surplus = rounded.sum(axis=2, keepdims=True)
-    moved = (rounded - taps) * np.sign(surplus)  # how far each was moved towards the surplus
+    moved = (rounded - taps) * np.sign(surplus)  # how far each tap was rounded towards the surplus
     rank = np.argsort(np.argsort(-moved, axis=2, kind="stable"), axis=2, kind="stable")
     zero_sum: Array = rounded - np.sign(surplus) * (rank < np.abs(surplus))
     return zero_sum
@@ -172,12 +171,12 @@ def sums(
     rowwise: bool = False,
     time_last: bool = False,
 ) -> str:
-    """[1, steps, C] -> sums over the first `counts` of them, of integers or floats: [1, number of
+    """[1, steps, C] -> sums over the first `counts` steps, of integers or floats: [1, number of
     counts, C].
 
-    rowwise: [m, steps, C], `counts` of m rows -> [m, counts in a row, C]. time_last: of [..., C,
-    steps]. The matrix of ones and zeros is computed from a few numbers when the box loads the
-    graph; as a constant it would be large.
+    rowwise: [m, steps, C] with `counts` for each of m rows -> [m, counts in a row, C]. time_last:
+    for [..., C, steps]. The box computes the matrix of ones and zeros from a few numbers when it
+    loads the graph; as a constant it would be large.
     """
     at = g(
         "Reshape",
@@ -201,22 +200,22 @@ def sums(
 def mean_factors(
     g: GraphBuilder, step: float, counts: list[int], size: int, rowwise: bool = False
 ) -> str:
-    """What makes means of sums over `counts`, in the shape that `_sums` gives."""
+    """Factors that turn sums over `counts` into means, in the shape that `sums` returns."""
     factors = np.array(
         [step / max(n, 1) for n in counts]
-    )  # where nothing is known the sum is 0 as well
+    )  # the sum of no steps is 0, so its mean is 0
     lead = (len(counts), 1) if rowwise else (1, len(counts))
     factors = factors.reshape(*lead, 1) if len(counts) > 1 else factors[0]
     return g("Expand", g.constant(factors), g.constant([*lead, size], "int64"))
 
 
 def side_by_side(g: GraphBuilder, parts: Sequence[str]) -> str:
-    """Values [n, m, C], their C one after another."""
+    """The values [n, m, C] of all parts, joined along C."""
     return g("Concat", *parts, axis=2) if len(parts) > 1 else parts[0]
 
 
 def with_head(trunk: onnx.ModelProto, weight: Array, bias: Array) -> onnx.ModelProto:
-    """A trunk (float or int8) and a linear head, weight [K, F] and bias [K]: `sweep` -> `logits`
+    """A trunk (float or int8) with a linear head, weight [K, F] and bias [K]: `sweep` -> `logits`
     float32 [1, K]."""
     model = onnx.ModelProto()
     model.CopyFrom(trunk)
@@ -234,21 +233,19 @@ def with_head(trunk: onnx.ModelProto, weight: Array, bias: Array) -> onnx.ModelP
 
 
 def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
-    """One model with the outputs of both, which take the same input. What both compute alike is
-    there once, as in `first`.
+    """One model with the outputs of both, which take the same input. Nodes that both have in common
+    occur once, named as in `first`.
 
-    So each output needs the nodes that it had alone, and gives the same bits where the box leaves
-    out the others.
+    Each output still depends on the same nodes as before, so it has the same bits if the box leaves
+    out the other outputs.
     """
     model = onnx.ModelProto()
     model.CopyFrom(first)
     graph, suffix = model.graph, second.graph.output[0].name
-    there: dict[
-        bytes, list[str]
-    ] = {}  # what a node or a constant is -> the names that it gives in `model`
-    same: dict[
-        str, str
-    ] = {}  # names in the graph that is gone through -> the first name of this value in `model`
+    # the content of a node or constant -> the names of its outputs in `model`
+    there: dict[bytes, list[str]] = {}
+    # names in the graph that is being added -> the first name of this value in `model`
+    same: dict[str, str] = {}
     taken: set[str] = set()
     for item in (*graph.initializer, *graph.node):
         names = there.setdefault(_content(item, same), _given(item))
@@ -267,8 +264,8 @@ def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def slim(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The same model in fewer bytes: equal constants are there once, and only what multiplies keeps
-    the name of its output, by which `palpate-train parity` tells layers."""
+    """The same model in fewer bytes: equal constants are merged, and only multiplying nodes keep
+    the names of their outputs, which `palpate-train parity` prints."""
     small = onnx.ModelProto()
     small.CopyFrom(model)
     graph = small.graph
@@ -305,7 +302,7 @@ def _append(
     item: onnx.NodeProto | onnx.TensorProto,
     names: list[str],
 ) -> None:
-    """Add what `_content` gave for `item`, under new names."""
+    """Add `item` with the new `names`; content: as `_content` returns it."""
     new = type(item).FromString(content)
     new.name = names[0]
     if isinstance(new, onnx.NodeProto):
@@ -316,13 +313,13 @@ def _append(
 
 
 def _given(item: onnx.NodeProto | onnx.TensorProto) -> list[str]:
-    """Names of what a node or a constant gives."""
+    """The names that a node or a constant defines."""
     return list(item.output) if isinstance(item, onnx.NodeProto) else [item.name]
 
 
 def _content(item: onnx.NodeProto | onnx.TensorProto, renamed: Mapping[str, str]) -> bytes:
-    """A node or a constant without its own names, with its inputs renamed: equal for two that give
-    the same values."""
+    """A node or a constant without its own names, and with its inputs renamed. It is equal for two
+    items that compute the same values."""
     bare = type(item)()
     bare.CopyFrom(item)
     bare.ClearField("name")
@@ -349,7 +346,7 @@ class GraphModel:
 
 
 def run(model: onnx.ModelProto, inputs: Array) -> Array:
-    """What `model` gives for each of `inputs` (raw counts or features), float32 [n, size], in the
-    box's kind of session."""
+    """The output of `model`, float32 [n, size], for each of `inputs` (raw counts or features), in
+    the same kind of session as on the box."""
     on_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
     return np.concatenate([on_the_box.run(None, {name: one[None]})[0] for one in inputs])

@@ -1,9 +1,9 @@
-"""Comparison of float and int8. In: both graphs of a model, sweeps with labels. Out: a Parity.
+"""Compares the float and the int8 precision of a model on labelled sweeps.
 
-It reports how much the answers differ, what accuracy is lost with its interval, and for every
-quantized tensor its range and saturation. Graphs are run as the box runs them, with their inner
-tensors as further outputs. A bundle holds no float form: then only tensors are compared, each with
-its own value before rounding.
+Reports how much the answers differ, how much accuracy is lost with its interval, and the range and
+saturation of every quantized tensor. Graphs run as on the box, with their inner tensors as further
+outputs. A bundle holds no float model; for a bundle, each tensor is only compared with its own
+value before rounding.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from train.onnx_tools.quantize import calibration_sweeps
 
 Array = NDArray[Any]
 PERCENTILES = (0.1, 50.0, 99.9, 100.0)
-"""Of a tensor's values; the last is the largest."""
+"""Percentiles of a tensor's values; the last is the largest value."""
 WEIGHTED = ("Conv", "Gemm", "MatMul")
 COMPARED = (*WEIGHTED, "MaxPool")
-"""Kinds of nodes that both forms have in the same order; tensors are compared at their outputs."""
+"""Kinds of nodes that both models have in the same order. Tensors are compared at their outputs."""
 TINY = 1e-30
 Z95 = 1.96
 
@@ -38,12 +38,12 @@ Z95 = 1.96
 class Layer:
     """One tensor that int8 rounds. kind: activations or weights.
 
-    against: what it is compared with, `float` (the same tensor of the float graph) or `itself` (its
-    value before it is rounded, where the float graph has no such tensor). percentiles: PERCENTILES
-    of that. low, high: the range of int8, in steps of `step` (of weights: the median channel's).
-    saturated: share of values beyond that range; what a ReLU cuts off does not count. sqnr_db:
-    power of the values over that of the difference, in decibel; for weights after one common factor
-    is divided out, which the float graph does not have.
+    against: `float` if it is compared with the same tensor of the float graph, `itself` if it is
+    compared with its own value before rounding, because the float graph lacks it. percentiles:
+    PERCENTILES of the values before rounding. low, high: the range of int8, in steps of `step` (for
+    weights the median channel's). saturated: share of values beyond that range; values that a ReLU
+    cuts off do not count. sqnr_db: power of the values divided by the power of the difference, in
+    decibel. For weights, a common factor that the float graph does not have is divided out first.
     """
 
     tensor: str
@@ -59,13 +59,14 @@ class Layer:
 
 @dataclass(frozen=True)
 class AnswerDifference:
-    """How far int8's answers are from float's.
+    """Differences between the answers of int8 and float.
 
-    agreement: share of equal labels. Probability and logit: of each sweep the largest difference of
-    any label; then largest and mean over sweeps. Logits are compared after each sweep's mean is
-    subtracted, which changes no answer. expected_loss: of accuracy, by float's own probabilities:
-    where int8 gives another label, that of float's label less that of int8's. Where these are
-    calibrated it is what counting right answers gives on average, with far less variance.
+    agreement: share of equal labels. Probability and logit: the largest difference over the labels
+    of each sweep; maximum and mean of it over sweeps. Each sweep's mean is subtracted from its
+    logits first, which changes no answer. expected_loss: the loss of accuracy by float's own
+    probabilities. For a sweep with different labels, it is the probability of float's label minus
+    the probability of int8's label. If probabilities are calibrated, it equals the mean loss in
+    counts of right answers, with far less variance.
     """
 
     agreement: float
@@ -78,11 +79,11 @@ class AnswerDifference:
 
 @dataclass(frozen=True)
 class AccuracyLoss:
-    """Accuracy of both, as counts of `total` sweeps. lost: float's share less int8's; low, high:
-    its 95 % interval.
+    """Accuracy of both precisions, as counts of `total` sweeps. lost: float's share minus int8's;
+    low, high: its 95 % interval.
 
-    chance: the probability, were neither form better, that int8 loses as many or more of the sweeps
-    on which they differ.
+    chance: if both were equally good, the probability that int8 loses at least as many of the
+    sweeps on which they differ.
     """
 
     total: int
@@ -96,11 +97,11 @@ class AccuracyLoss:
 
 @dataclass(frozen=True)
 class Parity:
-    """The comparison of a model's two forms on some sweeps.
+    """The comparison of a model's two precisions on some sweeps.
 
-    answers, accuracy: None where there is no float model. tap_sum: the largest sum of the integer taps of
-    one filter and taxel in the first convolution: 0 where no offset changes the answer, -1 where
-    there is no convolution in int8.
+    answers, accuracy: None if there is no float model. tap_sum: the largest sum of the integer taps
+    of one filter and taxel in the first convolution: 0 if no offset changes the answer, -1 if no
+    convolution is in int8.
     """
 
     sweeps: int
@@ -111,11 +112,11 @@ class Parity:
     layers: tuple[Layer, ...]
 
     def json(self) -> dict[str, Any]:
-        """What scripts read."""
+        """The comparison as scripts read it."""
         return asdict(self)
 
     def summary(self) -> dict[str, Any]:
-        """The part for a manifest: of the tensors only the worst."""
+        """The entry of a manifest: of the tensors only the worst."""
         figures: dict[str, Any] = {}
         for part in (self.answers, self.accuracy):
             figures |= asdict(part) if part else {}
@@ -135,11 +136,11 @@ def measure(
     reference: onnx.ModelProto | None = None,
     clusters: Array | None = None,
 ) -> Parity:
-    """Compare `int8` with `reference`, its float form, on `inputs` (raw counts or features) of
+    """Compare `int8` with the float model `reference` on `inputs` (raw counts or features) of
     sweeps with these `labels`.
 
-    clusters: [n], sweeps that succeed or fail together. Raises FormatError where nothing in `int8`
-    is quantized.
+    clusters: [n], numbers of sweeps that succeed or fail together. Raises FormatError if nothing in
+    `int8` is quantized.
     """
     int8_logits = logits(int8, inputs)
     right, difference, lost = int8_logits.argmax(1) == labels, None, None
@@ -150,18 +151,20 @@ def measure(
     rounded = tuple(layers(int8, reference, calibration_sweeps(inputs)))
     if not rounded and reference is None:
         raise FormatError(
-            "the model has no int8 tensors: there is nothing to compare; export a fit with palpate-train export"
+            "the model has no int8 tensors: there is nothing to compare; "
+            "export a fit with palpate-train export"
         )
     return Parity(len(labels), int(right.sum()), difference, lost, tap_sum(int8), rounded)
 
 
 def logits(model: onnx.ModelProto, inputs: Array) -> Array:
-    """The output `logits` for each of `inputs`, float32 [n, K], in the box's kind of session."""
+    """The output `logits` for each of `inputs`, float32 [n, K], in the same kind of session as on
+    the box."""
     return outputs(model, ["logits"], inputs)[0]
 
 
 def compare(float_logits: Array, int8_logits: Array) -> AnswerDifference:
-    """Of the logits of both forms for the same sweeps, [n, K] each."""
+    """Compare the logits [n, K] of both precisions for the same sweeps."""
     p, q = softmax(float_logits), softmax(int8_logits)
     label, other = float_logits.argmax(1, keepdims=True), int8_logits.argmax(1, keepdims=True)
     given_away = np.take_along_axis(p, label, 1) - np.take_along_axis(p, other, 1)
@@ -180,12 +183,12 @@ def compare(float_logits: Array, int8_logits: Array) -> AnswerDifference:
 
 
 def loss(float_right: Array, int8_right: Array, clusters: Array | None = None) -> AccuracyLoss:
-    """Of booleans [n] of the same sweeps.
+    """The loss of accuracy; booleans [n] say which answers to the same sweeps are right.
 
     The interval of the difference of matched proportions is that of Agresti and Min (Statistics in
-    Medicine 24, 2005): a half is added to each of the four counts, so that it is valid where the
-    forms never differ, too. With `clusters` it is the cluster bootstrap's (as score.interval) where
-    that is wider.
+    Medicine 24, 2005). It adds a half to each of the four counts, and so is valid even if both
+    precisions always agree. With `clusters` it is extended to the interval of the cluster bootstrap
+    (see score.interval).
     """
     difference = float_right.astype(float) - int8_right
     fewer, more = int((difference > 0).sum()), int((difference < 0).sum())
@@ -203,8 +206,8 @@ def loss(float_right: Array, int8_right: Array, clusters: Array | None = None) -
 def layers(
     int8: onnx.ModelProto, reference: onnx.ModelProto | None, inputs: Array
 ) -> Iterator[Layer]:
-    """Every rounded tensor of `int8`, then its weights where there is `reference`, its float form,
-    to compare with."""
+    """Every rounded tensor of `int8`, then its weights if there is a float model `reference` to
+    compare them with."""
     constants, nodes = _constants(int8), rounding_nodes(int8)
     tensors = outputs(int8, [q.input[0] for q in nodes] + [q.output[0] for q in nodes], inputs)
     twins = [_twin(int8, reference, q.input[0]) for q in nodes]
@@ -223,7 +226,7 @@ def layers(
         low, high = (limits.min - zero) * step, (limits.max - zero) * step
         against = "float" if twin and of_float[twin].shape == after.shape else "itself"
         want = of_float[twin] if against == "float" else before
-        want = np.maximum(want, 0) if low == 0 else want  # rounding does the ReLU as well
+        want = np.maximum(want, 0) if low == 0 else want  # rounding includes the ReLU
         beyond = float(np.mean((want > high + step / 2) | (want < low - step / 2)))
         sqnr = _sqnr(want, (after.astype(np.float64) - zero) * step)
         yield Layer(
@@ -281,7 +284,7 @@ def rounding_nodes(int8: onnx.ModelProto) -> list[onnx.NodeProto]:
 
 
 def outputs(model: onnx.ModelProto, names: list[str], inputs: Array) -> list[Array]:
-    """Tensors of `model` by name, inner ones too, for each of `inputs`: [n, ...] each."""
+    """Tensors of `model` by name, inner tensors too, for each of `inputs`: [n, ...] each."""
     run, given = session(with_outputs(model, names).SerializeToString()), model.graph.input[0].name
     sweeps = [run.run(names, {given: one[None]}) for one in inputs]
     return [np.concatenate([tensors[i] for tensors in sweeps]) for i in range(len(names))]
@@ -296,22 +299,22 @@ def _nodes(model: onnx.ModelProto, *kinds: str) -> list[onnx.NodeProto]:
 
 
 def _maker(model: onnx.ModelProto, tensor: str) -> onnx.NodeProto | None:
-    """The node whose output `tensor` is, None for an input or a constant."""
+    """The node that computes `tensor`, None for an input or a constant."""
     return next((node for node in model.graph.node if tensor in node.output), None)
 
 
 def _same(
     int8: onnx.ModelProto, reference: onnx.ModelProto, node: onnx.NodeProto
 ) -> onnx.NodeProto | None:
-    """The node of `reference` that does what `node` does: the one with the same number, where its
-    kind is as frequent."""
+    """The node of `reference` that corresponds to `node`: the node of the same kind and number,
+    None if the kinds occur in different numbers."""
     mine, its = _nodes(int8, node.op_type), _nodes(reference, node.op_type)
     return its[mine.index(node)] if len(mine) == len(its) else None
 
 
 def _twin(int8: onnx.ModelProto, reference: onnx.ModelProto | None, tensor: str) -> str:
-    """The name in `reference` of what `tensor` is in `int8`, after its ReLU; "" where there is no
-    such tensor."""
+    """The name in `reference` of the tensor that corresponds to `tensor` in `int8`, after its ReLU;
+    "" if there is none."""
     node = _maker(int8, tensor)
     if reference is None or node is None or node.op_type not in COMPARED:
         return ""
@@ -323,8 +326,8 @@ def _twin(int8: onnx.ModelProto, reference: onnx.ModelProto | None, tensor: str)
 
 
 def _weights(model: onnx.ModelProto, node: onnx.NodeProto) -> tuple[Array, Array] | None:
-    """Integer weights of `node` less their zero point, float64, and the step of each channel,
-    shaped to fit; None where they are float."""
+    """Integer weights of `node` minus their zero point, float64, and the step of each channel in a
+    shape that fits; None if the weights are float."""
     maker, constants = _maker(model, node.input[1]), _constants(model)
     if maker is None or maker.op_type != "DequantizeLinear":
         return None
@@ -340,8 +343,8 @@ def _weights(model: onnx.ModelProto, node: onnx.NodeProto) -> tuple[Array, Array
 
 
 def _depends_on_input(model: onnx.ModelProto, tensor: str) -> bool:
-    """Whether `tensor` is, or is computed from, the model's input: else onnxruntime computes it
-    when it loads the model."""
+    """Whether `tensor` is computed from the model's input, or is the input. If not, onnxruntime
+    computes it when it loads the model."""
     if tensor == model.graph.input[0].name:
         return True
     maker = _maker(model, tensor)
@@ -349,7 +352,7 @@ def _depends_on_input(model: onnx.ModelProto, tensor: str) -> bool:
 
 
 def _nothing(model: onnx.ModelProto) -> Array:
-    """One input of zeros [1, ...] of the model's type."""
+    """An input of zeros [1, ...] in the model's type."""
     given = model.graph.input[0].type.tensor_type
     shape = [d.dim_value for d in given.shape.dim][1:]
     return np.zeros((1, *shape), helper.tensor_dtype_to_np_dtype(given.elem_type))
@@ -368,20 +371,25 @@ def _sqnr(want: Array, have: Array) -> float:
 
 
 def table(parity: Parity) -> str:
-    """All of it as text."""
+    """The whole comparison as text."""
     lines = []
     if (apart := parity.answers) and (lost := parity.accuracy):
         lines.append(
-            f"labels equal {apart.agreement:.4f}, expected loss {100 * apart.expected_loss:.2f} points; a probability differs by up to {apart.probability_difference:.4f} "
-            f"(mean of sweeps {apart.probability_mean:.4f}), a logit by up to {apart.logit_difference:.3f} ({apart.logit_mean:.3f})"
+            f"labels equal {apart.agreement:.4f}, "
+            f"expected loss {100 * apart.expected_loss:.2f} points; "
+            f"a probability differs by up to {apart.probability_difference:.4f} "
+            f"(mean of sweeps {apart.probability_mean:.4f}), "
+            f"a logit by up to {apart.logit_difference:.3f} ({apart.logit_mean:.3f})"
         )
         lines.append(
-            f"float {lost.float_right}/{lost.total}, int8 {lost.int8_right}/{lost.total}: lost {100 * lost.lost:.2f} points "
+            f"float {lost.float_right}/{lost.total}, int8 {lost.int8_right}/{lost.total}: "
+            f"lost {100 * lost.lost:.2f} points "
             f"[{100 * lost.low:.2f}, {100 * lost.high:.2f}]"
         )
     else:
         lines.append(
-            f"int8 {parity.int8_right}/{parity.sweeps}; a bundle holds no float form: tensors are compared with themselves"
+            f"int8 {parity.int8_right}/{parity.sweeps}; a bundle holds no float model: "
+            "tensors are compared with themselves"
         )
     taps = (
         "zero, so no offset changes the answer"
@@ -391,7 +399,8 @@ def table(parity: Parity) -> str:
     lines.append(f"first convolution, sum of the integer taps of a filter and taxel: {taps}")
     percentiles = " ".join(f"{'max' if p == 100 else f'{p:g} %':>9}" for p in PERCENTILES)
     lines.append(
-        f"{'tensor':<36} {'against':<8} {percentiles} {'int8 from':>9} {'to':>9} {'step':>9} {'saturated':>9} {'SQNR dB':>8}"
+        f"{'tensor':<36} {'against':<8} {percentiles} {'int8 from':>9} {'to':>9} {'step':>9} "
+        f"{'saturated':>9} {'SQNR dB':>8}"
     )
     for x in parity.layers:
         values = " ".join(f"{v:>9.3g}" for v in (*x.percentiles, x.low, x.high, x.step))

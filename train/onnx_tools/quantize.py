@@ -1,5 +1,4 @@
-"""Static quantization. In: a float graph, sweeps of the training set. Out: the graph with its
-expensive nodes in int8."""
+"""Static quantization: puts the expensive nodes of a float graph into int8."""
 
 from __future__ import annotations
 
@@ -24,12 +23,12 @@ from onnxruntime.quantization import (
 Array = NDArray[Any]
 CALIBRATION_SWEEPS = 96
 PERCENTILE = 99.9
-"""Of the values, the one that int8 reaches: with the full range one outlier sweep costs all others
-their resolution."""
+"""Percentile of the values that is the end of the int8 range. With the full range, one outlier
+sweep would take resolution from all others."""
 
 
 def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
-    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]: a step for all along the first
+    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]; a step is shared along the first
     axis. Their product is the matrix, rounded."""
     steps = np.maximum(
         np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny
@@ -40,17 +39,16 @@ def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
 def quantize(
     model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")
 ) -> onnx.ModelProto:
-    """`model` with its nodes `ops` in int8, ranges found on some of `sweeps`: raw counts [N, T, R,
-    C].
+    """`model` with its nodes `ops` in int8. The ranges come from some of `sweeps`, raw counts [N,
+    T, R, C].
 
     Weights have seven bits: two products of eight bits overflow the 16-bit sums of an x86 without
-    VNNI, and the answer there would differ from that on Arm.
+    VNNI, and the answer there would differ from the answer on Arm.
     """
     copy = onnx.ModelProto()
-    copy.CopyFrom(model)  # onnxruntime moves the weights of what it is given to a file
-    copy.metadata_props.add(
-        key="onnx.quant.pre_process", value="onnxruntime.quant"
-    )  # nothing to simplify beforehand
+    copy.CopyFrom(model)  # a copy, because onnxruntime moves the weights of its argument to a file
+    # nothing to simplify beforehand
+    copy.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         path = Path(folder) / "int8.onnx"
         quantize_static(
@@ -68,15 +66,14 @@ def quantize(
         )
         made = onnx.load(path)
     for constant in made.graph.initializer:
-        constant.ClearField(
-            "data_location"
-        )  # set to its default where onnxruntime had moved it; the box refuses the field
+        # onnxruntime sets this field to its default; the box refuses the field
+        constant.ClearField("data_location")
     return made
 
 
 def calibration_sweeps(sweeps: Array) -> Array:
-    """At most CALIBRATION_SWEEPS of `sweeps` [N, ...], evenly spaced: ranges and comparisons are
-    taken from these."""
+    """At most CALIBRATION_SWEEPS of `sweeps` [N, ...], evenly spaced. Ranges and comparisons use
+    them."""
     some: Array = sweeps[
         np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)
     ]

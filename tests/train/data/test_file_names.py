@@ -1,4 +1,5 @@
-"""Patterns over file names: what they read, what is ambiguous, what is no pattern."""
+"""Patterns over file names: the fields that they read, ambiguous names, and texts that are not
+patterns."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ from train.data.file_names import NamePattern, group
     ],
 )
 def test_a_pattern_reads_a_name(pattern: str, path: str, fields: dict[str, str] | None):
-    """Text, whole numbers, numbers, parts that say nothing; a field stays within one name."""
+    """Text, whole numbers, numbers, ignored parts; a field stays within one name."""
     assert NamePattern(pattern).read(path) == fields
 
 
@@ -54,7 +55,7 @@ def test_a_name_that_fits_in_several_ways_is_refused():
     ],
 )
 def test_what_is_no_pattern_is_refused(pattern: str, message: str):
-    """Each with its reason."""
+    """Each invalid pattern has its message."""
     with pytest.raises(FormatError, match=message):
         NamePattern(pattern)
 
@@ -69,7 +70,7 @@ def test_what_is_no_pattern_is_refused(pattern: str, message: str):
     ],
 )
 def test_texts_become_numbers_that_are_told(texts: list[str], values: list[int], meaning: str):
-    """Whole numbers stay; others are ranked by value, or by name, and the report says what a rank
-    is."""
+    """Whole numbers stay; other texts are ranked by value or by name, and the report explains each
+    rank."""
     numbers, told = group(texts)
     assert (numbers.tolist(), told) == (values, meaning)

@@ -1,5 +1,5 @@
-"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; what cannot be used gets one exact
-line."""
+"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; each file that cannot be used gets
+one exact line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def plan(**changes: object) -> ImportPlan:
 
 
 def taken(folder: Path, **changes: object) -> Imported:
-    """What is imported; every file fits and is used."""
+    """The imported sweeps; every file fits and is used."""
     left_out: list[LeftOut] = []
     made = import_folder(folder, plan(**changes), lambda line: None, left_out)
     assert left_out == []
@@ -117,7 +117,8 @@ def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
 
 
 def test_windows_are_cut_as_asked(tmp_path: Path):
-    """The middle one; or one every so often from the start on, all of one recording."""
+    """The middle window, or a window at regular intervals from the start on; all belong to one
+    recording."""
     for name in ("cork_1", "felt_1"):
         text(tmp_path / f"{name}.csv")
     s = taken(tmp_path, every=Length("150ms", "--every")).sweeps
@@ -207,7 +208,7 @@ def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
 def test_a_count_that_does_not_fit_leaves_its_file_out(
     tmp_path: Path, dtype: str, value: float, why: str
 ):
-    """By name, with the count and what the type holds; the others are taken."""
+    """The message gives the file, the count and the range of the type; other files are imported."""
     for name in ("cork_1", "felt_1", "felt_2"):
         np.save(tmp_path / f"{name}.npy", COUNTS.astype(np.float64))
     bad = COUNTS.astype(np.float64)
@@ -246,7 +247,7 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
-    """The place and what stands there; the other files are taken."""
+    """The line gives the place and the bad text; other files are imported."""
     content, why = BAD[name]
     for good in ("cork_1", "felt_1"):
         (tmp_path / f"{good}.csv").write_text(GOOD)
@@ -309,8 +310,8 @@ def test_each_bad_binary_gets_one_exact_line(tmp_path: Path, suffix: str, save, 
 
 
 def test_an_array_is_chosen_and_turned(tmp_path: Path):
-    """Of two arrays the one that --variable names; taxels x frames with --transpose; times beside
-    it."""
+    """--variable chooses between two arrays; --transpose reads taxels x frames; times stand beside
+    the array."""
     for name in ("cork_1", "felt_1"):
         np.savez(
             tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50
@@ -342,8 +343,8 @@ def test_an_array_is_chosen_and_turned(tmp_path: Path):
     ],
 )
 def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
-    """Back in time, standing still, in bursts, at another rate: the file is left out, the others
-    are taken."""
+    """Times that go back, stand still, come in bursts or at another rate: the file is left out, the
+    others are imported."""
     for good in ("cork_1", "felt_1"):
         write(tmp_path / f"{good}.csv", COUNTS, 100.0)
     write(tmp_path / "felt_2.csv", COUNTS, 100.0, times)
@@ -382,7 +383,8 @@ def test_a_length_is_seconds_or_frames(length: str):
 
 
 def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
-    """All at once; --rename gives others, and joins two; one that nobody has is refused."""
+    """All bad names at once; --rename changes names and joins materials; renaming an unknown
+    material is refused."""
     for name in ("a,b", "x" * 30, "felt"):
         (tmp_path / f"{name}_1.csv").write_text("nothing to read")
     with pytest.raises(
@@ -398,7 +400,8 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
 
 
 def test_shapes_that_differ_are_refused(tmp_path: Path):
-    """Arrays of two grids are no set; nor is a folder that is none, or in which nothing fits."""
+    """Arrays of two grids are not a set; nor is a path that is not a folder, or a folder in which
+    no file matches."""
     np.save(tmp_path / "cork_1.npy", np.zeros((20, 2, 2)))
     np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
     with pytest.raises(FormatError, match=r"frames differ in shape: \[\[2, 2\], \[2, 3\]\]"):

@@ -40,7 +40,7 @@ def test_materials_that_get_one_name_become_one():
 
 
 def test_a_description_tells_which_names_must_change(tmp_path: Path):
-    """Of a file and of a folder of recordings: before anybody trains for an hour."""
+    """For a file and for a folder of recordings, before any training."""
     replace(easy(4), materials=("a,b", "middle", "c" * 33)).save(tmp_path / "long.npz")
     last = summary.describe(str(tmp_path / "long.npz")).splitlines()[-1]
     assert last.startswith(

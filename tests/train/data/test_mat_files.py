@@ -1,4 +1,4 @@
-"""MAT files: what scipy writes is read as scipy reads it; damage is told and never reaches
+"""MAT files: arrays are read as scipy reads them; damage raises an error and never reaches
 memory."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 
 
 def saved(compressed: bool, **values: object) -> bytes:
-    """What scipy writes."""
+    """A MAT file written by scipy."""
     file = io.BytesIO()
     scipy.io.savemat(file, values, do_compression=compressed)
     return file.getvalue()
@@ -37,8 +37,8 @@ CONTENT = {
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_numbers_are_read_as_scipy_reads_them(compressed: bool):
-    """Every class of numbers, cubes, scalars, nothing; what is no plain array of numbers is passed
-    over."""
+    """Every class of numbers, cubes, scalars, empty arrays; anything but a plain array of numbers
+    is ignored."""
     others = {
         "text": "abc",
         "cell": np.array([1, "a"], object),
@@ -54,7 +54,7 @@ def test_numbers_are_read_as_scipy_reads_them(compressed: bool):
 
 
 def test_the_other_byte_order_is_read():
-    """A file of a big-endian machine, put together by hand: flags, shape, name in its tag, two
+    """A file from a big-endian machine, built by hand: flags, shape, name in its tag, two
     doubles."""
     flags = b"\0\0\0\6" + b"\0\0\0\x08" + b"\0\0\0\6" + bytes(4)
     shape = b"\0\0\0\5" + b"\0\0\0\x08" + b"\0\0\0\1" + b"\0\0\0\2"
@@ -77,7 +77,8 @@ WHOLE = {
     st.lists(st.tuples(st.integers(100, 2000), st.integers(0, 255)), max_size=6),
 )
 def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int]]):
-    """Cut anywhere, bytes altered: arrays that fit their shapes, or a FormatError; nothing else."""
+    """Cut anywhere or with altered bytes: the file gives arrays that fit their shapes, or a
+    FormatError."""
     data = bytearray(WHOLE[compressed][: len(WHOLE[compressed]) - cut])
     for at, value in changes:
         if at < len(data):
@@ -102,6 +103,6 @@ def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int
     ],
 )
 def test_each_damage_has_its_message(data: bytes, message: str):
-    """What is wrong, and where."""
+    """The message says which part is damaged, and where."""
     with pytest.raises(FormatError, match=message):
         mat_files.arrays(data)

@@ -1,4 +1,5 @@
-"""How much of long work is done and how long the rest will take, in a line and as numbers."""
+"""Progress of long work: the share that is done and the time that is left, as a line and as
+numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from train.data.progress import Progress, ProgressLine, spoken
 
 
 class SteppedClock:
-    """Seconds that the test sets."""
+    """A clock that the test sets, in seconds."""
 
     now = 0.0
 
@@ -18,8 +19,8 @@ class SteppedClock:
 
 
 def test_progress_shows_how_much_is_left():
-    """Done, all, a time from what the others took, and what was done; the numbers of the line are
-    the same."""
+    """Tasks done, tasks in all, the time left estimated from finished tasks, and the task; the line
+    carries the same numbers."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(4, lines.append, clock)
@@ -33,7 +34,8 @@ def test_progress_shows_how_much_is_left():
 
 
 def test_a_task_that_begins_is_not_done():
-    """It is when the next one begins; before the first is done no time is known."""
+    """It counts as done when the next task begins; before the first is done there is no
+    estimate."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(3, lines.append, clock)

@@ -1,5 +1,5 @@
-"""The published series that aeon ships: their form, their splits, and what is said where they
-cannot be had."""
+"""The published series that aeon ships: their format, their splits, and the messages if they are
+missing."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Fetching recordings: only what is new, whole pairs whatever breaks off, nothing overwritten,
-nothing from elsewhere.
+"""Fetching recordings: only new ones, whole pairs whenever a connection breaks, nothing
+overwritten, and nothing that was not requested.
 
 The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and
-tar. One test goes through a real sshd where openssh-server is installed.
+tar. One test uses a real sshd if openssh-server is installed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SSHD = Path("/usr/sbin/sshd")
 
 
 class Ground:
-    """A box whose folder is `box`, and the folder `here`; `ssh` can be replaced."""
+    """A box with the folder `box`, and the local folder `here`; `ssh` can be replaced."""
 
     def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.box, self.here, self.bin = path / "box", path / "here", path / "bin"
@@ -46,29 +46,29 @@ class Ground:
             record(self.box / f"run {i // 2}" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
 
     def ssh(self, when: str = "nothing", what: str = "") -> None:
-        """From now on `ssh` does `what` where its command holds `when`."""
+        """From now on `ssh` does `what` if its command holds `when`."""
         self.program("ssh", SSH.format(when=when, what=what))
 
     def program(self, name: str, text: str) -> None:
-        """A command that goes before the system's."""
+        """Put a command before the system's."""
         (self.bin / name).write_text(text)
         (self.bin / name).chmod(0o755)
 
     def pull(self, *more: str) -> None:
-        """The command."""
+        """The command's exit code and output."""
         args = parser("pull").parse_args(
             ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
         )
         args.run(args)
 
     def fetch(self) -> PullReport:
-        """The same as a call."""
+        """The same as a call, without the command."""
         tally = PullReport()
         pull.pull(RecordingHost("user@box", str(self.box)), self.here, tally, lambda line: None)
         return tally
 
     def same(self) -> bool:
-        """Whether all that is on the box is here, and nothing else."""
+        """Whether `here` holds exactly the files of the box."""
         return files(self.here) == files(self.box)
 
 
@@ -88,11 +88,11 @@ def ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ground:
 
 
 def test_what_is_new_is_fetched(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """All at first, then nothing, then the one that came; the folders are the box's."""
+    """All recordings at first, then none, then the new recording; folders are the box's."""
     ground.pull()
     assert capsys.readouterr().out == "fetched 4, there already 0, refused 0\n"
     assert ground.same()
-    ground.ssh("tar", "exit 1")  # nothing is fetched that is there
+    ground.ssh("tar", "exit 1")  # no recording that is present is fetched
     ground.pull()
     assert capsys.readouterr().out == "fetched 0, there already 4, refused 0\n"
     ground.ssh()
@@ -103,7 +103,7 @@ def test_what_is_new_is_fetched(ground: Ground, capsys: pytest.CaptureFixture[st
 
 
 def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """An empty folder is no trouble, and nothing is made here."""
+    """An empty folder is not an error, and no local folder is made."""
     shutil.rmtree(ground.box)
     ground.box.mkdir()
     ground.pull()
@@ -132,8 +132,8 @@ def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
 
 @pytest.mark.slow
 def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
-    """Wherever the stream ends: what is here is the box's, byte for byte and in pairs, and the next
-    call has the rest."""
+    """Wherever the stream ends: local files equal the box's, byte for byte and in pairs, and the
+    next call fetches the rest."""
     whole = sum(len(data) for data in files(ground.box).values()) + 8 * 512
     for cut in [*range(0, whole, 700), whole]:
         ground.ssh("tar", f'sh -c "$command" | head -c {cut}; exit 255')
@@ -170,7 +170,8 @@ def test_an_interrupted_call_goes_on(ground: Ground):
 
 
 def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
-    """A sidecar alone, as between the two names; a file aside: the pair is fetched again."""
+    """A lone sidecar, as after a kill between the two files, or a temporary file: the pair is
+    fetched again."""
     ground.fetch()
     (ground.here / "run 0" / "sweep-000000.npy").unlink()
     (ground.here / "run 0" / "sweep-000001.npy").unlink()
@@ -216,8 +217,8 @@ def test_another_sweep_of_the_same_name_is_never_written_over(
 
 
 def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """The user may edit a sidecar: it is reported and not a failure; the same for one that was
-    edited on the box."""
+    """The user may edit a sidecar: it is reported, but is not a failure. The same if it was edited
+    on the box."""
     ground.fetch()
     mine = ground.here / "run 0" / "sweep-000000.json"
     mine.write_text(json.dumps(json.loads(mine.read_text()) | {"material": "cork"}))
@@ -233,8 +234,8 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
 
 
 def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Broken on the box: it never takes its name here; the others do. One without frames is a
-    recording."""
+    """A recording that is broken on the box is not stored; the others are. A recording without
+    frames is valid."""
     (ground.box / "run 0" / "sweep-000000.npy").write_bytes(b"\x93NUMPY")
     (ground.box / "run 0" / "sweep-000001.json").write_text("{}")
     np.save(ground.box / "run 1" / "sweep-000002.npy", np.array([{}], object), allow_pickle=True)
@@ -252,7 +253,7 @@ def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureF
 
 
 def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
-    """The bytes that came are not those that were listed."""
+    """The bytes differ from the hash in the list."""
     ground.ssh("tar", f"echo >> '{ground.box}/run 0/sweep-000000.json'")
     tally = ground.fetch()
     assert tally.refused == [
@@ -263,7 +264,7 @@ def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
 
 
 def test_what_goes_away_meanwhile_is_told(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Between list and stream: the others are kept, and the words of the box are passed on."""
+    """Removed between list and stream: the others are kept, and the box's message is passed on."""
     ground.ssh("tar", f"rm '{ground.box}/run 0/sweep-000000.npy'")
     with pytest.raises(ApplianceError, match="run the same command again"):
         ground.fetch()
@@ -272,7 +273,7 @@ def test_what_goes_away_meanwhile_is_told(ground: Ground, capsys: pytest.Capture
 
 
 def member(name: str, kind: bytes = tarfile.REGTYPE, data: bytes = b"x", link: str = "") -> bytes:
-    """An archive of one member, whatever it is."""
+    """An archive with one member of any kind."""
     held = io.BytesIO()
     with tarfile.open(fileobj=held, mode="w") as archive:
         info = tarfile.TarInfo(name)
@@ -297,8 +298,8 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, data: bytes = b"x", link: s
     ],
 )
 def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
-    """Out of the folder, absolute, links, devices, what was not asked for: nothing of it is
-    written."""
+    """Paths outside the folder, absolute paths, links, devices, files that were not requested: none
+    is written."""
     (ground.bin / "archive").write_bytes(archive)
     ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
     with pytest.raises(
@@ -319,7 +320,7 @@ def test_a_member_beyond_all_size_is_refused(ground: Ground):
 
 
 def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
-    """In the list already: nothing is asked for under it, and the others are fetched."""
+    """A path in the list that leads elsewhere: it is not requested, and the others are fetched."""
     record(ground.box.parent / "evil.npy")
     (ground.box / "run 0" / "line\nbreak.npy").write_bytes(b"")
     ground.program(
@@ -340,7 +341,7 @@ def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
 
 
 def test_a_shell_that_talks_is_named(ground: Ground):
-    """A greeting before the list is no file."""
+    """A greeting before the list is not a file."""
     ground.ssh("find", "echo Welcome")
     with pytest.raises(
         FormatError, match=r"user@box sends b'Welcome.*; see that its shell prints nothing at login"
@@ -471,7 +472,8 @@ def sshd(tmp_path: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
-    """Keys, a login shell, the real tools: all comes, twice; and a wrong key is no connection."""
+    """Keys, a login shell, the real tools: everything is fetched, twice; a wrong key gives no
+    connection."""
     for i in range(3):
         record(tmp_path / "box" / "a session" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
     box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)

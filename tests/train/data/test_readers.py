@@ -1,4 +1,4 @@
-"""Readers: HDF5, TactMat and recordings of the box become sets; what is broken is refused by
+"""Readers: HDF5, TactMat and recordings of the box become sets; broken files are refused by
 name."""
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def tactmat(path: Path, dtype: str = "uint8", **more: object) -> np.ndarray:
 
 
 def before_crc(path: Path) -> None:
-    """Make a sidecar what it was in schema 1: the sweep and its format, no check of its bytes."""
+    """Turn a sidecar into schema 1: the sweep and its format, without a check of its bytes."""
     held = json.loads(path.read_text()) | {"schema": 1}
     del held["crc32"]
     path.write_text(json.dumps(held))
@@ -93,7 +93,7 @@ PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
         ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
         ({"samples": PAIR.reshape(6, 1, 1, 1)}, "samples are .*; use one of"),
         ({"samples": ["a"] * 6}, "samples have the shape \\[6\\]"),
-        ({"samples": h5py.Empty("u1")}, "samples is no array but .*shape None"),
+        ({"samples": h5py.Empty("u1")}, "samples is not an array but .*shape None"),
         ({"labels": PAIR}, "labels holds .*; give one whole number for each of 6"),
         (
             {"labels": np.array([0, 1, 2, 0, 3, 1])},
@@ -115,7 +115,7 @@ PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
         ),
         ({"samples": h5py.ExternalLink("gone.h5", "/samples")}, "samples is a link to '/samples'"),
         ({"samples": h5py.SoftLink("/samples")}, "samples is a link to '/samples'"),
-        ({"labels": np.dtype("i8")}, "labels is no array but .*named type"),
+        ({"labels": np.dtype("i8")}, "labels is not an array but .*named type"),
     ],
 )
 def test_a_broken_hdf5_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
@@ -153,7 +153,7 @@ def _ragged(file: h5py.File) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (_group, "samples is no array but .*HDF5 group"),
+        (_group, "samples is not an array but .*HDF5 group"),
         (_unwritten, "samples \\[6, 8, 2, 3\\] was not written to its end"),
         (_huge, "samples \\[1099511627776, 8, 2, 3\\] was not written to its end"),
         (_virtual, "samples lies in other files"),
@@ -250,8 +250,8 @@ def test_a_broken_tactmat_is_refused(tmp_path: Path):
 
 
 def test_recordings_are_a_set(tmp_path: Path):
-    """One recording a file, materials and places by name, objects apart in each folder; what is not
-    ok is counted."""
+    """Each file is a recording; materials and places keep their names, objects differ between
+    folders; sweeps that are not ok are counted."""
     for i, (material, position, obj) in enumerate(
         [("b", "tip", 0), ("a", "side", 1), ("b", "side", 1), ("a", "tip", 2)]
     ):
@@ -304,8 +304,8 @@ def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
 
 
 def test_the_unloaded_skin_is_kept(tmp_path: Path):
-    """Of each sweep whose sidecar knows it in numbers, NaN for the others; a set of which none does
-    has no such array."""
+    """For each sweep whose sidecar has its numbers, NaN for the others; a set without any has no
+    such array."""
     level = [[1.0, 2, 3], [4, 5, 6]]
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
@@ -337,7 +337,7 @@ def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object
     save(tmp_path / "1.npy", *load(tmp_path / "1.npy"), {"unloaded": known})
     with pytest.raises(
         FormatError,
-        match=r"1\.npy: `unloaded` of its sidecar has no level and noise of the shape \[2, 3\]",
+        match=r"1\.npy: `unloaded` in its sidecar lacks a level and noise of shape \[2, 3\]",
     ):
         sets.load(str(tmp_path))
 
@@ -491,8 +491,8 @@ def test_a_file_that_may_not_be_read_is_named(
 
 
 def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
-    """Recordings by name whose unloaded skin read so much, None where it was not noted; what was
-    pressed on it, [8, 2, 3]."""
+    """Record sweeps by name with the given level of the unloaded skin, None if it was not noted;
+    returns the pressure that all have, [8, 2, 3]."""
     format, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():
@@ -509,8 +509,8 @@ def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -
 
 @pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
 def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: str):
-    """Those of a tared skin are moved to where most lie, in whole counts; what drifts a little, and
-    what is not known, stays."""
+    """Recordings of a tared skin are shifted to the most common level, in whole counts; small
+    drifts and unknown levels stay."""
     pressed = tared(tmp_path, {"a0": 300.0, "a1": 301.0, "b0": 0.0, "b1": 300.0, "b2": None}, dtype)
     s = sets.load(str(tmp_path))
     assert s.samples.dtype == dtype
@@ -522,8 +522,8 @@ def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: s
 
 
 def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path: Path):
-    """Each folder is at one level by itself; the smaller is brought to the level of the other, and
-    what is not known stays."""
+    """Each folder has one level; the smaller set is brought to the level of the other, and unknown
+    levels stay."""
     pressed = tared(tmp_path / "tared", {"a0": 0.0, "b0": 0.0})
     tared(tmp_path / "raw", {"a0": 300.0, "a1": 300.0, "b0": 300.0})
     joined = sets.join([sets.load(str(tmp_path / name)) for name in ("tared", "raw")])

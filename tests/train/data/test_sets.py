@@ -1,4 +1,4 @@
-"""Sweep sets: what is refused and how it is named, what belongs together and stays so."""
+"""Sweep sets: refused sets and their messages, and groups that stay together."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_simulated_sets_have_their_worlds():
     "spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"]
 )
 def test_an_unknown_simulated_set_is_refused(spec: str):
-    """The message repeats what was asked for."""
+    """The message repeats the name."""
     with pytest.raises(FormatError, match=f"^set '{spec}' is "):
         sets.load(spec)
 
@@ -186,8 +186,8 @@ def test_select_takes_any_of_several_values():
         ("speed<2", "cannot be read"),
         ("speed", "cannot be read"),
         ("force=1", "no group 'force'; it has recording, speed"),
-        ("speed=", "'' is no whole number"),
-        ("speed=1,fast", "'1,fast' is no whole number"),
+        ("speed=", "'' is not a whole number"),
+        ("speed=1,fast", "'1,fast' is not a whole number"),
         ("speed<=1,2", "<= takes a group and one whole number"),
         ("material>=low", ">= takes a group and one whole number"),
         ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
@@ -275,8 +275,8 @@ def test_join_keeps_recordings_apart_and_forces_together():
 
 
 def test_joined_sets_are_told_apart():
-    """`set` counts in the order given, so that one can be trained on and the other be tested on;
-    one alone has none."""
+    """`set` counts in the given order, so that a protocol can train on one set and test on the
+    other; a single set has no such group."""
     real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
     both = sets.join([real, hard])
     np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
@@ -351,7 +351,7 @@ def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
 
 
 def test_a_set_goes_to_another_process():
-    """Pickled and back, as a cluster does; this is no way to load a file."""
+    """Pickled and back, as on a cluster; files are never loaded like this."""
     s = easy(4)
     again = pickle.loads(pickle.dumps(s))
     assert sets.digest(again) == sets.digest(s)
@@ -375,7 +375,7 @@ def test_labels_may_be_names(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["labels", "materials", "group_speed"])
 def test_objects_are_refused_with_the_remedy(tmp_path: Path, name: str):
-    """What pandas and lists of names become in numpy; nothing is unpickled."""
+    """Object arrays, which numpy makes of pandas data and lists of names; nothing is unpickled."""
     arrays = held()
     np.savez(tmp_path / "o.npz", **arrays | {name: arrays[name].astype(object)})
     with pytest.raises(

@@ -1,5 +1,5 @@
-"""What is in a set, in lines: counts by position and session, what was lost, what keeps it from
-being trained on."""
+"""Descriptions of sets: counts by position and session, losses, and reasons why a set cannot be
+trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from train.data import sets, summary
 
 
 def lines(s: sets.Dataset) -> list[str]:
-    """What is text of a set."""
+    """The text lines of a set's description."""
     return summary.description(s, {})
 
 
@@ -50,8 +50,8 @@ def test_a_set_is_described():
 
 
 def test_what_is_confounded_is_told():
-    """Values that hold one material, a material that one value takes with it, recordings of
-    several; not one value."""
+    """Values with a single material, materials at a single value, recordings of several materials;
+    not a group of one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
     text = [
@@ -104,8 +104,8 @@ def test_positions_and_sessions_are_counted_in_tables():
 
 
 def test_recordings_are_described_by_name(tmp_path: Path):
-    """Places by the names they were given and the numbers that select them; frames lost, what was
-    left out, verdicts."""
+    """Places by their names and by the numbers that select them; lost frames, left-out sweeps,
+    verdicts."""
     for i in range(6):
         path = tmp_path / f"run{i // 3}" / f"{i}.npy"
         record(

@@ -225,6 +225,6 @@ def test_later_sweeps_correct_the_first():
     ],
 )
 def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):
-    """No sweep, and a certainty that is no probability."""
+    """No sweep, and a certainty that is not a probability."""
     with pytest.raises(FormatError, match=hint):
         explore(log_p, sure)

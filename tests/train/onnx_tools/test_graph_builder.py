@@ -1,4 +1,4 @@
-"""Joined graphs: what both compute is there once, and each output keeps its bits."""
+"""Joined graphs: nodes that both have in common occur once, and each output keeps its bits."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ def drawn() -> np.ndarray:
 
 
 def test_what_both_compute_is_there_once():
-    """Six nodes are shared; the two that differ get names of their own, and so does the constant
-    that differs."""
+    """Six nodes are shared; the two nodes and the constant that differ get names of their own."""
     both = joined(made("a", 0.5), made("b", 0.25))
     assert [node.name for node in both.graph.node] == [
         "reshape0",
@@ -56,7 +55,8 @@ def test_what_both_compute_is_there_once():
 
 
 def test_outputs_of_joined_graphs_keep_their_bits():
-    """Each is what its own graph gives; without the other, the first is its own graph again."""
+    """Each equals the output of its own graph; without the other output, the first graph comes back
+    unchanged."""
     one, other = made("a", 0.5), made("b", 0.25)
     both = joined(one, other)
     for name, have in zip("ab", parity.outputs(both, ["a", "b"], drawn()), strict=True):
@@ -84,8 +84,8 @@ def test_constants_are_told_apart_by_type_and_shape():
 
 
 def test_a_slim_model_gives_the_same_bits_in_fewer_bytes():
-    """Equal constants once, short names, those of inputs, outputs and of what multiplies as they
-    were."""
+    """Equal constants once and short names; inputs, outputs and multiplying nodes keep their
+    names."""
     g = GraphBuilder()
     x = g("Cast", g("Reshape", "sweep", g.constant([1, 20, 4], "int64")), to=1)
     y = g("MatMul", x, g.constant(np.arange(12).reshape(4, 3)))

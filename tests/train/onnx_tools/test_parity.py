@@ -1,5 +1,5 @@
-"""Float against int8: what is lost, with its interval, the range of each tensor, and what
-saturates."""
+"""Float against int8: the loss of accuracy with its interval, the range of each tensor, and its
+saturation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def fitted() -> Fit:
 
 
 def measured(fitted: Fit) -> parity.Parity:
-    """What its two forms do on its held-out sweeps."""
+    """The comparison of its two precisions on its held-out sweeps."""
     reference, int8 = quantized_bundle.graphs(fitted)
     return parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
 
@@ -70,8 +70,8 @@ def test_what_is_lost_is_counted_in_pairs():
 
 
 def test_the_interval_holds_what_it_promises():
-    """Of 400 draws of 80 sweeps, of which int8 loses 4 % and wins 2 %, at least 93 % of the
-    intervals hold the truth."""
+    """In 400 draws of 80 sweeps, where int8 loses 4 % and wins 2 %, at least 93 % of the intervals
+    hold the truth."""
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(400):
@@ -178,7 +178,7 @@ def test_a_bundle_is_compared_without_float(fitted: Fit):
         {"itself"},
     )
     assert len(found.layers) >= len(fitted.architecture.channels)
-    assert "holds no float form" in parity.table(found)
+    assert "holds no float model" in parity.table(found)
     with pytest.raises(FormatError, match="no int8 tensors"):
         parity.measure(reference, fitted.held.samples, fitted.held.labels)
 
@@ -193,7 +193,7 @@ def test_the_command_reports_fits_and_bundles(fitted: Fit, tmp_path: Path):
     assert len(figures["layers"]) == len(measured(fitted).layers)
     assert figures["set"] == "close"
     assert [line.split()[0] for line in table.splitlines()[:3]] == ["labels", "float", "first"]
-    assert "holds no float form" in quantized_bundle.compared(tmp_path / "bundle", fitted.held)
+    assert "holds no float model" in quantized_bundle.compared(tmp_path / "bundle", fitted.held)
     with pytest.raises(
         FormatError, match=r"fit.npz is of 2x2 uint8 .* name a set of the same kind"
     ):
