@@ -1,5 +1,5 @@
 """Fetching recordings: only new ones, whole pairs whenever a connection breaks, nothing
-overwritten, and nothing that was not requested.
+overwritten, no other file accepted.
 
 The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and
 tar. One test uses a real sshd if openssh-server is installed.

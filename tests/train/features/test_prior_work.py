@@ -179,7 +179,7 @@ def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, k
 @pytest.mark.parametrize(
     ("kind", "shape", "rate_hz", "message"),
     [
-        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is no sweep"),
+        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is not a sweep"),
         (
             "spectrogram",
             (19, 2, 2),
