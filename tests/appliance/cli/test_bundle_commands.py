@@ -1,5 +1,4 @@
-"""`palpate bundles install` beside a service that runs: a bundle for another skin than the one that streams
-is refused."""
+"""`palpate bundles install` refuses a bundle for another skin than the skin that streams."""
 
 from __future__ import annotations
 
@@ -48,21 +47,20 @@ HEALTH = Health(
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Config:
-    """Of a box without deliveries, so that the packaged bundle runs."""
+    """Settings of a box without deliveries, which runs the packaged bundle."""
     store = (f"store.folder={tmp_path}", f"store.runtime={tmp_path}")
     return config.load(None, store, site=Path("/dev/null"))
 
 
 def streaming(settings: Config, health: Health | None) -> object:
-    """What an install learns of a service in this state, None where it does not run."""
+    """The format that an install learns from a service in this state; None without a service."""
     if health:
         StatusFile(settings.store.status, SystemClock()).turn(health)
     return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
 
 
 def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config):
-    """Without a service, without a skin, or with a bundle that is not the store's, nothing is
-    known."""
+    """Without a service, without a skin, or with a bundle from elsewhere, the format is unknown."""
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
     assert streaming(settings, replace(HEALTH, skin="mismatch", streams=False)) is None
@@ -70,7 +68,8 @@ def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config
 
 
 def test_a_bundle_for_another_skin_is_refused_with_both_formats():
-    """One for the same skin with another window is taken, and any where the skin is not known."""
+    """A bundle for the same skin with another window is accepted, and any bundle if the skin is
+    unknown."""
     format = RUNNING.format
     other = replace(
         RUNNING,
@@ -92,8 +91,8 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
 def test_the_command_refuses_it_unless_it_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """`palpate bundles install` beside a service whose skin streams: nothing is changed; with
-    `--other-skin` it is on trial."""
+    """`palpate bundles install` beside a service whose skin streams changes nothing; with
+    `--other-skin` the bundle is on trial."""
     box = Delivery(tmp_path)
     held = toy_bundle.files()
     held[bundle.MANIFEST] = replace(

@@ -1,4 +1,4 @@
-"""The command as a person or a script uses it: what it prints, how it ends, its exit codes."""
+"""The command as a person or a script uses it: output, end, exit codes."""
 
 from __future__ import annotations
 
@@ -125,8 +125,8 @@ def test_kept_and_captured_sweeps_are_replayed(
 def test_a_full_disk_costs_the_recording_never_the_classifying(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    """Neither sweeps nor capture can be written: each is logged, every sweep is answered, exit code
-    0."""
+    """Neither sweeps nor capture can be written: each failure is logged, every sweep is answered,
+    and the exit code is 0."""
 
     def full(*args: object, **options: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -147,8 +147,7 @@ def test_a_full_disk_costs_the_recording_never_the_classifying(
 
 @pytest.mark.slow
 def test_a_log_on_a_full_disk_costs_the_log_alone():
-    """Where standard error cannot be written, sweeps are answered all the same, and the exit code
-    is 0."""
+    """Without a standard error that can be written, sweeps are answered, and the exit code is 0."""
     command = [
         sys.executable,
         "-m",
@@ -269,7 +268,7 @@ def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFix
 def test_a_sweep_that_was_answered_early_is_replayed_so(
     tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
 ):
-    """By a bundle that decides there; another one is named."""
+    """A replay stops at the step at which this bundle decides; another bundle is named."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy_bundle.FORMAT)
     for least, code in ((0.5, 0), (2.0, 1)):
@@ -288,7 +287,7 @@ def test_a_sweep_that_was_answered_early_is_replayed_so(
 
 
 def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
-    """On the rig everything is there."""
+    """On the rig all devices are present."""
     assert main(["check", "--sim", "skin", "--virtual"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["ok"] * 4
@@ -320,8 +319,8 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Without a bundle the skin is checked all the same; one for another skin is named with both
-    forms and what to do."""
+    """The skin is checked without a bundle. A bundle for another skin is named with both formats
+    and the remedy."""
     skin_and_no_bundle = [
         "check",
         "--sim",
@@ -355,8 +354,8 @@ def test_check_of_a_trigger_without_lines(mode: str, capsys: pytest.CaptureFixtu
 def test_record_on_a_machine_without_gpio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], form: str
 ):
-    """A PC: no line is wired, gpiod cannot be imported, no bundle is there; sweeps by the clock are
-    recorded, in the form that the skin announces, or that a person describes."""
+    """A PC without wired lines, gpiod and bundle: sweeps by the clock are recorded, in the
+    announced or the described format."""
     simulated = cli_devices.simulated(
         "skin", None, argparse.Namespace(seed=1, sweeps=None, virtual=True), config.load(None)
     )
@@ -393,8 +392,8 @@ def test_record_on_a_machine_without_gpio(
 
 
 def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`record --sim replay:SET` of a skin that no bundle is for: each window comes out as it went
-    in."""
+    """`record --sim replay:SET` of a skin without a bundle: each recorded window equals the window
+    of the set."""
     samples = np.random.default_rng(1).integers(100, 4000, (3, 40, 5, 3)).astype(np.int16)
     np.savez(
         tmp_path / "s.npz", samples=samples, labels=[0, 0, 1], materials=["a", "b"], rate_hz=50.0
@@ -582,7 +581,7 @@ def test_exit_codes(
 
 @pytest.mark.parametrize("text", ["0", "-2", "nan", "inf", "long"])
 def test_a_window_is_a_length_of_time(text: str, capsys: pytest.CaptureFixture[str]):
-    """Anything else is refused with the arguments."""
+    """Other values are wrong arguments."""
     with pytest.raises(SystemExit) as ended:
         main(["record", "--sim", "skin", "--virtual", "--window", text])
     assert ended.value.code == 2
@@ -594,7 +593,7 @@ def test_a_window_is_a_length_of_time(text: str, capsys: pytest.CaptureFixture[s
 
 @pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])
 def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]):
-    """A sweep set without one of its arrays is named with what is missing."""
+    """If a sweep set lacks an array, the error names the set and the array."""
     arrays = {
         "samples": np.zeros((2, 5, 4, 4), np.uint8),
         "labels": [0, 0],
@@ -609,7 +608,7 @@ def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.Captu
 
 
 def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A set that the bundle was not made for is refused with both formats."""
+    """A set of another format is refused, with both formats."""
     np.savez(
         tmp_path / "s.npz",
         samples=np.zeros((2, 5, 3, 3), np.int16),
@@ -665,7 +664,7 @@ def test_output_that_nobody_reads():
 
 
 def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
-    """The simulated skin is the one that the default bundle was trained for."""
+    """The default bundle was trained for the simulated skin."""
     assert default_bundle.format == skin.FORMAT
     assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)
 
@@ -676,8 +675,7 @@ def test_wilson():
 
 
 def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture[str]):
-    """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is asked
-    for."""
+    """`palpate skin check` on the simulated board: all ok, exit code 0, and no bundle is loaded."""
     no_bundle = ["--set", "classifier.bundle=/nowhere"]
     assert main(["skin", "check", "--sim", "skin", "--virtual", *no_bundle]) == 0
     told = capsys.readouterr()
@@ -685,7 +683,7 @@ def test_skin_check_prints_a_verdict_for_each_part(capsys: pytest.CaptureFixture
     assert len(lines) == 12
     assert (
         "listening to frames for 10 s" in told.err
-    )  # before anything is printed, a person knows how long it takes
+    )  # the duration is known before the first result
     assert all(line.startswith("ok       ") for line in lines)
 
 
@@ -721,7 +719,7 @@ def test_skin_check_fails_with_a_part(
 def test_skin_check_refuses(
     options: list[str], code: int, words: str, capsys: pytest.CaptureFixture[str]
 ):
-    """Arguments out of range, and a board that is not there."""
+    """Arguments out of range and missing boards are refused."""
     try:
         ended: object = main(["skin", "check", *options])
     except SystemExit as e:

@@ -1,4 +1,4 @@
-"""The lines of a dead program: the command that systemd runs after it takes them low."""
+"""After the end of a program, the command of systemd sets its lines low."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def chip() -> gpio.SimGpio:
 def test_all_outputs_are_requested_low_and_given_back(
     chip: gpio.SimGpio, monkeypatch: pytest.MonkeyPatch
 ):
-    """Each output of the board, once, as an output at its low level; inputs are left alone; nothing
-    is held after."""
+    """Each output of the board is requested once, as an output at its low level, and released;
+    inputs are not touched."""
     asked = []
     request = chip.request_lines
     monkeypatch.setattr(
@@ -50,7 +50,7 @@ def test_all_outputs_are_requested_low_and_given_back(
 def test_a_box_without_lines_has_nothing_to_lower(
     chip: gpio.SimGpio, capsys: pytest.CaptureFixture[str]
 ):
-    """No board, no line, no word."""
+    """Without a board the command touches no line and prints nothing."""
     assert lower_outputs.main(["--set", "output.ready="], chip) == 0
     assert capsys.readouterr() == ("", "")
 
@@ -65,8 +65,8 @@ def test_a_box_without_lines_has_nothing_to_lower(
 def test_what_cannot_be_lowered_is_said(
     chip: gpio.SimGpio, args: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
 ):
-    """Held by another program, or settings that cannot be read: one line, and the exit code of its
-    kind."""
+    """Lines of another program, or settings that cannot be read, cause one line and the exit code
+    of their kind."""
     request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
     assert lower_outputs.main(args, chip) == code
     error = capsys.readouterr().err
@@ -77,7 +77,7 @@ def test_what_cannot_be_lowered_is_said(
 
 
 def test_it_is_quick_as_it_loads_little():
-    """Neither numpy nor onnxruntime, in a process of its own."""
+    """A process of its own imports neither numpy nor onnxruntime."""
     code = (
         "import sys; from appliance.cli import lower_outputs; lower_outputs.main([]);"
         "print({'numpy', 'onnxruntime', 'usb', 'serial'} & set(sys.modules))"

@@ -1,5 +1,5 @@
-"""Which bundles a robot is answered by: signed ones, unless a setting allows others, and then
-everything says so."""
+"""A robot gets answers of signed bundles only, unless a setting allows others; then all outputs say
+so."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SAID = "unsigned bundles are allowed: classifier.allow_unsigned = true"
 
 @pytest.fixture
 def box(tmp_path: Path) -> Delivery:
-    """A box that has seen no bundle yet."""
+    """A box before its first delivery."""
     return Delivery(tmp_path)
 
 
@@ -53,7 +53,7 @@ def test_a_robot_is_answered_by_signed_bundles_alone(
     before anything else."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     if command == ("run", "--shadow"):
-        main([*command, str(folder), *of(box)])  # then it ends, since no line is wired
+        main([*command, str(folder), *of(box)])  # then it ends, because no line is wired
         assert f"no shadow: {folder} is not signed" in capsys.readouterr().err
         return
     code = main([*command, *of(box), "--set", f"classifier.bundle={folder}"])
@@ -103,8 +103,8 @@ def test_the_setting_is_said_at_each_start_by_check_and_by_status(
 
 
 def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.CaptureFixture[str]):
-    """Then an unsigned bundle starts; here it ends for want of a trigger line, after the
-    warning."""
+    """With the setting an unsigned bundle starts, after a warning. Here the start fails, because no
+    trigger line is wired."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
     warning, *_, end = capsys.readouterr().err.splitlines()
@@ -114,7 +114,7 @@ def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.Captur
 
 @pytest.fixture
 def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Real devices are played by the simulator, unknown to the command."""
+    """The simulator replaces the real devices; the command does not know it."""
 
     def played(args: argparse.Namespace, format: Callable[[], SweepFormat]) -> Devices:
         args.virtual = True
@@ -129,7 +129,7 @@ def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_enrolled_label_comes_into_the_store(
     box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
 ):
-    """Signed by the box, on trial; the bundles are listed with who signed what."""
+    """The new bundle is signed by the box and on trial; the list shows the signers."""
     before = box.committed(1)
     assert main(["enrol", "cork", *of(box)]) == 0
     assert (
@@ -174,8 +174,8 @@ def test_an_enrolled_folder_is_signed(
 def test_what_cannot_be_enrolled_is_told_before_the_robot_sweeps(
     box: Delivery, options: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str]
 ):
-    """No key, early answers that would end, unsigned results without a folder: one line, exit code
-    78, no sweep."""
+    """Without a key, with early answers, or unsigned without a folder: one line, exit code 78, no
+    sweep."""
     (box.enrolment_key.folder / KEY).unlink()
     assert main(["enrol", "cork", *of(box), *options]) == 78
     output = capsys.readouterr()

@@ -51,7 +51,7 @@ def test_bench_writes_its_figures(
 def test_bench_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Memory and processor share, in short."""
+    """Short measurements of memory and processor share."""
     monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
     monkeypatch.setattr(bench_process, "STREAM_S", 0.5)
     bench_process.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))

@@ -1,4 +1,4 @@
-"""`palpate demo`: what it shows with and without a terminal."""
+"""`palpate demo` with and without a terminal."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixtur
 
 
 def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
-    """Nothing but sentences, the same in every run with the same seed."""
+    """The output is sentences alone, and the same in every run with the same seed."""
     assert main(["demo", "--raw", *VIRTUAL]) == 0
     first = capsys.readouterr().out
     assert all(line.startswith("$PPLP,") for line in first.splitlines())
@@ -84,8 +84,8 @@ def test_demo_of_a_set_ends_with_the_set(
 def test_materials_that_the_bundle_never_learnt_are_counted_apart(
     tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
 ):
-    """A bundle of two of the simulated materials: the others are no wrong answers, and `unknown` is
-    what they should be."""
+    """A bundle has two of the simulated materials: other materials do not count as wrong, and
+    `unknown` is their right answer."""
     files = bundle.files(bundle.DEFAULT)
     names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
     names[:2] = default_bundle.manifest.labels[:2]
@@ -111,8 +111,8 @@ def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    """On an installed box what was deployed is for user palpate alone: said, with what to do, and
-    the demo plays."""
+    """On an installed box only the user palpate may read deployed bundles: a message says so with
+    the remedy, and the demo plays."""
 
     def refused(path: object) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
@@ -127,7 +127,7 @@ def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
 
 @pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
 def test_a_number_of_sweeps_is_a_number(text: str, capsys: pytest.CaptureFixture[str]):
-    """Anything else is a usage error that names it."""
+    """Other values are usage errors that name the value."""
     with pytest.raises(SystemExit) as e:
         main(["demo", "--sweeps", text])
     assert e.value.code == 2

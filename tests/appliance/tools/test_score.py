@@ -1,4 +1,4 @@
-"""Answers counted against what the robot did."""
+"""Answers are counted against the true materials."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_an_object_counts_by_its_last_answer():
 
 
 def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
-    """It is counted apart, and no object is wrong for it."""
+    """Sweeps of such a material are counted apart; its objects do not count as wrong."""
     score = AnswerScore(frozenset({"wood"}))
     right = [
         score.add(act("cork", new_object=True), answer(1, "wood")),
@@ -90,6 +90,6 @@ def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
 
 
 def test_another_sentence_is_no_answer():
-    """A state sentence, and half a line."""
+    """A state sentence and half a line do not count as answers."""
     assert Answer.read("$PPLP,STA,1,streaming*00") is None
     assert Answer.read("$PP") is None

@@ -1,5 +1,5 @@
-"""Conformance of readout boards: a sound one passes over each link, and each fault is found, named
-and told apart."""
+"""Conformance of readout boards: a sound board passes over each link, and each fault is found and
+named."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def of_requests(change: Callable[[rig.ReadoutBoard, int], bool]) -> Fault:
 
 
 def of_format(**changes: object) -> Fault:
-    """FORMAT tells of something else than what is sent."""
+    """FORMAT disagrees with the packets."""
     return lambda simulated: of_replies(
         packets.Request.FORMAT,
         lambda _: packets.pack_format(replace(simulated.backend.board.skin, **changes)),
@@ -268,7 +268,7 @@ def test_a_sound_board_passes(acm: bool):
 
 
 def test_a_board_that_was_left_sending_passes():
-    """A program that died without STOP is no fault of the board."""
+    """A board that still sends for a killed program passes."""
     simulated = idle_devices(acm=True)
     simulated.backend.board.request(packets.Request.START)
     simulated.clock.sleep_until(simulated.clock.now_ns() + 20_000_000_000)
@@ -278,7 +278,7 @@ def test_a_board_that_was_left_sending_passes():
 
 @pytest.mark.parametrize(("fault", "part", "words"), FAULTS.values(), ids=list(FAULTS))
 def test_each_fault_is_found(fault: Fault, part: str, words: str):
-    """The part fails with words that say what to do, and parts that do not depend on it are ok."""
+    """The part fails with a remedy, and independent parts are ok."""
     simulated = idle_devices(acm=True)
     fault(simulated)
     found = findings(simulated)
@@ -301,7 +301,7 @@ def test_each_fault_is_found(fault: Fault, part: str, words: str):
 
 
 def test_a_board_that_stops_for_good_is_found():
-    """It must begin again after STOP and START."""
+    """A board must send again after STOP and START."""
     simulated = idle_devices(acm=True)
     stops: list[int] = []
     of_requests(lambda b, n: stops.append(n) or (stops.count(4) > 1 and n == 3))(simulated)
@@ -365,7 +365,7 @@ class EchoLink:
 
 
 def test_another_device_at_the_port_is_told_apart():
-    """It answers nothing, and its bytes are no packets: no part is ok, and the check ends."""
+    """Another device answers nothing and sends no packets: no part is ok, and the check ends."""
     link = EchoLink()
     found = {f.part: f for f in skin_check.check(link, link.clock, 5, port=True)}
     assert [found[part].verdict for part in ("identity", "format", "start")] == [
@@ -411,6 +411,6 @@ def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
     assert verdict == "FAIL"
     assert detail.endswith("no packet tells of an overflow: they were never taken; lower the rate")
     assert found["sequence"][0] == "ok"
-    # 3.2 kB/s: what the kernel keeps for a port takes longer than anybody waits
+    # at 3.2 kB/s the kernel's buffer for a port lasts longer than the longest pause
     assert found["overflow"][0] == "unknown"
     assert "not waited for" in found["overflow"][1]

@@ -24,7 +24,7 @@ PORT = PortInfo("/dev/ttyUSB0", 0x1A86, 0x7523, "", "USB Serial")
 def found_on(
     port: WirePort, clock: VirtualClock, info: PortInfo = PORT, **options: bool
 ) -> PortFinding:
-    """What is found on one port."""
+    """The finding on a port."""
     (found,) = skin_detect.detect([info], PROFILES, port.open, clock, **options)
     return found
 
@@ -32,7 +32,7 @@ def found_on(
 @pytest.mark.parametrize("rate", [1.0, 0.8])
 @pytest.mark.parametrize("name", NAMES)
 def test_every_skin_is_found(name: str, rate: float):
-    """A skin that streams: its profile, its rate, what to set; not a byte is written."""
+    """A streaming skin is found with profile, rate and settings; not a byte is written."""
     clock, p = VirtualClock(), profile(name)
     port = WirePort(clock, lambda i: wire(name, i), p.format.period_ns / rate)
     found = found_on(port, clock)
@@ -95,8 +95,8 @@ def test_a_board_of_the_protocol_has_to_be_asked():
     "sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40]
 )
 def test_something_else_is_no_skin(sent: bytes):
-    """Bytes that are no frames of any profile: no profile, their number, and the command that
-    describes them."""
+    """Bytes without frames: no profile, the number of bytes, and the command that describes a
+    skin."""
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
     assert found.profile == ""
@@ -104,7 +104,7 @@ def test_something_else_is_no_skin(sent: bytes):
 
 
 def test_a_port_that_is_held():
-    """The others are looked at all the same."""
+    """The other ports are still examined."""
     clock = VirtualClock()
     held = WirePort(clock, lambda i: b"", 1e7, busy=True)
     free = WirePort(clock, lambda i: wire("matrix", i), 1e7)

@@ -25,7 +25,7 @@ def signal(
 
 
 def monitor(taxels: np.ndarray, dtype: str = "float32", piece: int = 7) -> dict[str, object]:
-    """What a monitor measures of these taxels, given piece by piece."""
+    """The measurements of a monitor that gets these taxels piece by piece."""
     rows, cols, *axes = taxels.shape[1:]
     watched = SkinMonitor(SweepFormat(rows, cols, RATE, 2 * RATE, dtype, *axes))
     for at in range(0, len(taxels), piece):

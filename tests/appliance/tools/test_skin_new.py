@@ -1,5 +1,4 @@
-"""`palpate skin new` finds how emulated skins frame what they send, and writes a profile that reads
-them."""
+"""`palpate skin new` finds the frames of emulated skins, and writes profiles that decode them."""
 
 from __future__ import annotations
 
@@ -69,7 +68,7 @@ def test_the_first_speed_with_a_pattern_is_taken_and_every_port_is_closed() -> N
 
 
 def test_silence_and_noise_are_told_apart() -> None:
-    """Silence and noise are told apart."""
+    """Silence and noise cause different errors."""
     clock = VirtualClock()
     with pytest.raises(SensorSilent, match="nothing came in 1 s at 9600, 1200 baud"):
         skin_new.listen(lambda baud: ScriptedPort(clock, []), (9600, 1200), 1.0, clock)
@@ -132,7 +131,7 @@ def test_the_profile_that_is_written_can_be_read_and_holds_the_proposal(
 
 
 def test_what_was_heard_is_read_with_the_new_profile() -> None:
-    """What was heard is read with the new profile."""
+    """The new profile decodes the bytes it was made from."""
     reads = [Read(i, b"\xaa\x55" + bytes(range(16))) for i in range(50)]
     text = skin_new.profile(MARKED, (4, 4, 1), 115_200, PortInfo("p"))
     frames, garbage = skin_new.decoded(text, [Read(0, b"boot"), *reads])
@@ -191,8 +190,8 @@ def test_emulated_skins_are_described_and_read_again(
 def test_what_cannot_be_is_said_in_one_line(
     options: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What cannot be is said in one line; a folder that cannot be written, before anything is
-    listened to."""
+    """Impossible requests cause one line. A folder that cannot be written is refused before the
+    command listens."""
     assert main(
         ["skin", "new", *(str(tmp_path) if option == "OUT" else option for option in options)]
     ) in (69, 78)

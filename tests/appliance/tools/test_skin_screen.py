@@ -1,4 +1,4 @@
-"""The terminal shows what a LiveView holds, in colour, without, or as one line a second."""
+"""The terminal shows a LiveView in colour, without colour, or in a line a second."""
 
 from __future__ import annotations
 

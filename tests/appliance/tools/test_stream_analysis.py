@@ -1,5 +1,5 @@
-"""An unknown stream's marker, length, type, grid and rate are found in its bytes, or nothing is
-proposed."""
+"""Marker, length, type, grid and rate of an unknown stream are found in its bytes, or there is no
+proposal."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_floats_with_a_trailer_where_reads_begin_with_a_frame() -> None:
 
 @pytest.mark.parametrize("size", [1, 2, 4])
 def test_a_count_of_the_frames_behind_the_marker_is_no_taxel(size: int) -> None:
-    """A count of the frames behind the marker is no taxel."""
+    """A count of the frames behind the marker is recognized."""
     values = matrix(5, 600, 16, 200).astype("u1")
     values[:, 0] = 0  # an untouched taxel, which could be the count's next byte
     frames = [
@@ -141,7 +141,7 @@ def test_lines_that_a_shorter_one_ends_are_one_frame() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\xaa\x55" * 3, bytes(4000), b"hello\nworld\n" * 40])
 def test_what_has_no_frames_gets_no_proposal(data: bytes) -> None:
-    """What has no frames gets no proposal."""
+    """Bytes without frames get no proposal."""
     assert analyse([Read(0, data[:5]), Read(10**9, data[5:])]) == []
 
 

@@ -275,7 +275,7 @@ def test_the_picture_shows_which_end_is_the_fingertip(
 
 
 def beyond(board: dict[str, float], box: dict[str, float]) -> str:
-    """The side of the board beyond whose edge the middle of a box lies."""
+    """The side of the skin beyond which the middle of a box lies."""
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     out = {"left": board["x"] - x, "right": x - board["x"] - board["width"], "top": board["y"] - y}
     out["bottom"] = y - board["y"] - board["height"]
@@ -284,8 +284,8 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
 
 @pytest.mark.slow
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
-    """The server still answers, but its loop hangs: after a while the page shows that instead of an
-    old picture."""
+    """The server still answers, but its loop hangs: after a while the page says so instead of
+    showing an old picture."""
     context = browser.new_context()
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -298,8 +298,8 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
 
 @pytest.mark.slow
 def test_a_server_that_is_gone_is_no_connection(browser: Any):
-    """The page says so at once and how old its picture is; one that comes back at the same port is
-    shown by itself."""
+    """The page says at once that there is no connection, and the age of its picture. It shows a new
+    server at the same port by itself."""
     access = Access(0)
     with PageServer("watch.html", access, SystemClock().now_ns) as page:
         page.show(VIEW)
@@ -352,7 +352,7 @@ def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
 
 @pytest.mark.slow
 def test_without_a_browser_the_command_ends_at_sigterm(box: tuple[subprocess.Popen[bytes], str]):
-    """SIGTERM ends it with 0 while connections are open; nothing keeps the port."""
+    """SIGTERM ends the command with 0 while connections are open, and the port is free."""
     run, address = box
     where = int(address.rsplit(":", 1)[1])
     with socket.create_connection(("127.0.0.1", where), timeout=WAIT_S):

@@ -1,4 +1,4 @@
-"""What the page shows, from lines of the feed: events, what is kept, what is refused."""
+"""The content of the page from lines of the feed: published events, kept events, refused lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.factories import feed_lines
 
 
 class Events:
-    """What a board has published."""
+    """The published events of a board."""
 
     def __init__(self) -> None:
         self.all: list[tuple[str, Any]] = []
@@ -25,13 +25,13 @@ class Events:
         self.all.append((name, json.loads(json.dumps(content, allow_nan=False))))
 
     def of(self, name: str) -> list[Any]:
-        """The contents of one name."""
+        """The contents of the events of a name."""
         return [content for one, content in self.all if one == name]
 
 
 @pytest.fixture
 def events() -> Events:
-    """What the board has published."""
+    """The events of the board."""
     return Events()
 
 
@@ -51,7 +51,8 @@ def frames(board: PageBoard, at_s: float, row: float, col: float, strength: floa
 
 
 def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
-    """That it is there, its labels, its state with everything that the status file holds."""
+    """The page gets the box's presence, its labels, and its state with the content of the status
+    file."""
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
     health = events.of("health")[0]
@@ -66,7 +67,8 @@ def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
 def test_a_verdict_comes_with_its_probabilities_or_its_reason(
     board: PageBoard, events: Events, status: str
 ):
-    """Those of all labels, rounded; where there are none, in words what happened and what to do."""
+    """A verdict has rounded probabilities of all labels; without them it has the reason and the
+    remedy in words."""
     board.take(feed_lines.verdict(7, 2.0, "wood", status))
     (shown,) = events.of("verdict")
     assert shown["pid"] == 71
@@ -97,7 +99,7 @@ def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Event
 
 
 def test_without_a_bundle_the_picture_has_no_positions(events: Events):
-    """`palpate record` has none: the load is shown, the centre alone."""
+    """Without a bundle, as in `palpate record`, the picture has the load and the centre alone."""
     board = PageBoard(events)
     board.take(
         {name: value for name, value in feed_lines.hello(bundle="").items() if name != "alignment"}
@@ -115,8 +117,8 @@ def test_without_a_bundle_the_picture_has_no_positions(events: Events):
 
 
 def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
-    """State and view say so with the next line; another skin's counts do not begin with this one's
-    lowest."""
+    """State and view change with the next line; the counts of another skin get their own lowest
+    value."""
     frames(board, 2.0, 1.5, 1.5)
     board.take(feed_lines.state("absent", "check the cable"))
     assert events.of("state")[-1] == {
@@ -151,8 +153,8 @@ def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
 
 
 def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Events):
-    """Another process: a note in the history, which names the new bundle; a connection that was
-    only cut is none."""
+    """A restarted process causes a note in the history, with the new bundle; a cut connection does
+    not."""
     board.away("the connection was cut")
     assert events.of("box")[-1] == {"there": False, "why": "the connection was cut"}
     board.take(feed_lines.hello())
@@ -167,7 +169,8 @@ def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Even
 
 
 def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
-    """SWEEPS of them, by a number of their own, since those of the box begin anew with it."""
+    """The latest SWEEPS sweeps are kept by a number of their own, because the box counts anew after
+    a restart."""
     for number in range(SWEEPS + 3):
         board.take(feed_lines.sweep(number))
     numbers = [one["number"] for one in events.of("signal")]
@@ -178,7 +181,7 @@ def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
 
 
 def test_lines_of_a_later_version_are_passed_over(board: PageBoard, events: Events):
-    """One of an unknown type changes nothing, and neither do unknown fields."""
+    """Lines of an unknown type and unknown fields change nothing."""
     before = len(events.all)
     board.take({"type": "weather", "sun": True})
     board.take({"type": "lost", "lines": 7})
@@ -218,7 +221,7 @@ HELLO, SWEEP = feed_lines.hello(), feed_lines.sweep(1)
     ],
 )
 def test_a_line_that_is_not_as_it_must_be_is_refused(board: PageBoard, line: dict[str, Any]):
-    """With its type, and what to do; the board goes on with the next one."""
+    """The error names the type and the remedy; the board continues with the next line."""
     with pytest.raises(FormatError, match=f"{line['type']}.*update"):
         board.take(line)
     board.take(HELLO)

@@ -1,5 +1,5 @@
-"""The page of a recording without a browser: what it orders is done in the loop, what it must not
-order is refused, and the loop waits for none of it."""
+"""The page of a recording, without a browser: the loop carries out its orders, refuses others, and
+never waits."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_an_order_is_a_command_of_the_serial_line(body: bytes, command: Command)
     ],
 )
 def test_what_is_no_order(body: bytes):
-    """Each is refused in one line that says what an order is."""
+    """Each is refused with one line that describes an order."""
     with pytest.raises(FormatError, match=r"^[^\n]+$"):
         order(body, ALLOWED)
 
@@ -131,7 +131,8 @@ def test_what_is_no_order(body: bytes):
 @pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
 @pytest.mark.parametrize("name", record.LABELS)
 def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: str, text: str):
-    """The same words, before the loop or a capture gets it."""
+    """The refusal has the command's words, and comes before the loop or a capture gets the
+    order."""
     recording = RecordingSession(
         tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None
     )
@@ -204,8 +205,8 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(
 
 
 def test_the_page_hears_what_there_is(recorded: RecordedPage):
-    """Labels, counts, what is missing, what became of the last sweep and its checks; the skin while
-    somebody looks."""
+    """The page gets labels, counts, missing sweeps, and the result and checks of the last sweep;
+    the skin only while a browser is connected."""
     reader = EventReader(recorded.page.server)
     assert reader.until("key") == recorded.page.server.key
     until(lambda: recorded.page.server.watched)
@@ -261,8 +262,8 @@ REFUSED = [
 def test_an_order_of_another_site_is_refused(
     recorded: RecordedPage, answer: int, changed: dict[str, str | None]
 ):
-    """Whatever a page of another site can send: wrong or no key, another origin, a content type
-    that needs no leave."""
+    """Requests that a page of another site can send are refused: wrong or missing key, another
+    origin, a content type without preflight."""
     server_of, key = recorded.page.server, key_of(recorded.page.server)
     assert status(ordered(server_of, key, WOOD, **changed)) == answer
     assert waiting(recorded) == 0
@@ -270,7 +271,7 @@ def test_an_order_of_another_site_is_refused(
 
 
 def test_a_key_of_another_run_is_refused(recorded: RecordedPage, tmp_path: Path):
-    """Each start of the program makes a new one."""
+    """The key of another start of the program is refused."""
     other = RecordedPage(tmp_path / "other", Labels())
     with other.page:
         assert status(ordered(recorded.page.server, other.page.server.key, WOOD)) == 403
@@ -302,7 +303,8 @@ def test_other_ways_to_order_are_refused(
 
 @pytest.mark.parametrize("chunked", [False, True])
 def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
-    """Announced or in chunks: it is not read to its end, and the next request is answered."""
+    """A body that is too large, announced or in chunks, is not read to its end; the next request is
+    answered."""
     page, body = (
         recorded.page.server,
         json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode(),
@@ -318,7 +320,7 @@ def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
 
 
 def test_half_a_body_ends_at_the_deadline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its connection is closed, and no order is taken from it."""
+    """The connection is closed, and no order comes from it."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     one = RecordedPage(tmp_path, Labels())
     with one.page, connected(one.page.server) as slow:
@@ -345,8 +347,8 @@ def test_refusals_say_why(recorded: RecordedPage):
 
 
 def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: RecordedPage):
-    """Those beyond MOST_WAITING are refused at once, while the loop stands; then each turn carries
-    out one, and not more."""
+    """While the loop stands still, orders beyond MOST_WAITING are refused at once. Then each turn
+    carries out exactly one."""
     asking = Asking(recorded, *[WOOD] * (MOST_WAITING + 6))
     until(lambda: len(asking.answers) == 6)
     assert waiting(recorded) == MOST_WAITING
@@ -359,7 +361,7 @@ def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: Re
 
 
 def test_a_loop_that_takes_nothing_up(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """After DONE_S the page hears that it was not done; and it is not done later."""
+    """After DONE_S the page gets an error, and the order is not carried out later."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
     asking = Asking(recorded, WOOD)
     assert asking.finished() == [503]
@@ -371,8 +373,7 @@ def test_a_loop_that_takes_nothing_up(recorded: RecordedPage, monkeypatch: pytes
 def test_a_command_that_takes_long_is_not_called_undone(
     recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch
 ):
-    """It is under way when DONE_S is over, on a slow disk: the page is not told that nothing
-    happened."""
+    """If an order is under way after DONE_S, as on a slow disk, the page does not get an error."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
     answered = threading.Event()
     monkeypatch.setattr(recorded.page, "_obey", lambda command: [answered.wait(WAIT_S)])
@@ -389,7 +390,7 @@ def test_a_command_that_takes_long_is_not_called_undone(
 def test_the_end_of_the_recording_answers_who_waits(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
-    """With the reason; nothing is carried out any more."""
+    """Waiting orders are refused with the reason, and none is carried out."""
     one = RecordedPage(tmp_path, Labels())
     with one.page:
         asking = Asking(one, WOOD, WOOD)
@@ -402,7 +403,7 @@ def test_the_end_of_the_recording_answers_who_waits(
 
 
 def test_commands_that_nobody_wants_any_more_take_no_turn():
-    """One that was given up is passed over; the next is carried out in the same turn."""
+    """An abandoned order is skipped; the next order is carried out in the same turn."""
     queue, done = CommandQueue(), []
     first, second = queue.put(Command("NEXT")), queue.put(Command("DISCARD"))
     assert first.cancel()
@@ -416,8 +417,8 @@ def test_commands_that_nobody_wants_any_more_take_no_turn():
 
 
 def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """However often its picture is asked for; only the last sweep has one, and none without a
-    window."""
+    """The picture is computed once. Only the last sweep has a picture, and a sweep without a window
+    has none."""
     drawn: list[int] = []
     draw = record.picture
     monkeypatch.setattr(
@@ -450,8 +451,8 @@ def test_the_trigger_is_named(mode: str, words: str):
 
 
 def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
-    """As the watch page: without the token an order is not even looked at, over plain HTTP
-    neither."""
+    """As on the watch page, an order without the token is refused, and plain HTTP is not
+    answered."""
     page_secrets(tmp_path / "secrets")
     settings = WatchConfig(address="0.0.0.0 localhost", folder=str(tmp_path / "secrets"))
     token = (tmp_path / "secrets" / "token").read_text().strip()

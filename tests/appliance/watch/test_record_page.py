@@ -1,5 +1,5 @@
-"""The page of `palpate record --web` in a headless browser: what it shows, how labels are set, how
-it looks at three sizes."""
+"""The page of `palpate record --web` in a headless browser: content, labels, and layout at three
+sizes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def begun(folder: Path, access: Access | None = None) -> RecordedPage:
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
-    """It, with a page that is served."""
+    """The recording, with a page that is served."""
     one = begun(tmp_path)
     with one:
         yield one
@@ -50,7 +50,7 @@ def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
 def opened(
     browser: Any, recorded: RecordedPage, width: int = 1024, height: int = 768, **more: Any
 ) -> BrowsedPage:
-    """The page in a browser, with all that there is."""
+    """The page in a browser, with its content."""
     context = browser.new_context(viewport={"width": width, "height": height}, **more)
     seen = BrowsedPage(context, recorded.page.server.address)
     until(lambda: seen.page.locator("#counts button").count() == 4)
@@ -59,13 +59,13 @@ def opened(
 
 
 def labels(recorded: RecordedPage) -> tuple[str, str, str]:
-    """The labels that hold."""
+    """The current labels."""
     about = recorded.recording.about()
     return about["material"], about["position"], about["session"]
 
 
 def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage):
-    """A row for each material, a column for each position, what is done and what is not; the
+    """A row for each material, a column for each position, with recorded and missing sweeps; the
     trigger in words."""
     seen = opened(browser, recorded)
     assert seen.page.locator("#counts th").all_inner_texts() == ["1", "2", "metal", "wood"]
@@ -88,8 +88,8 @@ def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage)
 
 
 def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
-    """Its status, what was checked, where it is; its signal; one with a fault, and one without a
-    window."""
+    """The last sweep has status, checks, path and signal; also a faulty sweep, and a sweep without
+    a window."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
     until(lambda: seen.text("#outcome") == f"wood at 1, stored as sweep-{number:06d}")
@@ -111,8 +111,8 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
 
 
 def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, tmp_path: Path):
-    """Tab reaches every control, each visibly; Enter in a field sets what was changed; the stored
-    sweep has it."""
+    """Tab reaches every control with a visible focus. Enter in a field sets the changed labels, and
+    the stored sweep has them."""
     seen, stops = opened(browser, recorded), []
     for _ in range(11):
         seen.page.keyboard.press("Tab")
@@ -157,8 +157,8 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
 
 
 def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: RecordedPage):
-    """In the words of the command, beside the field, which keeps what was typed; a good one then
-    takes it back."""
+    """The refusal has the command's words and stands beside the field, which keeps the text; a good
+    label removes it."""
     seen = opened(browser, recorded)
     for wrong in ("-wood", "<b>wood</b>", "Grüße"):
         seen.page.fill("#material", wrong)
@@ -181,8 +181,8 @@ def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: Recorded
 
 
 def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: RecordedPage):
-    """The robot sets a label meanwhile: the page shows it, and the field keeps what the person has
-    begun."""
+    """The robot sets a label meanwhile: the page shows it, and the field keeps the person's
+    text."""
     seen = opened(browser, recorded)
     seen.page.fill("#material", "pap")
     recorded.recording.commands["MATERIAL"]("cork")
@@ -193,8 +193,8 @@ def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: Recorded
 
 
 def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedPage):
-    """What is missing is chosen by pressing it; it keeps the focus, so that the next one is reached
-    from there."""
+    """Pressing a cell of the table sets both labels. The cell keeps the focus, so that the next
+    cell can be reached."""
     seen = opened(browser, recorded)
     seen.page.focus("#counts button[aria-label='wood at 2: 0 of 3']")
     seen.page.keyboard.press("Enter")
@@ -208,7 +208,7 @@ def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedP
 
 
 def test_start_and_stop(browser: Any, recorded: RecordedPage):
-    """Each can be pressed while it does something, and the state says so."""
+    """Each button can be pressed while it has an effect, and the state says so."""
     seen = opened(browser, recorded)
     until(lambda: not seen.page.is_disabled("#start"))
     assert seen.page.is_disabled("#stop")
@@ -224,7 +224,7 @@ def test_start_and_stop(browser: Any, recorded: RecordedPage):
 def test_only_the_sweep_that_was_seen_is_discarded(
     browser: Any, recorded: RecordedPage, tmp_path: Path
 ):
-    """The button names it; one that has come since then is not removed in its place."""
+    """The button names the sweep; a sweep that has come since then is not removed in its place."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
     until(lambda: seen.text("#discard") == f"Discard sweep {number}")
@@ -245,8 +245,8 @@ def test_only_the_sweep_that_was_seen_is_discarded(
 
 
 def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any, tmp_path: Path):
-    """It says so, and nothing can be pressed; the next run is shown by itself, and takes orders
-    with its own key."""
+    """The page says that the recorder has ended, and its controls are off. It shows the next run by
+    itself, and orders have the new key."""
     first = begun(tmp_path / "a")
     with first:
         seen = opened(browser, first)
@@ -352,8 +352,8 @@ def test_no_other_site_sets_a_label(
 def test_every_text_of_it_can_be_read(
     browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str
 ):
-    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also of an error and a banner;
-    nothing is too wide, with a name as long as one may be and more positions than fit."""
+    """Text, an error and a banner have a contrast of 4.5 with their background (WCAG 2.1, 1.4.3).
+    The longest names and more positions than fit stay within the page."""
     recorded.recording.commands["MATERIAL"]("a material of 24 letters")
     for position in range(3, 15):
         recorded.recording.commands["POSITION"](f"{position}")
@@ -380,7 +380,7 @@ def test_every_text_of_it_can_be_read(
 
 
 def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: RecordedPage):
-    """Sections, fields, pictures and buttons, for who does not see them; what changes is spoken."""
+    """Sections, fields, pictures and buttons have names for screen readers, which speak changes."""
     seen = opened(browser, recorded)
     unnamed = seen.page.evaluate(
         """() => [...document.querySelectorAll("section, canvas, button, input, table, [role]")].filter((e) => !(e.textContent.trim()

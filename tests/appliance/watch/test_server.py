@@ -1,4 +1,4 @@
-"""The server of the pages: what it answers, what it refuses, and what it survives."""
+"""The server of the pages: answers, refusals, faults."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def now_ns() -> int:
 
 @pytest.fixture
 def page() -> Iterator[PageServer]:
-    """A page at any free port, which has one event."""
+    """A page at any free port, with an event."""
     with PageServer(
         "watch.html", Access(0), now_ns, {"row": 3}, {"sweep": {"7": {"seconds": 2.0}}.get}
     ) as one:
@@ -50,8 +50,8 @@ def page() -> Iterator[PageServer]:
 def guarded(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
-    """A page on the network, as `make install` sets it up: it, its token, and what a browser that
-    trusts it has."""
+    """A page on the network as `make install` sets it up: the page, its token, and the context of a
+    browser that trusts it."""
     page_secrets(folder)
     settings = WatchConfig(address="0.0.0.0 localhost", folder=str(folder))
     token = (folder / "token").read_text().strip()
@@ -62,8 +62,8 @@ def guarded(
 
 
 def test_events_are_numbered_and_the_newest_are_kept():
-    """Of each name as many as asked for, one without; in order; who has some gets the rest, another
-    server's reader all."""
+    """The requested number of events of each name is kept, else the newest; in order. A browser
+    gets later events, a browser of another server all events."""
     log = EventLog({"row": 2})
     for i in range(4):
         log.add("row", i)
@@ -82,8 +82,8 @@ def test_events_are_numbered_and_the_newest_are_kept():
 
 
 def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
-    """First the clock, so that it can tell times; one that comes back gets what it has missed
-    alone."""
+    """The clock is the first event. A browser that comes back gets only the events it has
+    missed."""
     reader = EventReader(page)
     assert [reader.next() for _ in range(3)] == [
         ("now", now_ns()),
@@ -172,8 +172,8 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
 def test_the_page_for_this_machine_and_no_more(
     page: PageServer, path: str, method: str, host: str, answer: int
 ):
-    """GET of the page, its files and what it may ask for, under this machine's names; else refused
-    with its HTTP status."""
+    """GET of the page, its files and its data is answered under this machine's names; other
+    requests get their HTTP status."""
     assert status(ask(page, path, method, host)) == answer
     assert status(ask(page)) == 200
 
@@ -202,8 +202,8 @@ def test_the_page_for_this_machine_and_no_more(
 def test_malformed_requests_are_refused(
     page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]
 ):
-    """Each ends with an error or a closed connection, prints nothing, and the next one is
-    served."""
+    """Each request ends with an error or a closed connection and prints nothing; the next request
+    is served."""
     with connected(page) as one:
         with suppress(OSError):
             one.sendall(sent)
@@ -217,8 +217,8 @@ def test_malformed_requests_are_refused(
     "sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)]
 )
 def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, sent: bytes):
-    """It gets no answer and a closed connection, even if its other side goes on sending; others are
-    served."""
+    """Half a request gets no answer and a closed connection, even if its other side continues to
+    send; others are served."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with (
         PageServer("watch.html", Access(0), now_ns) as page,
@@ -251,8 +251,8 @@ def test_an_endless_head_is_not_read_on(page: PageServer):
 
 
 def test_a_thousand_connections_are_turned_away(page: PageServer):
-    """Those beyond MOST_OF_ONE are closed at once; the rest are served, and when these are gone,
-    new ones are."""
+    """Connections beyond MOST_OF_ONE are closed at once. The others are served, and later
+    connections as well."""
     with ExitStack() as stack:
         first = [stack.enter_context(connected(page)) for _ in range(MOST_OF_ONE)]
         turned_away = 0
@@ -267,8 +267,8 @@ def test_a_thousand_connections_are_turned_away(page: PageServer):
 
 
 def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
-    """A browser listens and never reads: it is cut off when too much waits for it, and the others
-    get everything."""
+    """A browser that never reads is disconnected when too many events wait for it; other browsers
+    get all events."""
     lazy = EventReader(page)
     busy = EventReader(page)
     until(lambda: len(page.queues) == 2)
@@ -282,7 +282,8 @@ def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: py
 
 
 def test_one_who_takes_nothing_is_closed(page: PageServer, monkeypatch: pytest.MonkeyPatch):
-    """After TAKEN_S, with an answer that is half sent: the place is free again."""
+    """A connection with an answer half sent is closed after TAKEN_S, and its place is free
+    again."""
     monkeypatch.setattr(server, "TAKEN_S", 1)
     monkeypatch.setattr(server, "MOST_OF_ONE", 1)
     page.files["/big"] = "text/plain", b"x" * 50_000_000
@@ -307,8 +308,8 @@ def test_a_browser_that_goes_is_forgotten(page: PageServer, rudely: bool):
 
 
 def test_another_server_at_the_port_begins_anew(page: PageServer):
-    """What a browser has of the one before is no number of this one: it gets `begin` and
-    everything."""
+    """The event numbers of a previous server are not valid: the browser gets `begin` and all
+    events."""
     reader = EventReader(page)
     reader.until("view")
     with PageServer("watch.html", Access(0), now_ns) as other:
@@ -325,7 +326,7 @@ def test_it_listens_on_this_machine_alone(page: PageServer):
 
 
 def test_a_port_that_is_taken_is_named(page: PageServer):
-    """A ConfigError with the port and what to do; so is a number that is no port."""
+    """A ConfigError names the port and the remedy, also for an invalid port number."""
     for taken in (port(page), 70_000):
         with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
             PageServer("watch.html", Access(taken), now_ns)
@@ -364,8 +365,9 @@ def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[s
 
 
 def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Without: the page that asks for it, and nothing else. With, as a header or as the cookie that
-    it gives: everything. The certificate is valid for a browser that trusts it."""
+    """Without the token the server answers with the page that asks for it. With the token, in a
+    header or in the server's cookie, everything is served. A browser that trusts the certificate
+    accepts it."""
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
         answer = ask(page, tls=trusts)
         assert status(answer) == 401
@@ -406,8 +408,8 @@ def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The token would be read by others: without TLS there is no answer, and a handshake that never
-    ends is cut off."""
+    """Plain HTTP, which would reveal the token, gets no answer; a handshake that never ends is cut
+    off."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
         assert status(ask(page, more=f"Authorization: Bearer {token}\r\n")) == 0
@@ -419,8 +421,8 @@ def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: 
 def test_wrong_tokens_are_slowed_and_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """Each waits for WRONG_S; the first is a warning that names the address, further ones are
-    silent."""
+    """Each wrong token waits for WRONG_S. The first is logged with the address, further wrong
+    tokens are not."""
     waited = []
 
     async def sleep(seconds: float) -> None:
@@ -447,8 +449,8 @@ def test_wrong_tokens_are_slowed_and_logged_once(
 
 
 def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path):
-    """Each file that is missing or cannot be used is named with what makes it; an address that is
-    none, too."""
+    """Errors for missing or broken files name the file and `make install`; an invalid address is
+    refused."""
     network = WatchConfig(address="0.0.0.0", folder=str(tmp_path))
     with pytest.raises(ConfigError, match=r"token cannot be read: No such file.*make install"):
         Access.configured(network, 0)
@@ -465,7 +467,7 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path)
 
 
 def test_a_token_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """One that may not be read, as by the user who records: the error says how to be let in."""
+    """If this user may not read the token, the error names the group."""
 
     def denied(path: Path, *args: object) -> str:
         raise PermissionError(13, "Permission denied", str(path))

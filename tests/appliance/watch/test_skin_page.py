@@ -1,5 +1,4 @@
-"""The page of `palpate skin show` in a real browser: what it shows of a skin, at three widths, in
-both modes."""
+"""The page of `palpate skin show` in a real browser, at three widths, light and dark."""
 
 from __future__ import annotations
 
@@ -76,7 +75,7 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
 
 @pytest.mark.slow
 def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser: Any, page: PageServer):
-    """The first says why, the second that nothing is heard; news bring the page back."""
+    """A missing skin has a reason, a dead box has no news; news bring the page back."""
     seen = BrowsedPage(browser.new_context(), page.address)
     page.show(replace(VIEW, number=2, state="lost", trouble="the skin was unplugged"))
     until(lambda: seen.text("#state") == "lost")

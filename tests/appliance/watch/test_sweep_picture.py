@@ -14,7 +14,7 @@ from tests.factories import feed_lines
 
 
 def test_the_window_is_the_one_that_was_sent():
-    """Bytes, shape and type; several axes, too."""
+    """Bytes, shape and type are equal, with several axes as well."""
     counts = np.arange(2 * 3 * 4 * 3, dtype="<i2").reshape(2, 3, 4, 3) - 7
     line = {
         "sweep": 5,
@@ -28,8 +28,7 @@ def test_the_window_is_the_one_that_was_sent():
 
 
 def test_a_vibration_stands_at_its_frequency():
-    """45 Hz: the strongest band of every moment is the one from 40 to 60 Hz; two seconds in steps
-    of 50 ms."""
+    """45 Hz: the strongest band at each time is 40 to 60 Hz, over two seconds in steps of 50 ms."""
     shown = picture(window(feed_lines.sweep(1, hz=45.0), feed_lines.RATE_HZ))
     assert shown["seconds"] == 2.0
     shares = np.array(shown["spectrogram"])
@@ -41,7 +40,7 @@ def test_a_vibration_stands_at_its_frequency():
 
 @pytest.mark.parametrize("frames", [1, 7, FINEST, 1500, 12_345])
 def test_no_peak_is_lost(frames: int):
-    """Least and highest count of the whole are in the lines, in at most FINEST steps."""
+    """Lowest and highest count of the whole sweep are in the lines, in at most FINEST steps."""
     counts = np.random.default_rng(frames).normal(100, 20, (frames, 2, 2)).astype("<f4")
     shown = picture(Window(1, 750.0, counts))
     assert [one["name"] for one in shown["taxels"]] == ["1.1", "1.2", "2.1", "2.2"]
@@ -81,7 +80,7 @@ def _nan() -> NDArray[np.float32]:
     ],
 )
 def test_without_a_spectrogram_it_says_why(counts: NDArray[np.uint8], rate_hz: float, why: str):
-    """The lines are there all the same, as JSON."""
+    """The lines are present and can be sent as JSON."""
     shown = picture(Window(1, rate_hz, counts))
     assert why in shown["trouble"]
     assert shown["spectrogram"] == []

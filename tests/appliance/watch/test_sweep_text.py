@@ -1,5 +1,5 @@
-"""Pictures of sweeps in a terminal: a tone stands where it should, every form fits, and a terminal
-that stands still."""
+"""Pictures of sweeps in a terminal: a tone is in its band, every format fits, a stopped terminal
+blocks nothing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def plain(text: str) -> str:
 
 
 def tone(hz: float, format: SweepFormat = skin.FORMAT) -> np.ndarray:
-    """A window [T, R, C] or [T, R, C, A] in which all taxels swing, the louder the later."""
+    """A window [T, R, C] or [T, R, C, A] in which all taxels swing, with growing amplitude."""
     t = np.arange(format.window) / format.rate_hz
     wave = 100 + 40 * t / t[-1] * (1 + np.sin(2 * np.pi * hz * t))
     return np.broadcast_to(
@@ -40,8 +40,7 @@ def tone(hz: float, format: SweepFormat = skin.FORMAT) -> np.ndarray:
 
 @pytest.mark.parametrize(("hz", "row"), [(10, 5), (100, 4), (340, 0)])
 def test_a_tone_stands_in_its_band(hz: float, row: int) -> None:
-    """The band with the darkest fields is the one that holds the frequency; 0 Hz is below, 375 Hz
-    above."""
+    """The darkest band contains the frequency; 0 Hz is at the bottom, 375 Hz at the top."""
     lines = picture(tone(hz), RATE, 80, colours=False)[HIGH : HIGH + BANDS]
     assert (lines[0].split()[0], lines[-1].split()[0]) == ("375", "0")
     dark = [line[NAME + 1 :].count("█") for line in lines]
@@ -74,8 +73,8 @@ def test_the_signal_rises_where_the_load_does() -> None:
     ids=str,
 )
 def test_every_form_fits(format: SweepFormat, width: int) -> None:
-    """No line is wider than the terminal; where a rate is too low for a spectrogram the reason
-    stands there."""
+    """No line is wider than the terminal. If the rate is too low for a spectrogram, the reason is
+    shown."""
     taxels = (
         tone(3, format) if format.window > 1 else np.ones((1, *format.shape), format.numpy_type)
     )
@@ -86,7 +85,7 @@ def test_every_form_fits(format: SweepFormat, width: int) -> None:
 
 
 def test_a_silent_window_and_broken_counts_are_pictures_too() -> None:
-    """All the same, and no numbers: lines without a bar, and no error."""
+    """Constant counts and counts that are not numbers give lines without a bar, and no error."""
     still = np.full((1500, 4, 4), 7, np.uint8)
     assert "█" not in "".join(picture(still, RATE, 80, colours=False))
     broken = np.full((200, 3, 3, 3), np.nan, np.float32)
@@ -111,12 +110,13 @@ def screen() -> Iterator[tuple[int, TextIO]]:
 
 
 def about() -> dict[str, object]:
-    """What a recording says."""
+    """The facts of a recording."""
     return {"counts": [("wood", "1", 4)]}
 
 
 def test_each_sweep_is_printed_with_the_counts(screen: tuple[int, TextIO]) -> None:
-    """One with a window as a picture; one without it gives the counts alone."""
+    """A sweep with a window is printed as a picture; without a window, only the counts are
+    printed."""
     far, out = screen
     printer = SweepPrinter(out, RATE, about)
     printer.sweep(
@@ -135,11 +135,11 @@ def test_each_sweep_is_printed_with_the_counts(screen: tuple[int, TextIO]) -> No
 
 
 def test_a_terminal_that_stands_still_keeps_nobody_waiting(screen: tuple[int, TextIO]) -> None:
-    """Ctrl-S, or a connection that hangs: sweeps are not printed, and the printer returns at
-    once."""
+    """After Ctrl-S, or with a connection that hangs, sweeps are not printed and the printer returns
+    at once."""
     _, out = screen
     os.set_blocking(out.fileno(), False)
-    while True:  # until the terminal takes nothing more
+    while True:  # until the terminal accepts nothing more
         try:
             os.write(out.fileno(), b"x" * 4096)
         except BlockingIOError:
@@ -151,7 +151,7 @@ def test_a_terminal_that_stands_still_keeps_nobody_waiting(screen: tuple[int, Te
 
 
 def test_record_prints_nothing_of_it_into_a_file(tmp_path: Path) -> None:
-    """Without a terminal there is no printer: standard output holds sentences alone."""
+    """Without a terminal nothing is printed: standard output holds sentences alone."""
     from appliance.cli import record_command
 
     assert not io.StringIO().isatty()

@@ -1,5 +1,4 @@
-"""`palpate watch` in a terminal: what it shows of the feed's lines, on any terminal and without
-one, and that it lasts."""
+"""`palpate watch` with a terminal of any size, without a terminal, and over restarts of the box."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from tests.factories.simulated_box import SECOND
 
 
 def lines_of(folder: Path, format: SweepFormat = skin.FORMAT, **facts: str) -> list[dict[str, Any]]:
-    """What a reader gets of a box that streams, answers twice and is swept again."""
+    """The lines of a box that streams, answers twice and is swept again."""
     offered = Offered(folder / "feed.sock", format, **facts)
     peer = offered.peer()
     peer.ask('{"frames": 20, "sweeps": true}')
@@ -69,8 +68,8 @@ def drawn(state: WatchedBox, width: int = 80, height: int = 24, **more: Any) -> 
 
 
 def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
-    """Skin, bundle, state, load, probabilities, counters, latency, last verdicts the newest
-    first."""
+    """The picture has skin, bundle, state, load, probabilities, counters, latency, and the last
+    verdicts, the newest first."""
     shown = drawn(state_of(lines_of(tmp_path, trial="7 of 20 sweeps")))
     text = "\n".join(shown)
     assert "palpate 4x4 uint8 at 750 Hz" in shown[0]
@@ -101,8 +100,8 @@ def test_the_picture_has_all_that_a_person_asks_for(tmp_path: Path) -> None:
 def test_it_fits_any_terminal(
     tmp_path: Path, size: tuple[int, int], format: SweepFormat, colours: bool
 ) -> None:
-    """No line is wider, no picture higher; the state, the skin and the last verdict are in it where
-    it is 80x24."""
+    """No line is wider and no picture is higher than the terminal; 80x24 has room for state, skin
+    and last verdict."""
     state = state_of(lines_of(tmp_path, format, trial="7 of 20 sweeps", shadow="x" * 200))
     raw = picture(state, 5 * SECOND, *size, colours=colours)
     assert len(raw) <= size[1]
@@ -123,7 +122,7 @@ def test_a_terminal_without_utf_8_gets_plain_signs(tmp_path: Path) -> None:
 
 
 def test_text_from_outside_does_not_steer_the_terminal(tmp_path: Path) -> None:
-    """Names of skins and labels, and what a device says: control characters become question
+    """Control characters in names of skins and labels, and in texts of a device, become question
     marks."""
     lines = lines_of(tmp_path)
     lines[0] |= {"skin": "\033[2Ja", "labels": ["\033]0;b", "wood"], "bundle": "\a"}
@@ -166,7 +165,7 @@ def test_text_from_outside_does_not_steer_the_terminal(tmp_path: Path) -> None:
     ids=str,
 )
 def test_a_line_that_is_not_as_it_must_be_is_named(tmp_path: Path, change: dict[str, Any]) -> None:
-    """An error of one line, and the state can still be shown."""
+    """The error is one line, and the state can still be shown."""
     lines = [*lines_of(tmp_path), {"type": "lost", "lines": 1}]
     state = state_of(lines)
     whole = next(line for line in lines if line["type"] == change["type"])
@@ -179,14 +178,14 @@ def test_a_line_that_is_not_as_it_must_be_is_named(tmp_path: Path, change: dict[
 
 
 def test_lines_of_a_later_version_are_passed_over(tmp_path: Path) -> None:
-    """A type that is not known, and members that are not."""
+    """Unknown types and members are ignored."""
     lines = [line | {"more": [1]} for line in lines_of(tmp_path)]
     assert drawn(state_of([{"type": "weather"}, *lines])) == drawn(state_of(lines))
 
 
 def test_while_sweeps_are_recorded_the_last_one_is_shown(tmp_path: Path) -> None:
-    """No labels: beside the skin stand the sweep's signal and spectrogram, and below what is
-    missing."""
+    """A recording has no labels: signal and spectrogram of the sweep are beside the skin, missing
+    sweeps below."""
     lines = lines_of(tmp_path, recorded="missing: wood at 1: 7")
     lines[0] |= {"labels": [], "bundle": ""}
     shown = drawn(state_of(lines))
@@ -198,13 +197,13 @@ def test_while_sweeps_are_recorded_the_last_one_is_shown(tmp_path: Path) -> None
 
 
 def test_missed_lines_are_counted(tmp_path: Path) -> None:
-    """What the box says that this reader has lost."""
+    """The number of lines that this reader has lost is shown."""
     state = state_of([*lines_of(tmp_path), {"type": "lost", "lines": 1200}])
     assert any("1,200 lines missed" in line for line in drawn(state))
 
 
 class Terminal(io.StringIO):
-    """An output that says it is a terminal."""
+    """An output that claims to be a terminal."""
 
     encoding = "utf-8"
 
@@ -219,7 +218,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def offered(tmp_path: Path) -> Iterator[Offered]:
-    """A feed that is there."""
+    """A running feed."""
     one = Offered(tmp_path / "feed.sock")
     one.turns()
     yield one
@@ -229,7 +228,7 @@ def offered(tmp_path: Path) -> Iterator[Offered]:
 def test_it_draws_and_gives_the_terminal_back(
     offered: Offered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames are asked for; the picture has the box in it; at the end the screen is as before."""
+    """The command asks for frames and draws the box; at the end the screen is as before."""
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     monkeypatch.setattr(terminal, "DRAW_NS", 0)
@@ -253,8 +252,8 @@ def test_it_draws_and_gives_the_terminal_back(
 def test_without_a_terminal_each_event_is_a_line(
     offered: Offered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Connection, verdict, change of the state, the end of the box and its return; no frames are
-    asked for."""
+    """A line is printed for connection, verdict, change of the state, end of the box and its
+    return; the command asks for no frames."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     out = io.StringIO()
     watch = TerminalWatch(str(offered.path), out, SystemClock())
@@ -287,7 +286,7 @@ def test_without_a_terminal_each_event_is_a_line(
 def test_what_cannot_be_read_is_said_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A verdict of another form: one line that says so, and the connection is closed."""
+    """A malformed verdict causes one line, and the connection is closed."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     offered = Offered(tmp_path / "feed.sock")
     offered.turns()
@@ -306,7 +305,8 @@ def test_what_cannot_be_read_is_said_and_tried_again(
 
 
 def test_json_passes_the_lines_on(offered: Offered, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit for bit what any other reader gets; why there is no box goes elsewhere."""
+    """Standard output has the same bytes as any reader gets; the reason for a missing box goes to
+    standard error."""
     monkeypatch.setattr(terminal, "READ_S", 0.01)
     peer: list[FeedPeer] = [offered.peer()]
     out, said, turns = io.StringIO(), [], [0]

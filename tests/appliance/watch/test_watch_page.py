@@ -1,5 +1,5 @@
-"""The page of `palpate watch --web` in a headless browser: what it shows, how it is used, how it
-looks at three sizes."""
+"""The page of `palpate watch --web` in a headless browser: content, use, and layout at three
+sizes."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ NOW_S = 400.0
 
 
 class Shown:
-    """A page whose lines of the feed a test writes. While it is entered, browsers hear twice a
-    second whether there is a box: as in the command, which is never silent for longer, however slow
-    the machine is."""
+    """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
+    second whether there is a box, as with the command, however slow the machine is."""
 
     def __init__(self, access: Access) -> None:
         self.server = PageServer(
@@ -132,7 +131,7 @@ def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
     ],
 )
 def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
-    """Nothing is cut off, at any size; what a name holds is text and nothing else."""
+    """Nothing is cut off at any size, and markup in a name is shown as text."""
     shown.board.take(feed_lines.verdict(41, 390.0, "wood") | {"label": label})
     for width, height in SIZES:
         seen = opened(browser, shown, width, height, rows=41)
@@ -145,7 +144,7 @@ def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
 
 
 def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
-    """In words, with its status; the probabilities are gone."""
+    """The reason is shown in words with the status; the probabilities are gone."""
     seen = opened(browser, shown)
     shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
     until(lambda: seen.text("#status") == "sensor-lost")
@@ -155,8 +154,8 @@ def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
 
 
 def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, shown: Shown):
-    """The last one by itself; another by a click, until the latest is asked for; an old one has no
-    signal any more."""
+    """The last sweep is shown by itself, and another sweep after a click, until the latest is asked
+    for. An old sweep no longer has a signal."""
     seen = opened(browser, shown)
     scores = seen.page.locator("#scores li").all_inner_texts()
     assert len(scores) == 6
@@ -197,8 +196,8 @@ def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
 
 
 def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
-    """The verdict says it, and leads to the view that shows where the skin has to go, with the
-    service running."""
+    """The verdict leads to the view that shows the direction in which to move the skin, while the
+    service runs."""
     seen = opened(browser, shown)
     shown.board.take(
         feed_lines.verdict(41, 390.0, "wood", moved="moved 2.2 mm too far towards row 1")
@@ -218,8 +217,8 @@ def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
-    """12 x 32 taxels: a few rows and columns by their number, none over another; the contact's ring
-    is large enough."""
+    """12 x 32 taxels: some rows and columns have numbers that do not overlap; the contact's ring is
+    large enough."""
     shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
     known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
     shown.board.take(feed_lines.hello(format=shape, alignment=known))
@@ -264,8 +263,8 @@ def test_loss_latency_and_the_box(browser: Any, shown: Shown):
 
 
 def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
-    """While a setting allows them, at every size, without scrolling and beside whatever else is
-    there; else not."""
+    """While a setting allows unsigned bundles, the top of the page says so at every size, without
+    scrolling; otherwise it does not."""
     for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
         shown.board.take(feed_lines.health(380.0, unsigned=text))
         for width, height in SIZES:
@@ -280,8 +279,8 @@ def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
 
 
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
-    """It says so at once, why, and how old what it shows is; the box is there again by itself, with
-    its new bundle."""
+    """The page says at once that the box is away, with the reason and the age of its content. It
+    shows the new box and bundle by itself."""
     seen = opened(browser, shown)
     assert not seen.page.is_visible("#banner")
     shown.board.take({"type": "closed", "why": "the box is stopping"})
@@ -308,8 +307,8 @@ def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, sho
 
 
 def test_a_page_program_that_dies_and_comes_back(browser: Any):
-    """The connection is gone: said at once, tried again, and what the new program knows is shown in
-    place of the old."""
+    """The page says at once that the connection is gone, and tries again. The content of the new
+    program replaces the old content."""
     first = Shown(Access(0))
     with first:
         first.shift()
@@ -341,8 +340,8 @@ def test_a_skin_that_is_away_is_not_a_box_that_is_away(browser: Any, shown: Show
 
 
 def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
-    """Tab goes from the views over the filter to the sweeps, each visibly; arrows choose a sweep,
-    space a status."""
+    """Tab goes from the views over the filter to the sweeps with a visible focus; arrows choose a
+    sweep, space a status."""
     seen = opened(browser, shown)
     stops = []
     for _ in range(8):
@@ -375,8 +374,8 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
 
 
 def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
-    """Sections, pictures, lists and buttons, for who does not see them; what is urgent is
-    spoken."""
+    """Sections, pictures, lists and buttons have names for screen readers, which speak urgent
+    changes."""
     seen = opened(browser, shown)
     unnamed = seen.page.evaluate(
         """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")].filter((e) => !(e.textContent.trim()
@@ -395,8 +394,8 @@ def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
 def test_every_text_can_be_read(
     browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str
 ):
-    """A contrast of 4.5 with what is behind it (WCAG 2.1, 1.4.3), also with a banner and each tone;
-    nothing is too wide."""
+    """All text has a contrast of 4.5 with its background (WCAG 2.1, 1.4.3), also with a banner and
+    each tone; nothing is too wide."""
     for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
         shown.board.take(
             feed_lines.verdict(
@@ -439,8 +438,8 @@ def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
 
 
 def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
-    """Over TLS: the token is asked for; a wrong one is refused; with the right one, or a link that
-    holds it, the page is there, and a reload needs no token. The address shows none."""
+    """Over TLS the page asks for the token, and refuses a wrong token. The right token, or a link
+    with it, opens the page; a reload needs no token. The address does not show it."""
     page_secrets(tmp_path)
     token = (tmp_path / "token").read_text().strip()
     shown = Shown(Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0))

@@ -1,5 +1,4 @@
-"""`palpate watch --web` on a feed: what comes through, and what it survives: a box that ends,
-restarts, or is none."""
+"""`palpate watch --web` on a feed, with boxes that end, restart, or do not exist."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from tests.factories.page_client import EventReader, PageAddress, ask, status
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where the feed is, or will be."""
+    """Path of the feed."""
     return tmp_path / "feed.sock"
 
 
@@ -53,8 +52,8 @@ def heard(watcher: PageWatcher, offered: Offered | None, name: str, reader: Even
 
 
 def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
-    """Verdicts with their probabilities, views of the frames, the sweep's picture under the number
-    that is told."""
+    """The page gets verdicts with probabilities, views of the frames, and the sweep's picture under
+    its number."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "hello", reader)["labels"] == ["plastic rough", "wood"]
@@ -70,8 +69,8 @@ def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
 
 
 def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path: Path):
-    """With the first browser they come, with the last one they end: nobody's page costs the box
-    nothing."""
+    """Frames come with the first browser and end with the last browser: without one, the page costs
+    the box nothing."""
     offered = Offered(path)
     until(lambda: (offered.turns(3), watcher.step(), watcher.feed.connected)[-1])
 
@@ -89,8 +88,8 @@ def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path:
 
 
 def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher, path: Path):
-    """The page hears at once that it is away, and why; then it is there again, and the history says
-    what has changed."""
+    """The page gets at once that the box is away, and why. Then it gets the new box, and the
+    history has the changes."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "box", reader) == {"there": True, "why": ""}
@@ -108,7 +107,7 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
 def test_a_box_that_is_not_there_is_shown_as_away(
     watcher: PageWatcher, path: Path, logged: list[str]
 ):
-    """Again and again, so that browsers know that the page's program is there; the log has it
+    """The page gets it repeatedly, so that browsers know that the program runs; the log has it
     once."""
     reader = EventReader(watcher.server)
     for _ in range(2):
@@ -134,8 +133,8 @@ RUBBISH = [
 def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
     watcher: PageWatcher, path: Path, sent: bytes
 ):
-    """Whatever it sends: the page says that there is no box, the server goes on, and a real feed is
-    read when it comes."""
+    """For any content the page shows a box that is away. The server continues, and reads a real
+    feed that comes later."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()
