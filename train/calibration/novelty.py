@@ -134,11 +134,11 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
         : classes - 1
     ].T
     orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
-    if fixed and classes - 1 + fixed < size:  # what is whitened after its inverse is as it was
+    if fixed and classes - 1 + fixed < size:  # W times columns of its inverse selects features
         directions, turn = white.apply(axes), np.linalg.inv(mixed)
     else:
         directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
-    # as a bundle's graph holds them
+    # rounded as the graph of a bundle holds them
     (whole, steps), (turn, sizes) = sixteen_bits(directions), sixteen_bits(turn)
     bare = Embedding(whole * steps, turn * sizes, *[np.empty(0)] * 3)
     projection = bare.projection

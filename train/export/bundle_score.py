@@ -82,7 +82,7 @@ class BundleScore:
     are independent. answered: for each material the answers and their counts: a label, or a status
     in parentheses. statuses: counts. unsure_right: number of unsure answers with the right label.
     recordings: whether the fused answer to each recording is right; None if no recording has
-    several sweeps. foreign: as `answered`, of materials that the bundle does not have. moved:
+    several sweeps. foreign: as `answered`, of materials that the bundle does not have. displaced:
     descriptions of displacements, of the sweeps whose contact lies outside the trained positions,
     with their counts.
     """
@@ -97,7 +97,7 @@ class BundleScore:
     unsure_right: int
     recordings: Array | None
     foreign: dict[str, Counter[str]]
-    moved: Counter[str]
+    displaced: Counter[str]
 
     def json(self) -> dict[str, Any]:
         """The figures for scripts, with their provenance."""
@@ -113,7 +113,7 @@ class BundleScore:
             "unsure_right": self.unsure_right,
             "answers": self.answered,
             "not_in_the_bundle": self.foreign,
-            "moved": self.moved.total(),
+            "moved": self.displaced.total(),
         }
         if self.recordings is not None:
             result["recordings"] = Score.of(self.recordings).json() | {
@@ -142,10 +142,10 @@ class BundleScore:
             for status, n in self.statuses.most_common()
         ]
         lines.append(f"answers: {', '.join(counts)}")
-        if self.moved:
-            most = self.moved.most_common(1)[0][0]
+        if self.displaced:
+            most = self.displaced.most_common(1)[0][0]
             lines.append(
-                f"outside the trained positions: {self.moved.total()} sweeps, most often {most}; "
+                f"outside the trained positions: {self.displaced.total()} sweeps, most often {most}; "
                 "record there, too, or align the skin"
             )
         wide = max(map(len, (*self.answered, *self.foreign)))
@@ -222,7 +222,7 @@ def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
         return None
     right = np.zeros(len(values), bool)
     for i, verdict in verdicts(classifier, sweeps, fused=True):
-        if verdict.label:  # what is unknown is not fused, and leaves the answer so far
+        if verdict.label:  # an unknown sweep is not fused and keeps the last answer
             right[member[i]] = (
                 verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]
             )

@@ -101,9 +101,8 @@ def timed(
     slows all of them alike. The time is processor time of one thread: in real time, slow models
     would be interrupted by other programs and quick ones would not.
     """
-    from train.models.training import (
-        one_thread,
-    )  # imports torch, which the process of `memory` must not hold
+    # here: it imports torch, which the process of `memory` must not load
+    from train.models.training import one_thread
 
     names, took = list(calls), {name: np.empty(rounds * block) for name in calls}
     with one_thread():
@@ -160,9 +159,8 @@ def load(folder: Path) -> Call:
 
 def _classifier(folder: Path) -> Call:
     """The box's classifier, which gets one sound sweep after another, each of another object."""
-    from appliance.bundle import (
-        bundle,
-    )  # here, not at the top: a model in its own library runs without the box's code
+    # here: a model in its own library runs without the box's code
+    from appliance.bundle import bundle
     from appliance.core.clock import SystemClock
     from appliance.core.types import Frames, Status, Sweep
     from appliance.inference.classifier import Classifier
@@ -182,9 +180,8 @@ def _torch(path: Path) -> Call:
     import torch
 
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # of TorchScript, which needs none of our code to be read
+        # of TorchScript, which is read without our code
+        warnings.simplefilter("ignore", DeprecationWarning)
         network = torch.jit.load(path)
 
     def answer(counts: Array) -> Any:
@@ -205,7 +202,7 @@ def _aeon(path: Path) -> Call:
             z["bias"],
         )
     features, before = MiniRocket(n_jobs=1), np.random.get_state()
-    features.fit(silence)  # it must have seen the form of a sweep; what it found there is not used
+    features.fit(silence)  # it needs the shape of a sweep; its result is replaced
     np.random.set_state(before)
     features.parameters = parameters
 

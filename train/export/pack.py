@@ -68,8 +68,9 @@ class Content:
     model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need. input:
     as in the manifest. train, held_out: the training sweeps and the others, split by the group
     `held_out_by`. about: description of the training; figures: its results; both for the manifest.
-    early, known, moved: for the manifest. classes: of the embedding, if there is `known`. reference:
-    the float model of an int8 model. contacts: of the training sweeps; None to find them.
+    early, known, displacement: for the manifest. classes: of the embedding, if there is `known`.
+    reference: the float model of an int8 model. contacts: of the training sweeps; None to find
+    them.
     """
 
     model: onnx.ModelProto
@@ -81,7 +82,7 @@ class Content:
     figures: dict[str, Any] = field(default_factory=dict)
     early: bundle.Early | None = None
     known: bundle.Known | None = None
-    moved: bundle.DisplacementRule | None = None
+    displacement: bundle.DisplacementRule | None = None
     classes: bundle.Classes | None = None
     reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
@@ -118,7 +119,7 @@ def pack(
         runtime=RUNTIME,
         early=content.early,
         known=content.known,
-        displacement=content.moved,
+        displacement=content.displacement,
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit, contacts.limit.why),
     )

@@ -83,13 +83,10 @@ def _packed_forms(
         graph = graphed.graph()
         precision = cost.precision(graph)
         if any(precision == entry["precision"] for entry in counted.values()):
-            continue  # nothing of it is in int8: it is its own float form
+            continue  # nothing in it is int8: both precisions are the same
         folder = work / precision
-        if form:  # early answers and novelty belong to the method itself
-            about = content.about | {"form": form}
-            pack.pack_to_measure(replace(content, model=graph, about=about, reference=None), folder)
-        else:
-            pack.pack_to_measure(content, folder)
+        about = content.about | ({"form": form} if form else {})
+        pack.pack_to_measure(replace(content, model=graph, about=about, reference=None), folder)
         counted[form] = {
             "form": form,
             "precision": precision,
@@ -107,7 +104,7 @@ def _packed_forms(
 
 def _save_torch(model: Any, train: Dataset, seed: int, folder: Path) -> None:
     """The network as TorchScript, which can be read without our code."""
-    import torch  # here: other forms need no PyTorch
+    import torch  # here: other models need no PyTorch
 
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore", DeprecationWarning)

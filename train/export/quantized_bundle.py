@@ -102,7 +102,7 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         model=bundle_graph(calibration, fit.trunk(), prefixes),
         early=rule.early,
         known=calibration.known(),
-        moved=calibration.displacement_rule(),
+        displacement=calibration.displacement_rule(),
         classes=calibration.classes(),
         about=content.about | {"early": early},
         figures=content.figures | figures,

@@ -1,8 +1,8 @@
 """Signing of a bundle with a key and a counter.
 
 The box refuses a bundle whose counter is not above that of every bundle it has committed, so that
-an old bundle cannot be installed again, even with a valid signature. The signer chooses the counter:
-number your deliveries, from 1.
+an old bundle cannot be installed again, even with a valid signature. The signer chooses the
+counter: number your deliveries, from 1.
 """
 
 from __future__ import annotations

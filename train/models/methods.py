@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.signal import features
-from train.data.progress import spoken as spoken  # the trainings say it, too
+from train.data.progress import spoken as spoken  # for trainings
 from train.data.sets import Dataset
 from train.features import kinds
 

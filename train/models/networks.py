@@ -75,10 +75,8 @@ class Network(nn.Module, ABC):
         The trained logits are shifted to sum to 0, which changes no softmax; ABSENT lies far below
         the largest of them.
         """
-        old, new = (
-            self.head,
-            nn.utils.skip_init(nn.Linear, self.head.in_features, classes),
-        )  # draws no random numbers
+        old = self.head
+        new = nn.utils.skip_init(nn.Linear, old.in_features, classes)  # draws no random numbers
         new.weight.zero_()
         new.bias.fill_(ABSENT)
         new.weight[present] = (old.weight - old.weight.mean(0)) / temperature

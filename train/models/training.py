@@ -120,9 +120,8 @@ def deterministic_device(seed: int) -> Iterator[str]:
 
     It computes the same bits each time, and no random state outside is changed.
     """
-    exact = torch.backends.cudnn.flags(
-        enabled=True, deterministic=True, allow_tf32=False
-    )  # float32 means float32
+    # without TF32, which rounds the factors of products in float32
+    exact = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)
     with one_thread(), exact, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         yield "cuda" if torch.cuda.is_available() else "cpu"

@@ -369,7 +369,10 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
     """Sweeps beyond the full scale count as saturated, which export reports before a robot meets
     it."""
-    refused = r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: \d+ saturated\. .* --full-scale$"
+    refused = (
+        r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: "
+        r"\d+ saturated\. .* --full-scale$"
+    )
     with pytest.raises(ExportRefused, match=refused):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
 
@@ -379,7 +382,10 @@ def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
 ):
     """The message has their number, the limit, and the distance beyond which a sweep is unknown."""
     monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
-    told = r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance \d[\d.]*\); record more positions"
+    told = (
+        r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance "
+        r"\d[\d.]*\); record more positions"
+    )
     with pytest.raises(ExportRefused, match=told):
         quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "")
 

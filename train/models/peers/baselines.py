@@ -197,9 +197,8 @@ def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:
         folds = []
         n = min(FOLDS, len(np.unique(group)), np.bincount(sweeps.labels).max())
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", UserWarning
-            )  # of a material with fewer sweeps than folds
+            # of a material with fewer sweeps than folds
+            warnings.simplefilter("ignore", UserWarning)
             splits = StratifiedGroupKFold(n).split(group, sweeps.labels, group) if n > 1 else ()
             for train, test in splits:
                 test = test[np.isin(sweeps.labels[test], sweeps.labels[train])]
@@ -252,9 +251,8 @@ def _converted(g: GraphBuilder, estimator: Estimator, features: str, size: int) 
     *before, last = steps
     options: dict[str, Any]
     if votes := isinstance(last, KNeighborsClassifier):
-        options = {
-            "optim": "cdist"
-        }  # skl2onnx's default distances are a loop over all sweeps, twelve times as slow
+        # skl2onnx's default distances are a loop over all sweeps, twelve times as slow
+        options = {"optim": "cdist"}
     else:
         # skl2onnx's votes are thousands of nodes for 36 classes
         last = copy(last).set_params(decision_function_shape="ovo")

@@ -109,7 +109,7 @@ def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> 
     rows: 1 if the taxels stand in a line, which is not displaced. x: prepared sweeps (see
     `Network.prepare`); it is not changed.
     """
-    x = _attached(x, rows, augmentation, rng)  # new memory: what follows may write to it
+    x = _attached(x, rows, augmentation, rng)  # new memory, which may be written to
     for change in (_stretched, _filtered, _disturbed, _clipped):
         x = change(x, augmentation, rng)
     return x
@@ -170,9 +170,8 @@ def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
         damped = _chosen(augmentation.damped, rng, n, 1)
         passed = np.where(damped, 1 / np.sqrt(1 + (frequency / cut) ** 2), passed)
     if augmentation.colour:
-        octave = -np.log2(
-            np.maximum(frequency, frequency[1])
-        )  # from the highest frequency downwards
+        # in octaves below the highest frequency
+        octave = -np.log2(np.maximum(frequency, frequency[1]))
         knot = octave.astype(np.int64)
         log_gain = augmentation.colour * _normal(rng, n, int(knot.max()) + 2)
         passed *= np.exp(_lerp(log_gain[:, knot], log_gain[:, knot + 1], octave % 1))
@@ -218,9 +217,8 @@ def _clipped(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
 def _white_noise(rng: Generator, n: int, taxels: int, frames: int) -> Array:
     """White noise [n, taxels, frames] from pieces of one draw, because separate draws would take
     longer than everything else."""
-    distance, angle = _uniform(
-        rng, 2, (PIECES + frames + 1) // 2
-    )  # Box and Muller 1958: NumPy's own takes three times as long
+    # Box and Muller 1958: NumPy's own method takes three times as long
+    distance, angle = _uniform(rng, 2, (PIECES + frames + 1) // 2)
     distance, angle = np.sqrt(-2 * np.log1p(-distance)), 2 * pi * angle
     source = np.concatenate([distance * np.cos(angle), distance * np.sin(angle)])
     pieces: Array = sliding_window_view(source, frames)[rng.integers(0, PIECES, (n, taxels))]

@@ -209,8 +209,7 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
     )
     taps = g("Mul", *(g("Cast", x, to=TensorProto.INT64) for x in factors))
     taps = g("Cast", taps, to=TensorProto.INT8)
-    # with the scale of the counts in it, as int8 needs it; for floats the same product is computed
-    # beforehand
+    # the scale of the counts is a separate factor in int8, and part of the product in float
     unit = bank.unit if int8 else bank.unit * step
     return g(
         "DequantizeLinear", taps, g.constant(unit), g.constant(np.zeros(len(bank)), "int8"), axis=0
@@ -250,9 +249,8 @@ def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
     at = g("Range", *(g.constant(n, "int32") for n in (0, len(bank), 1)))
     own = g("Not", g("Less", at, g.constant(np.append(0, ends[:-1])[:, None], "int32")))
     own = g("And", own, g("Less", at, g.constant(ends, "int32")))
-    factors = g.constant(
-        1 / np.maximum(counts, 1)[:, :, None]
-    )  # where nothing is known the sum is 0 as well
+    # without a known response the sum is 0 as well
+    factors = g.constant(1 / np.maximum(counts, 1)[:, :, None])
     return g("Mul", g("Cast", own, to=FLOAT), factors)
 
 

@@ -188,8 +188,8 @@ class CalibrationInputs:
 
 
 def fit_calibration(given: CalibrationInputs) -> Calibration:
-    """Raises FormatError as novelty.embed, and if there is only one group or no sweep to judge
-    by."""
+    """The calibration that is fitted to these features. Raises FormatError as novelty.embed, and if
+    there is only one group or no sweep to judge by."""
     whole, labels, groups = given.whole, given.labels, given.groups
     logits, numbers, class_mean_temperature = _held_out_logits(given)
     temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups[numbers])

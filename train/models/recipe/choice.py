@@ -179,7 +179,7 @@ class FeatureColumns:
         """The columns of a trunk with this graph.layout; free: bool [n], of its filters."""
         magnitudes, shares, levels, bands = (
             np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
-            for name in ("sizes", "shares", "levels", "bands")
+            for name in ("magnitudes", "shares", "levels", "bands")
         )
         kinds = tuple(np.flatnonzero(free == kind) for kind in np.unique(free))
         return cls(magnitudes, shares, kinds, levels, bands)

@@ -119,7 +119,7 @@ def pooled(
     changes, older = (
         g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older)
     )
-    if prefixes:  # each tenth has means of its own
+    if prefixes:  # each prefix has its own means
         changes = g("Expand", changes, g.constant([PREFIXES, looked.steps, taxels], "int64"))
     about = g(
         "Sub",
@@ -127,8 +127,8 @@ def pooled(
         g("Mul", total(older), graph_builder.mean_factors(g, 1.0, counts, taxels, prefixes)),
     )
     y = g("Transpose", graph_builder.side_by_side(g, [about, changes]), perm=[0, 2, 1])
-    # a level is compared with a whole row of frames, which is four times as fast as a frame with a
-    # row of levels
+    # comparing a level with a whole row of frames is four times as fast as comparing a frame with
+    # a row of levels
     levels = some.levels.reshape(SIGNALS * taxels, -1, 1) / step
     above = g("Greater", g("Reshape", y, g.constant([0, 0, 1, -1], "int64")), g.constant(levels))
     above = g(

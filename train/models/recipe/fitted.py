@@ -106,7 +106,7 @@ class Fit:
 
         from train.models.recipe.stages import Compact
 
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and overwritten
+        with torch.random.fork_rng(devices=[]):  # its first weights are drawn and overwritten
             format, classes = self.train.format, len(self.train.materials)
             model = Compact(format, classes, self.scale, False, self.keep_means, self.architecture)
         state = {

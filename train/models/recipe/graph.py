@@ -98,12 +98,12 @@ def layout(
     architecture: Architecture,
     keep_means: bool = False,
 ) -> dict[str, slice]:
-    """Where the features of each part of a trunk are: `stages`, `sizes` and `shares` of the bank,
-    `levels` of the distribution, `means`, `bands`."""
+    """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
+    bank, `levels` of the distribution, `means`, `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
-        "sizes": filters,
+        "magnitudes": filters,
         "shares": filters * (architecture.pools > 1),
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "means": keep_means * format.channels,
@@ -183,7 +183,7 @@ class _TrunkNodes:
         g, taxels = self.g, self.prepared(self._own)
         x = taxels.x
         if taxels.rounded:
-            # whole numbers, whose sums are exact in floats: all machines find the same frames
+            # sums of whole numbers are exact in floats, so all machines find the same frames
             # above a level
             x = graph_builder.channels_first(g, taxels.rounded, 1.0, taxels.zero)
         levels, int8 = distribution.Levels.of(weights), self._own is not None

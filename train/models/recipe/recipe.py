@@ -110,8 +110,9 @@ class Trunk:
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that the steps of a fit share. out: bool [N], the sweeps of some values of the
-    group `by`, on which stages are not trained; `by` is "nothing" if there are too few groups."""
+    """Everything that the steps of a fit share. out: bool [N], the held-out sweeps, of some values
+    of the group `by`, on which stages are not trained; `by` is "nothing" if there are too few
+    groups."""
 
     sweeps: Dataset
     seed: int
@@ -165,8 +166,8 @@ class Setup:
         return HeldOutScores([data] * len(parts), parts, classes, copied)
 
     def part(self, number: int) -> Log:
-        """The log of one part of the fit. The third part, the stages, takes most of the time, and
-        is left out if the first two suffice."""
+        """The log of one part of the fit. The third part, the stages, takes most of the time; it is
+        left out if the first two suffice."""
         return lambda line: self.log(f"part {number} of {3 if self.may_train else 2}, {line}")
 
 
@@ -270,7 +271,9 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
     size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
     filters, shares, levels, bands = (
         used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
-        for part in (layout.get(k, slice(0, 0)) for k in ("sizes", "shares", "levels", "bands"))
+        for part in (
+            layout.get(k, slice(0, 0)) for k in ("magnitudes", "shares", "levels", "bands")
+        )
     )
     architecture = replace(
         stages.architecture if stages else fixed.architecture,

@@ -1,8 +1,8 @@
 """The spectrum that all taxels share: log band powers, in PyTorch and as ONNX nodes.
 
-These are fixed features beside the learned ones. Training discards features that do not separate the
-training materials; it overfits, and its features hardly show that a material is unknown. Here the
-mean of the taxels over the grid, for each axis, is cut into tenths of the window. The power in
+These are fixed features beside the learned ones. Training discards features that do not separate
+the training materials; it overfits, and its features hardly show that a material is unknown. Here
+the mean of the taxels over the grid, for each axis, is cut into tenths of the window. The power in
 bands of each tenth's spectrum (Welch 1967) is a feature, as a logarithm. Each tenth is processed by
 itself, so that offsets and later frames do not matter; the hum of the mains is removed.
 """

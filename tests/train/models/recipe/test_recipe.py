@@ -282,8 +282,10 @@ def test_filters_need_no_pytorch(tmp_path: Path):
         "util.find_spec = lambda name, *args: None if name == 'torch' else found(name, *args)\n"
         "builtins.__import__ = gone\n"
         "from train.cli.main import main\n"
-        f"code = main(['fit', '--set', {str(tmp_path / 'easy.npz')!r}, '--seed', '1', '--steps', '0', '--out', {str(tmp_path / 'f.npz')!r}])\n"
-        f"sys.exit(code or main(['export', {str(tmp_path / 'f.npz')!r}, '--out', {str(tmp_path / 'b')!r}, '--name', 'b', '--version', '1']))"
+        f"sweeps, fit, bundle = {[str(tmp_path / name) for name in ('easy.npz', 'f.npz', 'b')]}\n"
+        "code = main(['fit', '--set', sweeps, '--seed', '1', '--steps', '0', '--out', fit])\n"
+        "args = ['--out', bundle, '--name', 'b', '--version', '1']\n"
+        "sys.exit(code or main(['export', fit, *args]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False

@@ -203,7 +203,8 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     replace(fitted, architecture=ARCHITECTURES["1k"]).save(tmp_path / "fit.npz")
     with pytest.raises(
         FormatError,
-        match=r"^fit.npz: its weights are not those of its Architecture\(channels=\(2, 6, 8\).*; fit again$",
+        match=r"^fit.npz: its weights are not those of its Architecture"
+        r"\(channels=\(2, 6, 8\).*; fit again$",
     ):
         Fit.load(tmp_path / "fit.npz")
     with np.load(tmp_path / "fit.npz") as z:
