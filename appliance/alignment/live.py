@@ -33,15 +33,18 @@ SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What is known of the skin beforehand. bundle: the one that fits it, in words. contact: its
-    threshold, in counts, and place: its positions in training, both None without such a bundle, or
-    where it does not know them. unloaded: counts [R, C] along the normal that an unloaded skin
-    gives by the bundle; 0 without. fingertip: setting `skin.fingertip`."""
+    """The skin as the bundle describes it.
+
+    bundle: name, version and id of a bundle with the skin's format, or NO_BUNDLE. threshold: of
+    contact, raw counts. contact: contact positions in training. Both are None without a bundle,
+    and where the bundle does not have them. unloaded: raw counts [R, C] of the unloaded skin along
+    the normal; 0 without a bundle. fingertip: setting `skin.fingertip`.
+    """
 
     format: SweepFormat
     bundle: str = NO_BUNDLE
-    contact: float | None = None
-    place: ContactPositions | None = None
+    threshold: float | None = None
+    contact: ContactPositions | None = None
     unloaded: NDArray[np.float64] | float = 0.0
     fingertip: str = ""
 
@@ -53,12 +56,12 @@ class Expected:
         return cls(m.format, named, m.thresholds.contact, m.contact, normal(m.tare, 0), fingertip)
 
     def json(self) -> dict[str, Any]:
-        """All but format and bundle, for the feed."""
-        place = asdict(self.place) if self.place else None
+        """All but format and bundle, under the keys of the feed (PROTOCOL.md, section 4)."""
+        contact = asdict(self.contact) if self.contact else None
         unloaded = np.asarray(self.unloaded).tolist()
         return {
-            "contact": self.contact,
-            "place": place,
+            "contact": self.threshold,
+            "place": contact,
             "unloaded": unloaded,
             "fingertip": self.fingertip,
         }
@@ -69,7 +72,7 @@ class Expected:
         ValueError or BundleError."""
         if not known:
             return cls(format, bundle or NO_BUNDLE)
-        place = typed(ContactPositions, known["place"]) if known["place"] else None
+        contact = typed(ContactPositions, known["place"]) if known["place"] else None
         unloaded = np.array(known["unloaded"], np.float64)
         if unloaded.shape not in ((), (format.rows, format.cols)):
             raise ValueError(f"unloaded counts of {unloaded.shape}")
@@ -77,7 +80,7 @@ class Expected:
             format,
             bundle or NO_BUNDLE,
             known["contact"],
-            place,
+            contact,
             unloaded,
             str(known["fingertip"]),
         )
@@ -104,13 +107,13 @@ class ContactTracker:
         """Start anew: this may be another skin than before."""
         self._latest = normal(Frames.empty(self._expected.format).taxels, 1)
         self._lowest = np.full(self._shape, np.inf)
-        self._full = SHOWN * abs(self._expected.contact or 0.1)
+        self._full = SHOWN * abs(self._expected.threshold or 0.1)
         self._unloaded.restart()
 
     def put(self, taxels: NDArray[Any]) -> None:
         """Take the newest frames, raw counts [n, R, C] or [n, R, C, A]."""
         self._latest = np.concatenate([self._latest, normal(taxels, 1)])[-self._span :]
-        if self._expected.contact is None:
+        if self._expected.threshold is None:
             self._unloaded.put(taxels)
 
     def view(self, skin: str, trouble: str) -> View:
@@ -119,28 +122,28 @@ class ContactTracker:
         self._number, self._skin = self._number + 1, skin
         if skin != "streaming":
             return self._view("no-skin", f"no skin: {skin}", trouble)
-        contact = self._expected.contact
-        if contact is None and self._unloaded.skin:
-            contact = self._unloaded.skin.contact
-        if len(self._latest) < self._span or contact is None:
+        threshold = self._expected.threshold
+        if threshold is None and self._unloaded.skin:
+            threshold = self._unloaded.skin.contact
+        if len(self._latest) < self._span or threshold is None:
             return self._view("wait", "reading the unloaded skin", "keep the finger off")
         self._lowest = np.fmin(self._lowest, self._latest.mean(axis=0, dtype=np.float64))
         load = self._latest.mean(axis=0, dtype=np.float64) - self._lowest
         load = np.where(np.isfinite(load), load, 0)  # a taxel of a floating-point skin may give NaN
         self._full = max(self._full, float(load.max()))
-        return self._touched(load, centre(self._latest, self._lowest, contact))
+        return self._touched(load, centre(self._latest, self._lowest, threshold))
 
     def _touched(self, load: NDArray[np.float64], found: Point | None) -> View:
         """The View of a streaming skin with this load [R, C], raw counts, and centre of contact
         (None: no contact)."""
-        place = self._expected.place
+        trained = self._expected.contact
         shown: dict[str, Any] = {
             "load": tuple(map(tuple, load.round(1).tolist())),
             "full": self._full,
         }
         lowest = self._lowest - self._expected.unloaded
         least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
-        if self._expected.contact is not None and least >= self._expected.contact:
+        if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
             hint = f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies on the skin"
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
@@ -148,22 +151,22 @@ class ContactTracker:
             return self._view(
                 "no-contact", "nothing touches the skin", "rest the finger on the tube", **shown
             )
-        if place is None:
+        if trained is None:
             hint = "this bundle does not say where the skin sat in training; export it again"
             if self._expected.bundle == NO_BUNDLE:
                 hint = "no bundle fits this skin, so there is no trained position; palpate record needs none"
-            elif self._expected.contact is None:
+            elif self._expected.threshold is None:
                 hint = "this bundle cannot tell contact, so it has no trained position; train one on sweeps of palpate record"
             return self._view(
                 "no-positions", "the contact's centre alone", hint, **shown, centre=found
             )
-        offset = place.offset(found)
-        at = found[0] * place.pitch_mm, found[1] * place.pitch_mm
+        offset = trained.offset(found)
+        at = found[0] * trained.pitch_mm, found[1] * trained.pitch_mm
         shown |= {"centre": at, "nearest": (at[0] - offset[0], at[1] - offset[1])}
-        if place.within(offset):
+        if trained.within(offset):
             away = f"{np.hypot(*offset):.1f} mm from the nearest trained position"
             return self._view(
-                "in-place", IN_PLACE, f"{away}; up to {place.limit_mm:.1f} mm is fine", **shown
+                "in-place", IN_PLACE, f"{away}; up to {trained.limit_mm:.1f} mm is fine", **shown
             )
         hint = "move the skin on the finger as far that way, then look again"
         return self._view("off", advice(offset, self._shape), hint, **shown)
@@ -179,7 +182,7 @@ class ContactTracker:
             message,
             hint,
             self._shape,
-            place=known.place,
+            contact=known.contact,
             fingertip=known.fingertip,
             **shown,
         )

@@ -153,7 +153,7 @@ class Canvas:
             self._put(
                 below, 1, f"centre: row {row:.1f}, column {col:.1f} {view.unit} from taxel 1.1"
             )
-        trained = f"   {self._signs[6]} where it was in training" if view.place else ""
+        trained = f"   {self._signs[6]} where it was in training" if view.contact else ""
         self._put(below + 1, 1, f"{self._signs[5]} the contact's centre{trained}   Ctrl-C ends")
         self._put(below + 2, 1, address)
 
@@ -195,8 +195,8 @@ class Canvas:
 
     def _positions(self) -> None:
         view = self._view
-        if view.place:
-            for position in zip(view.place.rows_mm, view.place.cols_mm, strict=True):
+        if view.contact:
+            for position in zip(view.contact.rows_mm, view.contact.cols_mm, strict=True):
                 self._put(*self._at(position), self._signs[6], BOLD)
         if view.centre:
             y, x = self._at(view.centre)
@@ -204,7 +204,7 @@ class Canvas:
 
     def _at(self, point: Point) -> tuple[int, int]:
         """Line and column of a point, at the grid's edge where it lies beyond it."""
-        pitch = self._view.place.pitch_mm if self._view.place else 1.0
+        pitch = self._view.contact.pitch_mm if self._view.contact else 1.0
         (high, wide), (rows, cols) = self._cell, self._view.shape
         row, col = (point[0] / pitch + 0.5) * high, (point[1] / pitch + 0.5) * wide
         return TOP + int(max(0, min(rows * high - 1, row))), LEFT + int(

@@ -32,7 +32,7 @@ class View:
     full: float = 1.0
     centre: Point | None = None
     nearest: Point | None = None
-    place: ContactPositions | None = None
+    contact: ContactPositions | None = None
     fingertip: str = ""
 
     @property
@@ -43,7 +43,7 @@ class View:
     @property
     def unit(self) -> str:
         """Unit of centre and nearest."""
-        return "mm" if self.place else "taxels"
+        return "mm" if self.contact else "taxels"
 
     def json(self) -> dict[str, Any]:
         """The View as the page reads it."""

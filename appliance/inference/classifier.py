@@ -141,7 +141,7 @@ class Classifier:
     def set_tare(self, taxels: NDArray[Any]) -> str:
         """Take the mean of frames [n, R, C] as the unloaded skin, for the checks of contact."""
         self.tare = taxels.mean(axis=0, dtype=np.float64)
-        return f"largest {self.tare.max():.1f} digits"
+        return f"largest {self.tare.max():.1f} raw counts"
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""

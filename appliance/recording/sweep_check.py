@@ -91,4 +91,4 @@ class SweepCheck(Observer):
     def set_tare(self, taxels: NDArray[Any]) -> str:
         """Take frames [n, R, C] as the unloaded skin."""
         self._unloaded.set(taxels)
-        return f"largest {taxels.mean(axis=0).max():.1f} digits"
+        return f"largest {taxels.mean(axis=0).max():.1f} raw counts"

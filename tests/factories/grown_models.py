@@ -15,7 +15,7 @@ from onnx import helper, numpy_helper
 
 from appliance.bundle.onnx_check import operators
 from appliance.bundle.onnx_check.operators import OPERATORS
-from appliance.bundle.onnx_check.shapes import PLACE, Call, Value
+from appliance.bundle.onnx_check.shapes import INDEX, Call, Value
 from appliance.core.errors import BundleError
 from appliance.core.types import SweepFormat
 
@@ -155,7 +155,7 @@ class Sprout:
         depends = any(x.depends_on_sweep for x in inputs)
         for name, (kind, shape) in zip(made, outs, strict=True):
             self.known[name] = Value(
-                "int64" if kind == PLACE else kind, shape, None, depends, kind == PLACE
+                "int64" if kind == INDEX else kind, shape, None, depends, kind == INDEX
             )
         return True
 

@@ -17,9 +17,9 @@ from appliance.bundle.onnx_check import operators, reader
 from appliance.bundle.onnx_check.operators import OPERATORS
 from appliance.bundle.onnx_check.reader import Message
 from appliance.bundle.onnx_check.shapes import (
+    INDEX,
     KINDS,
     MOST_RANK,
-    PLACE,
     Call,
     Out,
     Shape,
@@ -265,7 +265,7 @@ def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
     need(len(node.output) == len(outs), f"it has {len(node.output)} outputs instead of {len(outs)}")
     depends = any(x.depends_on_sweep for x in inputs)
     made = [
-        Value("int64" if kind == PLACE else kind, shape, None, depends, kind == PLACE)
+        Value("int64" if kind == INDEX else kind, shape, None, depends, kind == INDEX)
         for kind, shape in outs
     ]
     for name, value in zip(node.output, made, strict=True):

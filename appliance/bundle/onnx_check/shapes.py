@@ -33,7 +33,7 @@ MOST_WINDOW_RANK = 3
 """Dimensions of a convolution or a pool, besides samples and channels."""
 MOST_STEP = 1 << 16
 """Largest stride, dilation and kernel."""
-PLACE = "place"
+INDEX = "index"
 """Type of an output that is an int64 and numbers a place, so is never negative: onnxruntime does
 not check it everywhere."""
 
@@ -50,7 +50,7 @@ class Value:
     shape: Shape
     numbers: NDArray[Any] | None = None
     depends_on_sweep: bool = False
-    place: bool = False
+    index: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ def _without(shape: Shape, gone: Sequence[int], kept: bool) -> Shape:
 def highest(call: Call) -> Out:
     """ArgMax."""
     shape = call.inputs[0].shape
-    return PLACE, _without(shape, [call.axis(len(shape), 0)], call.flag("keepdims", 1))
+    return INDEX, _without(shape, [call.axis(len(shape), 0)], call.flag("keepdims", 1))
 
 
 def top(call: Call) -> list[Out]:
@@ -200,7 +200,7 @@ def top(call: Call) -> list[Out]:
     call.flag("largest", 1), call.flag("sorted", 1)
     need(len(k) == 1 and 1 <= k[0] <= shape[axis], f"{k} of {shape[axis]} cannot be chosen")
     shape[axis] = k[0]
-    return [("float32", tuple(shape)), (PLACE, tuple(shape))]
+    return [("float32", tuple(shape)), (INDEX, tuple(shape))]
 
 
 def concat(call: Call) -> Out:
@@ -244,7 +244,8 @@ def _within(at: Value, size: int) -> None:
     """Where the places are constants: each is there. Else onnxruntime looks, sweep by sweep."""
     if at.numbers is not None:
         need(
-            bool(-size <= at.numbers.min() and at.numbers.max() < size), f"a place is out of {size}"
+            bool(-size <= at.numbers.min() and at.numbers.max() < size),
+            f"an index is out of {size}",
         )
 
 
@@ -261,7 +262,7 @@ def scatter(call: Call) -> Out:
     _beside(call, x, at)
     need(
         new.shape == at.shape and new.kind == x.kind,
-        "places and what is put there differ in shape or type",
+        "indices and updates differ in shape or type",
     )
     need(call.given.get("reduction", b"none") in (b"none", b"add"), "reduction must be none or add")
     return x.kind, x.shape
@@ -273,14 +274,14 @@ def _beside(call: Call, x: Value, at: Value) -> None:
     fits = len(x.shape) == len(at.shape) and all(
         i == axis or a <= n for i, (a, n) in enumerate(zip(at.shape, x.shape, strict=True))
     )
-    need(fits, f"places of {list(at.shape)} do not fit {list(x.shape)}")
+    need(fits, f"indices of {list(at.shape)} do not fit {list(x.shape)}")
     _within(at, x.shape[axis])
 
 
 def extract(call: Call) -> Out:
     """ArrayFeatureExtractor: onnxruntime reads before the array where a place is negative."""
     x, at = call.inputs
-    need(at.place, "places must come from TopK or ArgMax")
+    need(at.index, "indices must come from TopK or ArgMax")
     need(x.shape != (), "nothing to choose from")
     return x.kind, (*(x.shape[:-1] or (1,)), prod(at.shape))
 
@@ -311,7 +312,7 @@ def flatten(call: Call) -> Out:
 
 
 def _as(x: Value) -> str:
-    return PLACE if x.place else x.kind
+    return INDEX if x.index else x.kind
 
 
 def unsqueeze(call: Call) -> Out:

@@ -38,7 +38,7 @@ export class SkinPicture {
   constructor(parent) { this.parent = parent; this.form = ""; }
 
   show(view) {
-    const form = JSON.stringify([view.shape, view.place, view.fingertip]);
+    const form = JSON.stringify([view.shape, view.contact, view.fingertip]);
     if (form !== this.form) {
       this.parent.replaceChildren();
       this.build(view);
@@ -55,9 +55,9 @@ export class SkinPicture {
     this.centre.style.visibility = view.centre ? "visible" : "hidden";
     this.way.style.visibility = "hidden";
     if (!view.centre) return;
-    const [x, y] = at(view.centre, view.place);
+    const [x, y] = at(view.centre, view.contact);
     this.centre.style.transform = `translate(${x}px, ${y}px) scale(${this.big})`;
-    if (view.state === "off") this.pointOut(...at(view.nearest, view.place), x, y);
+    if (view.state === "off") this.pointOut(...at(view.nearest, view.contact), x, y);
   }
 
   build(view) {
@@ -85,7 +85,7 @@ export class SkinPicture {
     for (let c = 0; c < cols; c++) {
       if (named(c, cols)) element("text", {class: "name", x: (c + 0.5) * TAXEL, y: -RIM - 11 * big}, svg, most > NUMBERED ? c + 1 : `column ${c + 1}`);
     }
-    if (view.place) drawPlace(svg, view.place);
+    if (view.contact) drawTrained(svg, view.contact);
     this.way = element("g", {id: "way"}, svg);
     for (const name of ["edge", "line"]) element("path", {class: name}, this.way);
     this.centre = element("g", {id: "centre"}, svg);
@@ -107,7 +107,7 @@ export class SkinPicture {
 /* The same way as an angle from upwards, clockwise, in degrees; null where the skin need not be moved. */
 export function wayBack(view) {
   if (view.state !== "off") return null;
-  const [dx, dy] = direction(...at(view.nearest, view.place), ...at(view.centre, view.place));
+  const [dx, dy] = direction(...at(view.nearest, view.contact), ...at(view.centre, view.contact));
   return Math.atan2(dx, -dy) * 180 / Math.PI;
 }
 
@@ -117,14 +117,14 @@ function direction(x0, y0, x, y) {
 }
 
 /* From the box's coordinates (mm, or taxels where it knows no mm; row, column) to the picture's (x, y). */
-function at(point, place) {
-  const pitch = place ? place.pitch_mm : 1;
+function at(point, contact) {
+  const pitch = contact ? contact.pitch_mm : 1;
   return [(point[1] / pitch + 0.5) * TAXEL, (point[0] / pitch + 0.5) * TAXEL];
 }
 
-function drawPlace(svg, place) {
-  const {rows_mm, cols_mm, limit_mm, pitch_mm} = place, halo = element("g", {id: "halo"}, svg);
-  const spots = rows_mm.map((mm, i) => at([mm, cols_mm[i]], place));
+function drawTrained(svg, contact) {
+  const {rows_mm, cols_mm, limit_mm, pitch_mm} = contact, halo = element("g", {id: "halo"}, svg);
+  const spots = rows_mm.map((mm, i) => at([mm, cols_mm[i]], contact));
   for (const [x, y] of spots) element("circle", {class: "halo", cx: x, cy: y, r: (limit_mm / pitch_mm) * TAXEL}, halo);
   for (const [x, y] of spots) element("circle", {class: "trained", cx: x, cy: y, r: 3.5}, svg);
 }

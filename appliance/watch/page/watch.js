@@ -136,13 +136,13 @@ function drawWords() {
   }
   put("message", (view.state === "in-place" ? "✓ " : "") + view.message.replace(/ (?=mm|\d)/g, "\u00a0"));
   put("hint", view.hint);
-  const unit = view.place ? "mm" : "taxels", turned = wayBack(view);
+  const unit = view.contact ? "mm" : "taxels", turned = wayBack(view);
   put("figures", view.centre ? `centre: row ${view.centre[0].toFixed(1)}, column ${view.centre[1].toFixed(1)} ${unit} from taxel 1.1` : "");
   byId("push").toggleAttribute("hidden", turned === null);
   byId("push").firstElementChild.setAttribute("transform", `rotate(${turned ?? 0})`);
   byId("where").hidden = Boolean(view.fingertip) || !view.load.length;
   byId("key").hidden = false;
-  for (const name of ["t", "h"]) byId("key").querySelector("." + name).hidden = !view.place;
+  for (const name of ["t", "h"]) byId("key").querySelector("." + name).hidden = !view.contact;
   const text = `${view.message}. ${view.hint}`;
   if (byId("spoken").textContent !== text && performance.now() - spokenAt > SPOKEN_MS) {
     spokenAt = performance.now();

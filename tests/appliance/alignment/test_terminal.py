@@ -182,7 +182,7 @@ def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
     ]
     last = [v for v in seen if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert (last.bundle, last.place, last.unit) == ("none for this skin", None, "taxels")
+    assert (last.bundle, last.contact, last.unit) == ("none for this skin", None, "taxels")
     assert "no bundle fits this skin" in last.hint
 
 
@@ -330,7 +330,7 @@ def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
 
 def test_a_place_beside_the_skin_is_shown_at_its_edge():
     """However far it is: a bundle may name any number."""
-    far = replace(VIEW, place=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
+    far = replace(VIEW, contact=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
     lines = Canvas(far, ASCII, 80, 24, "").lines(False)
     assert [
         line.index("+")

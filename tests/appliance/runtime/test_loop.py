@@ -312,7 +312,7 @@ def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
     assert "SIM0001" in box.ask("$PPLP,ID")
     assert ",streaming,0,0," in box.ask("$PPLP,STATE")
     assert ",TEST,ok," in box.ask("$PPLP,TEST")
-    assert ",TARE,ok,largest 0.0 digits" in box.ask("$PPLP,TARE")
+    assert ",TARE,ok,largest 0.0 raw counts" in box.ask("$PPLP,TARE")
     assert ",NEW,ok" in box.ask("$PPLP,NEW")
     assert ",ABORT,error,no sweep is open" in box.ask("$PPLP,ABORT")
     labels = default_bundle.manifest.labels

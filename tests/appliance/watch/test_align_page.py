@@ -154,7 +154,7 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
             number=10,
             shape=(2, 3),
             load=((1.0, 2, 3),) * 2,
-            place=None,
+            contact=None,
             state="no-positions",
             nearest=None,
             centre=(0.5, 1.0),
