@@ -70,8 +70,8 @@ def main() -> int:
 
 
 class CrashPointLog:
-    """Points by their moments; one line of a file each, under a first line that says what was cut,
-    where."""
+    """Points by their moments. Each is a line of a file; the first line names the program and the
+    machine."""
 
     def __init__(self, path: Path) -> None:
         self._path, head = path, json.dumps(_head())
@@ -99,7 +99,7 @@ def _point(reported: dict[str, Any]) -> CrashPoint:
 
 
 def _head() -> dict[str, str]:
-    """What was cut: the commit, a digest of what is really there, the machine."""
+    """The program that was cut: its commit, a digest of its files, and the machine."""
     git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     sources = (tree.read(ROOT / folder) for folder in ("appliance", "tests/cuts"))

@@ -1,5 +1,5 @@
-"""The black box, cut short. In: a program that keeps the last sweeps in service. Out: a scene,
-whose judge finds what is lost of these beyond the sweep in progress.
+"""The black box, cut short. A program keeps the last sweeps in service; the judge of the scene
+finds every lost sweep except the sweep in progress.
 
 `python -m tests.cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each
 sweep when it is kept.
@@ -34,7 +34,7 @@ def keep(folder: Path) -> None:
 
 
 def judge(found: Found) -> list[str]:
-    """What is wrong with the sweeps that were found, and with what the next run makes of them."""
+    """Faults of the sweeps that were found, and of the next run in their folder."""
     folder = found.folder / recording.KEPT
     wrong, there = recording.read(folder)
     last = sorted(there.keys() | KEPT.findall(found.heard))[-MOST:]
@@ -43,7 +43,7 @@ def judge(found: Found) -> list[str]:
 
 
 def _goes_on(folder: Path, last: str) -> list[str]:
-    """What the next run does wrong in the folder. last: the newest sweep there."""
+    """Faults of the next run in the folder. last: the newest sweep there."""
     with log_lines.collected() as wrong:
         box = BlackBox(folder, recording.SHORT, MOST)
         for number in (1, 2):
@@ -57,7 +57,7 @@ def _goes_on(folder: Path, last: str) -> list[str]:
 
 
 def scene() -> CutScene:
-    """Two runs that keep sweeps, the second one in what the first has left."""
+    """Two runs that keep sweeps; the second continues in the folder of the first."""
 
     def step(name: str) -> SceneStep:
         return SceneStep(

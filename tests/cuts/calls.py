@@ -38,9 +38,10 @@ class NotFollowed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SystemCall:
-    """One system call. nth: which one of its name in its process, from 1, as strace counts. paths:
-    what it is about, absolute. data: what it writes, or where a symlink leads. words: its arguments
-    as strace shows them. result: None where the process was killed in it.
+    """One system call. nth: its number among the calls of that name in its process, from 1, as
+    strace counts. paths: its files, absolute. data: the bytes that it writes, or the target of a
+    symlink. words: its arguments as strace shows them. result: None where the process was killed in
+    it.
     """
 
     process: int
@@ -88,7 +89,7 @@ def run(
 ) -> TracedRun:
     """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
 
-    env: what is added to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
+    env: variables to add to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
     """
     how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
     done = subprocess.run(
@@ -127,8 +128,8 @@ def run(
 
 
 def output(call: SystemCall) -> str:
-    """What the command writes to standard output or standard error by this call; its children do
-    not count."""
+    """The text that the command writes to standard output or standard error by this call; its
+    children do not count."""
     heard = (
         call.process == 0
         and call.name in ("write", "writev")

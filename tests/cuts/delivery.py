@@ -1,6 +1,6 @@
 """Delivery and enrolment, cut short. In: signed bundles that are copied to the box, taken, started,
 committed and left again, and labels that it learns. Out: scenes, whose judge finds each box that
-does not come back with the old bundle or the new one, whole.
+does not come back with either the old or the new bundle, whole.
 
 `python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is
 wrong on purpose.
@@ -66,8 +66,8 @@ syncs nothing."""
 
 @dataclass(frozen=True, slots=True)
 class Shop:
-    """What the box gets, in a folder beside it: bundles of these NAMES, one counter higher each,
-    signed by one key. There lies its own key for enrolments, too."""
+    """The bundles for the box, in a folder beside it: these NAMES, each with the next counter,
+    signed by one key. The box's key for enrolments lies there, too."""
 
     folder: Path
 
@@ -113,8 +113,8 @@ class Shop:
         return SceneStep(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
     def steps(self) -> Iterator[tuple[str, SceneStep]]:
-        """What happens to a box; before each command, which bundles may run if that is cut
-        short."""
+        """The commands that a box runs; before each, the bundles that may run if that command is
+        cut short."""
         do = self.palpate
         yield "packaged", self.copy("first")
         yield "packaged first", do("install the first ever", "bundles", "install", "@first")
@@ -145,7 +145,7 @@ class Shop:
         yield "fifth", do("commit it by hand", "bundles", "commit")
 
     def scene(self) -> CutScene:
-        """All steps, each command of which is cut short."""
+        """All steps; each of their commands is cut short."""
         return self._scene("delivery", _bare, list(self.steps()))
 
     def enrolment(self) -> CutScene:
@@ -243,7 +243,7 @@ class Shop:
                 raise NotFollowed(f"{words[0]} ended with {code}: {_end(output)}")
 
     def _comes_back(self, folder: Path, ids: set[str]) -> list[str]:
-        """What is wrong with the box when it starts twice."""
+        """Faults of the box when it starts twice."""
         return [
             wrong
             for time in ("first", "second")
@@ -260,7 +260,7 @@ class Shop:
         return []
 
     def _takes_another(self, folder: Path, last: str) -> list[str]:
-        """What is wrong with the box when the last bundle is delivered and committed."""
+        """Faults of the box when the last bundle is delivered and committed."""
         again = folder / INCOMING / "again"
         shutil.copytree(self.at("last"), again)
         code, output = _apart(self.words(folder, "bundles", "install", again))
@@ -311,7 +311,8 @@ def _apart(words: list[str]) -> tuple[int, str]:
 
 
 def _signs(args: argparse.Namespace, settings: Config) -> EnrolmentKey:
-    """What a simulated skin taught is signed as what a real one did; the box itself refuses to."""
+    """A label enrolled with a simulated skin is signed as with a real skin; the box itself refuses
+    that."""
     return EnrolmentKey(settings.store.enrolment_key)
 
 

@@ -1,13 +1,12 @@
-"""A disk that keeps for certain only what was synced. In: a folder, and the calls that change it.
-Out: all the folders that may be found when the power comes back.
+"""A disk that keeps only synced data for certain. In: a folder, and the calls that change it. Out:
+all the folders that may be found when the power comes back.
 
-What a program has written is on the disk for sure only once it was synced: a file's content by an
-fsync of the file, a name (new, moved, gone) by an fsync of the folder it stands in. As long as it
-was not, it may be there or not:
+Data is on the disk for certain only after a sync: a file's content after an fsync of the file, a
+name (new, moved, gone) after an fsync of its folder. Before that it may be there or not:
 
 - names: those of one folder are kept in their order; those of different folders in any order. A rename is never half
   done, also from folder to folder, and a folder's fsync takes with it whatever had to happen before.
-- contents: all of it, what was last synced, nothing, the first half, or as many zeros; each file by itself, too.
+- contents: all of it, the last synced content, nothing, the first half, or as many zeros; each file by itself, too.
 
 That is less than ext4 promises (there a sync of one file takes all earlier names with it), and
 about what POSIX does. A symlink leads where it leads as soon as its name is there. Modes and owners
@@ -60,7 +59,8 @@ Change = tuple[tuple[Folder, str, Inode | None], ...]
 
 
 class Disk:
-    """`folder`, of which `there` is on the disk; what `effect` gives then happens to it.
+    """A `folder`, and the part of it that is on the disk (`there`); then the change of `effect`
+    happens.
 
     apart: paths that do not matter: their contents are not varied.
     """
@@ -87,7 +87,8 @@ class Disk:
                 effect()
 
     def effect(self, call: SystemCall) -> Callable[[], None] | None:
-        """What this call does to the folder; None for nothing. Raises NotFollowed."""
+        """The change that this call makes to the folder; None without a change. Raises
+        NotFollowed."""
         if call.result is None or call.result < 0:
             return None
         if call.name == "sync":
@@ -194,8 +195,8 @@ class Disk:
     def _find(
         self, path: str, follow: bool = False, depth: int = 0
     ) -> tuple[Folder, str, Inode | None]:
-        """The folder that `path` stands in, its name there, and what it is. Symlinks on the way are
-        followed; at its end only where that is wanted.
+        """The folder of `path`, its name there, and its entry. Symlinks on the way are followed; at
+        its end only where that is wanted.
         """
         if depth > 40 or not self._inside(path):
             raise NotFollowed(f"{path} leads out of {self._path}")
@@ -319,7 +320,7 @@ def _overlay(changes: list[Change] | tuple[Change, ...]) -> dict[int, dict[str, 
 def _walk(
     folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = ""
 ) -> Iterator[tuple[str, Inode]]:
-    """Paths and inodes below a folder: its synced names, and what lies over them."""
+    """Paths and inodes below a folder: its synced names, and the changes since."""
     for name, inode in sorted(
         {**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]
     ):

@@ -1,8 +1,8 @@
-"""Recording, cut short. In: programs that record sweeps, that of the box and some that are wrong on
-purpose. Out: scenes, whose judge finds what is lost beyond the sweep in progress.
+"""Recording, cut short. In: programs that record sweeps, the box's program and some that are wrong
+on purpose. Out: scenes, whose judge finds every lost sweep except the sweep in progress.
 
-`python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it goes on in the folder,
-says what a robot would hear, and which sweep it is asked to discard.
+`python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it continues in the folder,
+and prints the sentences for a robot and the sweep that it is asked to discard.
 """
 
 from __future__ import annotations
@@ -73,8 +73,7 @@ def taken(number: int, format: SweepFormat) -> tuple[Sweep, Verdict]:
 def _aside(
     files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]
 ) -> None:
-    """Write all files aside, then give them their names; settle: what is done with each name
-    then."""
+    """Write all files aside, then give them their names; settle: called with each name then."""
     for path, data in files.items():
         write(path.with_name(path.name + storage.PART), data)
     for path in files:
@@ -109,8 +108,7 @@ that."""
 
 
 def judge(format: SweepFormat, found: Found) -> list[str]:
-    """What is wrong with the sweeps of this form that were found, and with what the next run makes
-    of them."""
+    """Faults of the sweeps that were found in this layout, and of the next run in their folder."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
     owed, gone = reported(found.heard)
@@ -139,8 +137,8 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
-    """What a robot has heard: session and number of the sweeps that are stored, and of the
-    discarded ones. What is being discarded is neither.
+    """The reports to a robot: session and number of the stored sweeps, and of the discarded sweeps.
+    A sweep that is being discarded is in neither.
     """
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
@@ -156,7 +154,7 @@ def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _goes_on(folder: Path, format: SweepFormat) -> list[str]:
-    """What the next run does wrong in the folder."""
+    """Faults of the next run in the folder."""
     before = {path: path.read_bytes() for path in folder.glob("*.npy")}
     running = recording(folder, format, "later", lambda line: None)
     for number in (1, 2):
@@ -175,7 +173,7 @@ def _goes_on(folder: Path, format: SweepFormat) -> list[str]:
 
 
 def scene(way: str = "right") -> CutScene:
-    """Two runs that record, the second one in what the first has left."""
+    """Two runs that record; the second continues in the folder of the first."""
     return _sessions(
         "recording", SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name]
     )

@@ -1,11 +1,10 @@
 """Plays a scene and cuts it short. In: commands that change a folder, one after another, and a
-judge of what may be found in it. Out: one point for each moment, with all that the judge has found
-wrong.
+judge of the folder. Out: one point for each moment, with all faults that the judge found.
 
 The scene is first played to its end, and its calls are noted. A moment lies before each call that
 changes the folder or syncs something in it, and after the last one of each command: after a call is
-before the next one. At each moment the command is killed there, or the power is cut there. What is
-found then goes to the judge.
+before the next one. At each moment the command is killed there, or the power is cut there. The
+judge then examines the folder.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ def stage() -> TemporaryDirectory[str]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a judge gets: the folder, which it may change; the command that was cut; what it hears
-    of all that was said."""
+    """Input of a judge: the folder, which it may change; the command that was cut; the part of the
+    output that it needs."""
 
     folder: Path
     step: str
@@ -59,8 +58,8 @@ class SceneStep:
 
 @dataclass(frozen=True, slots=True)
 class CutScene:
-    """prepare: makes the folder as it is before the first command. judge: what is wrong. apart:
-    paths that it does not look at. hears: what it needs of what was said.
+    """prepare: makes the folder as it is before the first command. judge: finds faults. apart:
+    paths that it does not look at. hears: selects the part of the output that the judge needs.
     """
 
     name: str
@@ -73,9 +72,9 @@ class CutScene:
 
 @dataclass(frozen=True, slots=True)
 class CrashPoint:
-    """A scene that was cut at one moment. how: a method of Play. call: the one that was not carried
-    out any more. states: how many different folders it may have left. wrong: what the judge said of
-    them.
+    """A scene that was cut at one moment. how: a method of Play. call: the first call that was not
+    carried out. states: number of different folders that may be left. wrong: faults of these
+    folders.
     """
 
     scene: str
@@ -100,9 +99,9 @@ class Moment:
 
 @dataclass(slots=True)
 class ScenePlay:
-    """A scene that was played to its end in `work`. said: what had been said before. before: what
-    was in the folder before each command. runs: how these went. Raises NotFollowed where the folder
-    is not what the calls must have made of it.
+    """A scene that was played to its end in `work`. said: earlier output. before: content of the
+    folder before each command. runs: their results. Raises NotFollowed if the folder differs from
+    the result of the calls.
     """
 
     scene: CutScene
@@ -129,8 +128,8 @@ class ScenePlay:
         return self.work / "folder"
 
     def moments(self) -> Iterator[Moment]:
-        """All moments in their order. What the command before the last one has done is on the disk
-        by then."""
+        """All moments in their order. The changes of the command before the last are on the disk by
+        then."""
         output = self.output
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
@@ -162,8 +161,8 @@ class ScenePlay:
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
-        """The command is killed there, and started again: it goes on with what is left, and at each
-        of its moments the power goes. Raises NotFollowed.
+        """The command is killed there and started again in the same folder; at each of its moments
+        the power fails. Raises NotFollowed.
         """
         step, before = self.scene.steps[moment.step], self.before[moment.step]
         steps = replace(step, killed=moment.call), replace(step, code=None)
@@ -185,8 +184,7 @@ class ScenePlay:
         return self._point("kill_then_power", moment, states, wrong)
 
     def _run(self, step: SceneStep, at: SystemCall | None) -> TracedRun:
-        """Run a command, and compare what it leaves with what its calls must have made of the
-        folder."""
+        """Run a command, and compare the folder with the result of its calls."""
         disk = Disk(self.folder, tree.read(self.folder))
         run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
         disk.follow(run.calls)
@@ -205,7 +203,7 @@ class ScenePlay:
         tree.write(held, self.folder)
 
     def _judged(self, left: tree.Tree, step: SceneStep, output: str) -> tuple[str, ...]:
-        """What is wrong with a folder; each is looked at once."""
+        """Faults of a folder; each folder is judged once."""
         heard = self.scene.hears(output)
         key = tree.digest(left, self.scene.apart), step.name, heard
         if key not in self.judged:

@@ -15,7 +15,7 @@ MADE_UP = re.compile(r"-[a-z0-9_]{8}(?=/|$)")
 
 
 def read(folder: Path) -> Tree:
-    """What is in a folder."""
+    """The entries of a folder."""
     found: Tree = {}
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))

@@ -1,8 +1,8 @@
 """`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a
 shell in it.
 
-`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that
-are missing here, and `table` prints what the box did at each fault that the tests have injected.
+`ground` builds the part that is the same for every commit, `lacking` lists the missing Debian
+packages, and `table` prints the reaction of the box to each fault that the tests have injected.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
-    """Let the robot sweep; print what it touched, what the box answered, and the levels of its
+    """Let the robot sweep; print the touched material, the answer, and the levels of the GPIO
     lines."""
     begun = time.monotonic()
     cell.plug()

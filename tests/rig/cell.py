@@ -1,7 +1,7 @@
 """The robot cell around a guest: a robot that sweeps on request, and reads sentences and lines as a
 controller does.
 
-In: a Guest. Out: answers, with what was really touched and when.
+In: a Guest. Out: answers, each with the touched material and the time.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Cell:
     """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug`
     is called.
 
-    acts: what the robot sweeps over, in order; the simulator's six tubes, drawn from `seed`.
+    acts: the robot's sweeps in order, over the simulator's six tubes, drawn from `seed`.
     packet_frames: of its boards; more of them in a packet spare an emulator half of its work.
     """
 
@@ -112,8 +112,8 @@ class Cell:
         return rig.ReadoutBoard(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
     def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard:
-        """Plug a board in, a sound one if none is given. An old one goes first, and a box that runs
-        has seen it: FAULT."""
+        """Plug a board in, by default a sound one. An old board is unplugged first, and a running
+        box has reported FAULT by then."""
         board = board or self.board()
         if self.cable.board:
             self.unplug()
@@ -170,7 +170,7 @@ class Cell:
         return self.serial.wait_for("$PPLP,STA,", 30, since).split("*")[0].split(",")[2:]
 
     def journal(self, lines: int = 15) -> str:
-        """What the service last wrote."""
+        """The last lines of the service."""
         return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
 
     def restore(self) -> None:

@@ -1,5 +1,6 @@
-"""What tests on the virtual box share. PALPATE_RIG=quick runs them, =full with the counts of the
-report; else they are skipped. `python -m tests.campaigns test-rig` sets it, and makes the box first.
+"""Fixtures of the tests on the virtual box. PALPATE_RIG=quick runs them, =full with the counts of
+the report; otherwise they are skipped. `python -m tests.campaigns test-rig` sets it, and makes the
+box first.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from tests.rig.notes import HOW
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs a guest where none is wanted."""
+    """Skip tests that need a guest unless PALPATE_RIG is set."""
     for item in items:
         if not HOW and item.path.parent == Path(__file__).parent:
             item.add_marker(

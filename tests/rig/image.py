@@ -281,7 +281,7 @@ def _make_root(part: Path, version: str) -> None:
 
 
 def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> list[Path]:
-    """Copy modules and what they need to a root; their files in the order of loading."""
+    """Copy modules and their dependencies to a root; their files in the order of loading."""
     source, target = kernel / "lib/modules" / version, root / "lib/modules" / version
     if not (source / "modules.dep").exists():
         run("depmod", "-b", kernel, version)

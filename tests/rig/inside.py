@@ -1,5 +1,5 @@
-"""What a test that runs inside the guest stands on. In: a Machine. Out: a folder for its second
-disk, and a bench that does outside what such a test asks for (tests/backends/remote.py).
+"""The means of a test that runs inside the guest: a folder for its second disk, and a bench that
+carries out its requests outside (tests/backends/remote.py).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ SETTLE_S = 0.2
 
 
 def pack(folder: Path, tests: Iterable[str]) -> None:
-    """Put these files and folders of the checkout and what runs them into `folder`, each where it
-    lies in the checkout."""
+    """Copy these files and folders of the checkout and the tools that run them into `folder`, at
+    the same paths."""
     for name in tests:
         source, place = ROOT / name, folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ class GuestControls:
         self._machine, self._clock, self._told = machine, machine.clock, 0
 
     def able(self) -> list[str]:
-        """What can be done, as a Backend has it in `can`."""
+        """The abilities, as `can` of a Backend."""
         return ["skin", "numbered", "plug", "garble", "silence", "lines", "serial", "stall"]
 
     def reset(self) -> None:
@@ -90,8 +90,7 @@ class GuestControls:
         self._machine.serial.say(data)
 
     def hear(self) -> bytes:
-        """What has come since the last call. Between calls nobody reads, so that a port may fill
-        up."""
+        """Bytes since the last call. Between calls nobody reads, so that a port may fill up."""
         port = self._machine.serial
         port.deaf = False
         self._clock.sleep(SETTLE_S)

@@ -1,11 +1,11 @@
 """Which sweeps a box must have stored when it is killed. In: the sentences a robot heard, the files
-that were found. Out: what is missing. Also the log of a campaign of kills, which a later run
+that were found. Out: the missing sweeps. Also the log of a campaign of kills, which a later run
 continues.
 
 A kept sweep is written after its answer, in the same turn of the loop, and state sentences come
 after that. So one whose answer was heard, and after it a state sentence of the same run, must be
-there whole. One sweep a run may be missing: the one in progress, whose answer is the last that was
-heard.
+there whole. One sweep of a run may be missing: the sweep in progress, whose answer is the last in
+the sentences.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
 
 
 def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
-    """Look at a disk that nobody uses, on a copy: e2fsck's exit code once the journal is replayed,
-    and what was kept."""
+    """Look at a disk that nobody uses, on a copy: e2fsck's exit code after the journal is replayed,
+    and the kept sweeps."""
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()

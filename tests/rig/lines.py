@@ -1,5 +1,5 @@
-"""The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: what the
-box drives, with times.
+"""The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: the
+levels that the box drives, with times.
 
 All times are the guest's.
 
@@ -24,8 +24,8 @@ that is busy takes an interrupt long after the edge, and looks at the level only
 
 
 class GuestLines:
-    """levels: line name -> what the box drives it to. log: (ns, name, level) of all changes, in
-    order, each with the time that was read last.
+    """levels: the level that the box drives, by the name of the line. log: (ns, name, level) of all
+    changes, in order, each with the time that was read last.
 
     Fits where the rig's robot drives its edges (appliance.sim.rig.EdgeLines).
     """
@@ -70,7 +70,7 @@ class GuestLines:
         return self._clock.until(lambda: self.levels[name] == level, timeout_s)
 
     def code(self) -> int:
-        """What the class bits say now."""
+        """The code on the class bits now."""
         bits = sorted(name for name in self.levels if name.startswith("CLASS-"))
         return sum(self.levels[name] << i for i, name in enumerate(bits))
 

@@ -184,8 +184,8 @@ class Guest:
         return base64.b64decode(self.run(f"base64 {path}", check=True).out)
 
     def save(self) -> None:
-        """Keep the running guest in its disk as the snapshot `ready`, without what hangs on its
-        USB, and end."""
+        """Keep the running guest in its disk as the snapshot `ready`, without its USB devices, and
+        end."""
         self.qmp("device_del", id="cable")
         self.run("udevadm settle")
         text = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
@@ -194,12 +194,12 @@ class Guest:
         self.close()
 
     def bench(self) -> socket.socket:
-        """The other end of the guest's port palpate.bench, over which tests inside ask for what
-        happens outside."""
+        """The other end of the guest's port palpate.bench, over which tests inside request actions
+        outside."""
         return self._connect("bench")
 
     def console(self) -> str:
-        """What the kernel and systemd wrote on the console."""
+        """The output of kernel and systemd on the console."""
         return (self._folder / "console").read_text(errors="replace")
 
     def cut(self) -> None:

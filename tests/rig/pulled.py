@@ -1,5 +1,5 @@
 """The skin's cable, pulled at a moment of a sweep. In: a cell, the number of the try. Out: the
-status of the one answer."""
+status of the only answer."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class Qtest:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def ask(self, *lines: str) -> list[str]:
-        """What follows OK in the answer to each line, all sent in one write.
+        """The text after OK in the answer to each line, all sent in one write.
 
         Raises OSError where QEMU has gone or answers nothing, RuntimeError where it refuses.
         """

@@ -1,5 +1,5 @@
 """Shell lines in the guest, from outside. In: the far end of the port at which its agent listens
-(guest/agent.py). Out: what the lines said.
+(guest/agent.py). Out: their output.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ take."""
 
 
 class GuestFailed(AssertionError):
-    """The guest did not do what it was asked to."""
+    """The guest did not carry out a command."""
 
 
 @dataclass(frozen=True, slots=True)

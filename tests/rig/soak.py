@@ -66,8 +66,7 @@ class Recorder:
         self._begun_s = self._heard_s = self._looked_s = self._clock()
 
     def listen(self, seconds: float, stopped: Callable[[], bool]) -> None:
-        """Judge what comes, and look now and then, for so long or until `stopped()`. Raises
-        Gone."""
+        """Judge sentences and sample the process for so long or until `stopped()`. Raises Gone."""
         end_s = self._clock() + seconds
         while (now_s := self._clock()) < end_s and not stopped():
             for line in self._box.heard(WAIT_S):
@@ -107,7 +106,7 @@ class Recorder:
             self._note(at_s, body.split(",")[2:])
 
     def fault(self, what: str, at_s: float | None = None) -> None:
-        """Take note of what must not be."""
+        """Note a fault."""
         if len(self.run.faults) < NOTED:
             self.run.faults.append([self._since(self._clock() if at_s is None else at_s), what])
 
@@ -163,8 +162,8 @@ def record(
     stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
 ) -> None:
-    """Have a box sweep for so long; `save` is called each minute and at the end. What goes wrong
-    stands in the run."""
+    """Have a box sweep for so long; `save` is called each minute and at the end. Faults are noted
+    in the run."""
     recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
@@ -234,7 +233,7 @@ def soak(
     stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
 ) -> Path:
-    """Record one box for what is left of `hours`; its record."""
+    """Record one box for the rest of `hours`; its record."""
     path = _record(work, box.name)
     about = {
         "box": box.name,
@@ -399,8 +398,8 @@ def main() -> int:
 
 
 def _together(arguments: list[str]) -> bool:
-    """Each box that can be had here in a process of its own; who interrupts this one interrupts
-    them. False if one fell."""
+    """Run each box that this machine has in a process of its own; a signal to this process is
+    passed on to them. False if one failed."""
     children = []
     for name, kind in BOXES.items():
         if missing := kind.missing():

@@ -50,8 +50,8 @@ class Gone(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A sweep of the script: what is touched, the numbers of the frames at its edges, what the
-    bundle by itself says."""
+    """A sweep of the script: the touched material, the numbers of the frames at its edges, the
+    verdict of the bundle by itself."""
 
     label: str
     start: int
@@ -196,7 +196,7 @@ class Reckoned:
 class ThisMachine:
     """`palpate run --sim skin`, as installed beside this Python, in real time.
 
-    before: what starts it, such as `chrt -f 10`. sets: further settings.
+    before: a command that starts it, such as `chrt -f 10`. sets: further settings.
     """
 
     name = "this machine"
@@ -251,7 +251,7 @@ class ThisMachine:
         self._robot.hear(at_s, line)
 
     def _said(self) -> bytes:
-        """What the box has sent."""
+        """Bytes from the box."""
         return os.read(self._far, 65536)
 
     def _log_text(self) -> str:

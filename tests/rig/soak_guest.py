@@ -2,7 +2,7 @@
 it, resources of its process.
 
 The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its
-serial port: the way of a real box. Only what it takes of memory is asked for inside.
+serial port: the way of a real box. Only its use of memory is read inside.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class SoakRobot:
     """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of
     starts, and of stops.
 
-    The edges of a sweep are planned while the one before it is made: they come in time however late
+    The edges of a sweep are planned during the previous sweep, so they come in time however late
     frames are fetched.
     """
 
@@ -145,7 +145,7 @@ class VirtualBox:
         """Take note of the last frame of a packet that goes to the guest; the packet as it is."""
         _, _, _, _, _, count, *_, seq, _ = packets.HEADER.unpack_from(packet)
         if self._anew and self._sent:
-            # what it took from the box's STOP to its START it was asked not to send
+            # frames between STOP and START of the box are not to be sent
             self._thrown += seq - self._thrown - self._sent[-1][1]
         self._anew = False
         self._sent.append((self.clock(), seq + count - self._thrown))

@@ -57,8 +57,8 @@ class SoakRun:
     """One unbroken run of one box; a soak that was interrupted has several.
 
     began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be
-    answered by its end. faults: [seconds, what was wrong]. silence_s: longest time without a
-    sentence. ended: why, "" while it goes on.
+    answered by its end. faults: [seconds, description]. silence_s: longest time without a sentence.
+    ended: why, "" while it goes on.
     """
 
     seed: int
@@ -78,8 +78,8 @@ def columns(rows: Sequence[Sequence[Any]], names: Sequence[str]) -> dict[str, li
 
 
 def numbering(number: int, last: int, started: int) -> str:
-    """What is wrong with the number of an answer after the answer `last`, when `started` sweeps had
-    begun; "" if nothing."""
+    """The fault in the number of an answer after the answer `last`, when `started` sweeps had
+    begun; "" if it is right."""
     if number == last + 1:
         return (
             ""
@@ -197,7 +197,7 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
 
 
 def _counted(runs: Sequence[Json]) -> dict[str, Any]:
-    """Counters of the box, and what the board took that it never counted."""
+    """Counters of the box, and the frames of the board that it never counted."""
     last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
     result: dict[str, Any] = {
         name: sum(c[name][-1] for c in last)
@@ -213,11 +213,9 @@ def _counted(runs: Sequence[Json]) -> dict[str, Any]:
 
 
 def unaccounted(behind: Sequence[float]) -> int:
-    """Frames that the board took and the box counted neither as received nor as lost, from what it
-    was behind over time.
-
-    What is on its way comes back down within a minute; what was dropped in silence never does. More
-    than was taken, frames out of nowhere, counts as well.
+    """Frames that the board took and the box counted neither as received nor as lost, from its lag
+    over time. Frames on their way are counted within a minute; frames that were dropped in silence
+    never are. Counting more frames than were taken is a fault as well.
     """
     if not behind:
         return 0

@@ -1,8 +1,7 @@
 """The page of a soak. In: records with their sums. Out: HTML and its picture of four charts over
 time.
 
-Nothing is computed here but what a chart needs; every sentence with a number takes it from the
-sums.
+Only charts are computed here; every sentence with a number takes it from the sums.
 """
 
 from __future__ import annotations
@@ -106,7 +105,7 @@ def render(records: Json) -> tuple[str, str]:
 
 
 def _targets(boxes: Json) -> list[Json]:
-    """What was asked and what came out on each box, a line for each target."""
+    """The wanted and measured value of each target on each box."""
     each = zip(*(targets(box["sums"]) for box in boxes.values()), strict=True)
     return [
         {

@@ -1,5 +1,5 @@
-"""What a robot checks around a fault: the box recovers by itself, and no answer names a material
-that was not touched.
+"""Checks of a robot around a fault: the box recovers by itself, and no answer names a material that
+was not touched.
 
 In: a cell. Out: right sweeps, state fields, or AssertionError with the journal of the box.
 """

@@ -1,5 +1,4 @@
-"""What the trigger lines can do to the box, on a real kernel. In: edges that no sound robot makes.
-Out: one answer each.
+"""Edges on the trigger lines that no sound robot makes, on a real kernel: each gets one answer.
 
 Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
 """
@@ -242,7 +241,7 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
     cell.until_ready(20)
     assert int(cell.state()[LOST_EDGES]) > dropped
     outcomes = [answer.status for answer in cell.answers(since)]
-    # the skin may have gone stale while the program stood still; the one start edge has one answer
+    # the skin may have gone stale while the program stood still; the only start edge has one answer
     # either way
     assert outcomes in (["edges-lost"], ["not-ready"])
     check_recovers(cell)

@@ -1,5 +1,5 @@
-"""The contract of skin, lines and port, run inside the guest over its real kernel; what is outside
-it asks for."""
+"""The contract of skin, GPIO lines and port, run inside the guest over its real kernel; it requests
+the actions outside."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Killed at random moments. In: a box that keeps its sweeps, a robot that sweeps. Out: it is there
-again, nothing is lost.
+"""The box is killed at random moments while a robot sweeps: it comes back, and no kept sweep is
+lost.
 
-`PALPATE_RIG=full python -m tests.campaigns test-rig` kills the program 200 times and cuts the power 50 times; counts so far
-are kept in build/rig, so that a campaign that was broken off goes on. What was in QEMU's memory is
-gone with a cut: the disk's tables of newly written clusters, which it writes when the guest
-flushes. So a cut costs what a disk's own memory costs.
+`PALPATE_RIG=full python -m tests.campaigns test-rig` kills the program 200 times and cuts the power
+50 times; counts so far are kept in build/rig, so that a campaign that was broken off goes on. A cut
+also loses the data in QEMU's memory: the disk's tables of newly written clusters, which it writes
+when the guest flushes. So a cut loses as much as the cache of a disk does.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class EndlessRobot:
         self.cell, self.touches = cell, list[Touch]()
 
     def for_seconds(self, seconds: float) -> str:
-        """Go on sweeping; what the box was doing at the end."""
+        """Go on sweeping; the state of the box at the end."""
         clock = self.cell.clock
         end = clock.now_s() + seconds
         while (left := end - clock.now_s()) > 0:
@@ -183,7 +183,7 @@ def cut(
     """One life of a box: power on, READY, sweeps, power off at a random moment; or off already
     while it boots.
 
-    had: sweeps that earlier lives have kept on this disk. What is there now.
+    had: sweeps that earlier lives have kept on this disk. Returns the sweeps there now.
     """
     with Guest(image, folder, disk=disk) as machine:
         cell = Cell(machine)

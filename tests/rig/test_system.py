@@ -1,6 +1,6 @@
 """The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions.
-In: a guest whose service keeps its sweeps on small file systems. Out: answers as before, what is
-missing logged once, recovery without help.
+In: a guest whose service keeps its sweeps on small file systems. Out: answers as before, the fault
+logged once, recovery without help.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
-    """The capture's disk is full: logged once, it ends, sweeps go on, and what it holds can be
-    played."""
+    """The capture's disk is full: this is logged once, the capture ends, sweeps go on, and its
+    content can be played."""
     until_logged(
         box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here"
     )
@@ -250,8 +250,8 @@ def swept(cell: Cell) -> str:
 
 
 def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
-    """Four programs that want all of the processor: each sweep is answered, what was lost is
-    counted, none is wrong.
+    """Four programs that want all of the processor: each sweep is answered, lost frames are
+    counted, no answer is wrong.
 
     The guest has only one meanwhile: before release 8.1, QEMU that counts instructions gives the
     second a turn when the first leaves time, so that whatever was on it stood still for minutes

@@ -1,10 +1,10 @@
-"""Trigger and frames on one time line, on a real kernel: is the middle of a window what was taken
-between the edges?
+"""Trigger and frames on one time line, on a real kernel: is the middle of a window half-way between
+the edges?
 
 In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the
-board outside knows. What the guest's kernel calls its time is put to the clock by which the board
-goes by the shortest of many round trips, so that edges as the guest's kernel stamped them can be
-held against the moments at which the board took its frames.
+board outside knows. The shortest of many round trips relates the time of the guest's kernel to the
+clock of the board. So edges that the kernel stamped can be compared with the moments at which the
+board took its frames.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def spikes(seed: int) -> Callable[[], int]:
 
 
 def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
-    """The windows of `n` sweeps, none of which was answered wrong. Raises AssertionError where they
-    do not come."""
+    """The windows of `n` sweeps; no answer to them was wrong. Raises AssertionError where they do not
+    come."""
     for _ in range(3 * n):
         touch, answer = cell.sweep()
         if not_wrong(touch, answer) not in LATE - {"unsure", "unknown"}:
@@ -147,8 +147,8 @@ def test_windows_lie_in_the_middle(
     cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str
 ):
     """The window's middle is the frame taken half-way between the edges: within one frame at 80
-    ppm, and beyond what the box takes for possible within what it then cannot know. All stamps are
-    late alike, by a transfer's shortest way."""
+    ppm; beyond the drift that the box allows for, within the remaining uncertainty. All stamps are
+    late by the same shortest transfer."""
     ppm, seen = CASES[what], []
     for _ in range(ATTEMPTS):
         board = cell.plug(cell.board(ppm=ppm, latency=spikes(abs(ppm))))

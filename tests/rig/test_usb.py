@@ -1,7 +1,6 @@
-"""The skin's cable, pulled and put back at any moment; other boards on it; resets. In: a guest.
-Out: what it answered.
-
-Nothing may hang, no answer may name what was not touched, and a sound skin is taken up by itself.
+"""The skin's cable, pulled and put back at any moment; other boards on it; resets. Nothing may
+hang, no answer may name a material that was not touched, and a sound skin is read again without
+help.
 """
 
 from __future__ import annotations

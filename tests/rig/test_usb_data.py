@@ -1,8 +1,5 @@
-"""A skin that sends what it should not, or does not answer as it should. In: a guest. Out: what
-became of each fault.
-
-A sweep that was harmed says so; what harms none is answered right; a sound skin is taken up by
-itself.
+"""A skin that sends wrong data, or answers wrong. A damaged sweep says so; a fault that damages no
+sweep leaves its answer right; a sound skin is read again without help.
 """
 
 from __future__ import annotations
@@ -41,8 +38,8 @@ ALL = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens to so many transfers from `begin_s` after the start edge on, and how the sweep
-    may be answered.
+    """The fault of some transfers, from `begin_s` after the start edge on, and the allowed answers
+    to the sweep.
 
     make: a new mangle for one sweep. counter: a field of the state sentence that goes up.
     """
@@ -157,8 +154,8 @@ def robot(shared: Cell) -> None:
 
 @pytest.mark.parametrize("what", FAULTS if HOW == "full" else QUICK)
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
-    """Harmed in mid sweep: one answer that says so, none that is wrong; what lies beside the window
-    harms nothing."""
+    """Harmed in mid sweep: one answer that says so, none that is wrong; a fault beside the window
+    does no harm."""
     n = count(1, 3)
     fault, outcomes = FAULTS[what], Counter[str]()
     for _ in range(n):

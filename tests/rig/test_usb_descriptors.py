@@ -1,5 +1,4 @@
-"""Devices that lie about what they are, under the skin's ids. In: a guest. Out: none is taken for
-what it is not.
+"""Devices with false descriptors under the skin's ids: none is taken for a skin.
 
 The kernel refuses some, libusb or the box others; the service neither dies nor hangs, and the sound
 skin streams after.
@@ -48,7 +47,7 @@ class Spoken(Descriptors):
     raw: bytes = b""
 
     def reply(self, kind: int, index: int) -> bytes | None:
-        """As the sound one, but for its strings; the list of languages is as it should be."""
+        """As the sound skin, except for its strings; the list of languages is right."""
         return self.raw if kind == 3 and index else super().reply(kind, index)
 
 

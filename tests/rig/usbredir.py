@@ -1,9 +1,9 @@
 """The far end of a USB cable that leads into the guest. In: a board of the rig. Out: the usbredir
 protocol's messages.
 
-QEMU's usb-redir device sits on the guest's xHCI port and passes on what the guest's kernel asks of
-a device (messages as in usbredirproto.h of usbredir 0.13); a ReadoutBoard answers, as it does under the
-simulated bus.
+QEMU's usb-redir device sits on the guest's xHCI port and passes on the requests of the guest's
+kernel (messages as in usbredirproto.h of usbredir 0.13). A ReadoutBoard answers, as it does under
+the simulated bus.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ agrees."""
 
 @dataclass(slots=True)
 class Descriptors:
-    """What the device says of itself when the kernel asks; anything may be put here."""
+    """The answers of the device to the kernel; anything may be put here."""
 
     device: bytes = struct.pack(
         "<BBHBBBBHHHBBBB",
@@ -75,11 +75,11 @@ class UsbRedirPeer:
     """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any
     thread.
 
-    mangle: what the cable does to a transfer; more than was asked for is a babble. silent:
-    transfers never end. deaf: requests are never answered. slow_s: they are answered so late. All
-    times are those of `clock`, the guest's. halted: the endpoint stalls until it is cleared. sent:
-    transfers that the guest took. asked: requests that it made. opened: how often the guest's
-    kernel has set up a device.
+    mangle: the change that the cable makes to a transfer; more than was asked for is a babble.
+    silent: transfers never end. deaf: requests are never answered. slow_s: they are answered so
+    late. All times are those of `clock`, the guest's. halted: the endpoint stalls until it is
+    cleared. sent: transfers that the guest took. asked: requests that it made. opened: how often
+    the guest's kernel has set up a device.
     """
 
     def __init__(self, connection: socket.socket, clock: Clock) -> None:
@@ -105,7 +105,7 @@ class UsbRedirPeer:
         self._thread.start()
 
     def plug(self, board: rig.ReadoutBoard, descriptors: Descriptors | None = None) -> None:
-        """Hang a board on the cable; an old one has been taken off before."""
+        """Hang a board on the cable; an old board has been taken off before."""
         self._said_hello.wait(10)
         self.do(lambda: self._connect(board, descriptors or Descriptors()))
 
@@ -256,7 +256,7 @@ class UsbRedirPeer:
         self._later.append((self._clock.now_ns() + round(self.slow_s * 1e9), answer, ident))
 
     def _deliver(self) -> None:
-        """Give the guest what is due."""
+        """Send the guest the replies that are due."""
         while self._later and self._later[0][0] <= self._clock.now_ns():
             _, answer, ident = self._later.popleft()
             self._send(CONTROL, ident, answer)

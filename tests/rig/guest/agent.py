@@ -1,5 +1,4 @@
-"""In the guest: runs shell lines for whoever sits at the other end of a virtio port. One JSON line
-in, one out.
+"""In the guest: runs shell lines that arrive at a virtio port. One JSON line in, one out.
 
 In: {"run": "...", "timeout_s": 30}. Out: {"rc": 0, "out": "..."}; rc 124 where the time was up.
 """
@@ -13,7 +12,7 @@ PORT = "/dev/virtio-ports/palpate.agent"
 
 
 def answer(request: dict) -> dict:
-    """Run the shell line; what it gives on its standard input stands in `stdin`, in base64."""
+    """Run the shell line; `stdin` is its standard input in base64."""
     given = base64.b64decode(request.get("stdin", ""))
     try:
         done = subprocess.run(
