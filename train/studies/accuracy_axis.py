@@ -1,9 +1,5 @@
-"""The axis of accuracy that pictures of many methods share. In: a plot. Out: its axis, to 100 %,
-stretched where the best are.
-
-A place on it is the root of the error, so that 90 and 95 % are as far apart as 71 and 80 %, and 100
-% is still there.
-"""
+"""The axis of accuracy of pictures with many methods. A position on it is the root of the error: 90
+and 95 % are as far apart as 71 and 80 %, and 100 % is on the axis."""
 
 from __future__ import annotations
 
@@ -17,14 +13,14 @@ from numpy.typing import NDArray
 from train.reports.plot_style import GREY, set_ticks
 
 SHARES = (0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1)
-"""Ticks: closer together where the best are."""
+"""Ticks, closer together near 100 %."""
 ROOM = 0.04
-"""Below the lowest value."""
+"""Space below the lowest value, as a share of the axis."""
 
 
 def stretch(axes: Axes, way: str, lows: Iterable[float], ticks: Iterable[float] = SHARES) -> None:
-    """Make the axis `way` ("x" or "y") of `axes` one of accuracy, from a little below all `lows` to
-    100 %."""
+    """Make the axis `way` ("x" or "y") of `axes` an axis of accuracy, from a little below all
+    `lows` to 100 %."""
     low = max(min(lows) - ROOM, 0.0)
     set_scale, set_limits = (
         (axes.set_xscale, axes.set_xlim) if way == "x" else (axes.set_yscale, axes.set_ylim)
@@ -39,7 +35,7 @@ def stretch(axes: Axes, way: str, lows: Iterable[float], ticks: Iterable[float] 
 
 
 def draw_chance(axes: Axes, share: float) -> None:
-    """A dashed line across at what guessing names rightly."""
+    """Draw a dashed line at the accuracy of guessing."""
     axes.axhline(share, color=GREY, linewidth=1, linestyle=(0, (3, 2)))
 
 

@@ -1,6 +1,5 @@
-"""The table of the box's figures in README and manual. In: docs/data/bench.json, which `palpate bench
---json` wrote. Out: the table in Markdown; document_figures puts it into the documents.
-"""
+"""The table of the box's time and memory, in Markdown, from docs/data/bench.json (`palpate bench
+--json`). document_figures writes it into the documents."""
 
 from __future__ import annotations
 
@@ -13,11 +12,8 @@ Json = dict[str, Any]
 
 
 def table(figures: Json) -> str:
-    """The figures as a table with a caption, in Markdown; where they are of an older bundle, it
-    says so first.
-
-    Raises KeyError where one is missing.
-    """
+    """The table with a caption. Figures of an older bundle are marked as such. Raises KeyError if a
+    figure is missing."""
     older = provenance.of(figures).older
     rows = [f"| {what} | {value} |" for what, value in _rows(figures)]
     return "\n".join(
@@ -43,7 +39,7 @@ def _caption(figures: Json) -> str:
 
 
 def _rows(figures: Json) -> Iterator[tuple[str, str]]:
-    """What was measured, and its figure."""
+    """Name and value of each measured figure."""
     accuracy, inference, memory = figures["accuracy"], figures["inference_ms"], figures["rss_mb"]
     right, n = accuracy["right"], accuracy["total"]
     low, high = (100 * value for value in accuracy["interval"])

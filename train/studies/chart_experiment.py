@@ -202,7 +202,7 @@ class Chart:
 
 
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
-    """Where the bundles of a method that was trained on these sweeps are kept."""
+    """The folder in the cache for the bundles of a method that was trained on these sweeps."""
     about = [sets.digest(train), method.name, method.effort, seed]
     modules = methods.module_of(method.name), "train.export.precisions", "train.export.pack"
     return cache / "dots" / fingerprint(about, *modules)
@@ -217,8 +217,8 @@ def joined(results: Sequence[Json]) -> Json:
 
 
 def under_stress(entry: Json) -> dict[str, Json]:
-    """Accuracies under stress from an entry of robustness.merge: "stress", the worst one's mean
-    over severities, and robustness.TARGETS."""
+    """Accuracies under corruption from an entry of robustness.merge: "stress", the mean over
+    severities of the worst corruption, and robustness.TARGETS."""
     curves, seeds = entry["curves"], entry["seeds"]
     n = next(iter(curves.values()))["total"] // len(seeds)
     mean = {
@@ -240,10 +240,10 @@ def _entry(shares: Iterable[float], n: int, seeds: Sequence[int]) -> Json:
 
 
 def touch_shares(paths: Sequence[Path]) -> dict[str, float]:
-    """Mean share of the sweep that each method needs with early exit, from files of `python -m
-    train.studies certainty`.
+    """The mean share of a sweep that each method needs with early answers, from results of `python
+    -m train.studies certainty`.
 
-    Raises FormatError where a file has another content.
+    Raises FormatError if a file has another content.
     """
     shares = {}
     for path in paths:

@@ -1,8 +1,7 @@
-"""Renders the interactive chart from dots, the entries of chart.json: one HTML file that needs
-nothing else.
+"""Renders the interactive chart from dots, the entries of chart.json, as one HTML file that needs
+no other file.
 
-It is made of templates/chart.html.j2 and chart.js, and shows the picture and a table where scripts
-do not run.
+Its parts are templates/chart.html.j2 and chart.js. Without scripts it shows a picture and a table.
 """
 
 from __future__ import annotations
@@ -49,10 +48,13 @@ def html(
     source: str = "chart.json",
     header: Provenance | None = None,
 ) -> str:
-    """The whole file. picture: SVG. quick: the figures mean nothing. left_out: what is missing, and
-    why. box_on_hard: the box's answers to T-HARD's sweeps, see pages.box_on_hard.
-    accuracies: the axes, the first one first seen. source: the file beside the page that has all
-    figures. header: where they are from, if the dots do not say so."""
+    """The whole file.
+
+    picture: SVG. quick: the run was too small for figures. left_out: missing methods, each with the
+    reason. box_on_hard: the box's answers to T-HARD's sweeps, see pages.box_on_hard. accuracies:
+    the axes; the first is shown at first. source: the file of results beside the page. header:
+    provenance, if the dots have none.
+    """
     there = {
         key: axis for key, axis in accuracies.items() if any(key in dot["accuracy"] for dot in dots)
     }
@@ -121,8 +123,8 @@ def _weights(dots: Sequence[Dot], method: str) -> int | None:
 def _lines(
     dots: Sequence[Dot], accuracies: Mapping[str, ChartAxis], chosen: str
 ) -> list[dict[str, Any]]:
-    """Under each protocol what the box ships, and the best of the peers; each method as it is
-    listed first, not its other forms."""
+    """For each protocol the packaged recipe beside the best of the peers. Each method counts in the
+    precision that is listed first."""
     own = {dot["method"]: dot for dot in reversed(dots)}
     first = {method: own[method] for method in dict.fromkeys(dot["method"] for dot in dots)}
     return [
@@ -142,8 +144,8 @@ def _lines(
 
 
 def _who(dots: Sequence[Dot]) -> list[list[str]]:
-    """Each model once, those that are the same but for their size in one line: names for people,
-    what it is, what commands call it."""
+    """Each model once: its name, a description, its name in commands. Models that differ in size
+    alone share a line."""
     lines: dict[str, list[Dot]] = {}
     for dot in {dot["method"]: dot for dot in dots}.values():
         about = method_names.about(dot["method"])
@@ -159,7 +161,7 @@ def _who(dots: Sequence[Dot]) -> list[list[str]]:
 
 
 def _together(those: Sequence[Dot]) -> str:
-    """One name for models that are the same but for their size."""
+    """The common name of models that differ in size alone."""
     names = list(dict.fromkeys(map(label, those)))
     sizes = sorted(dot["weights"] for dot in those if dot.get("weights"))
     return (
@@ -172,8 +174,7 @@ def _together(those: Sequence[Dot]) -> str:
 def _table(
     dots: Sequence[Dot], accuracies: Mapping[str, ChartAxis], costs: Mapping[str, ChartAxis]
 ) -> tuple[list[str], list[list[str]]]:
-    """Head and lines of the table for readers without scripts: all figures, the most accurate dot
-    first."""
+    """Head and lines of the table for readers without scripts, the most accurate dot first."""
     first = next(iter(accuracies), "")
     order = sorted(dots, key=lambda dot: -dot["accuracy"].get(first, {"mean": -1})["mean"])
     head = [
@@ -205,8 +206,7 @@ def _cost(value: float | None) -> str:
 def _sheet(
     dots: Sequence[Dot], accuracies: Mapping[str, ChartAxis], costs: Mapping[str, ChartAxis]
 ) -> str:
-    """All figures as the address of a file for a spreadsheet, which the page holds itself; shares
-    are from 0 to 1."""
+    """All figures as a data address of a CSV file. Shares are from 0 to 1."""
     text, ends = io.StringIO(), ("mean", "low", "high")
     sheet = csv.writer(text)
     sheet.writerow(

@@ -1,11 +1,10 @@
-"""The paper's CNN followed while it learns: accuracy over iterations at new positions and a row
-off. In: a size, a seed.
+"""The study `cnn-curve`: accuracy of the paper's CNN over iterations, at new positions and with the
+contact a row off.
 
-Out: a curve in a file, beside the two accuracies that the paper prints, with the newest answers,
-which the paper's page shows. Trained whole it takes an hour of one core, so there is a small one to
-compare simulated worlds with: a quarter of the filters and neurons, one second of each sweep, 600
-iterations at ten times the rate. An interrupted training goes on from the file and a checkpoint
-beside it.
+It writes the curve into a file, with the newest answers, which the study `paper` takes up. The
+whole training takes an hour of one core. A small one compares simulated worlds: a quarter of the
+filters and neurons, one second of each sweep, 600 iterations at ten times the learning rate. An
+interrupted training goes on from the file and from a checkpoint beside it.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ Array = NDArray[Any]
 PRINTED = {"new": 0.923, "hard": 0.917}
 """Figs. 5, 7 and 10: leave one position out, and T-HARD."""
 APART = 1000
-"""T-REAL of the seed + APART stands for positions that were left out: as the ninth, but more of
-them."""
+"""T-REAL of the seed + APART stands for the positions that were left out. It is like the ninth
+position, with more sweeps."""
 ATTACHMENTS = 20
 FIRST_MARK = 25
 EACH = {"train": 10, "new": 3, "hard": 3}
@@ -52,7 +51,7 @@ EACH = {"train": 10, "new": 3, "hard": 3}
 
 @dataclass(frozen=True)
 class Size:
-    """A form of the paper's CNN. window: frames of each sweep that it sees."""
+    """A size of the paper's CNN. window: frames of each sweep that it uses."""
 
     layers: ImageLayers
     window: int
@@ -103,11 +102,11 @@ def follow(
     log: Callable[[str], None] = lambda line: None,
     each: dict[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Train, and write a point of the curve into `out` at each of `marks`; what the file then
-    holds.
+    """Train, and write a point of the curve into `out` at each of `marks`; the content of the file
+    at the end.
 
-    centred: behind a layer that subtracts each taxel's mean. steps: None for those of the size.
-    Computed in bfloat16 where the processor can. Raises OSError where `out` cannot be written.
+    centred: a first layer subtracts each taxel's mean. steps: None for those of the size. Computed
+    in bfloat16 if the processor can. Raises OSError if `out` cannot be written.
     """
     form, each = SIZES[size], each or EACH
     about = [size, seed, centred, repr(world), steps, each]
@@ -148,15 +147,13 @@ def follow(
 
 
 def marks(steps: int) -> list[int]:
-    """Iterations at which the accuracy is measured: FIRST_MARK, twice, four times as many and so
-    on, and the last."""
+    """Iterations at which accuracy is measured: FIRST_MARK, its doubles, and the last iteration."""
     doubled = [FIRST_MARK * 2**i for i in range(20)]
     return [*(mark for mark in doubled if mark < steps), steps]
 
 
 def _kept(out: Path, about: Sequence[Any]) -> dict[str, Any] | None:
-    """What an earlier run of the same training wrote; None where there is nothing, or of another
-    one."""
+    """The file of an earlier run of the same training, or None."""
     try:
         kept: dict[str, Any] = json.loads(out.read_text())
     except (OSError, ValueError):
@@ -180,7 +177,7 @@ def _logits(network: Network, samples: Array) -> Array:
 
 
 def _given(logits: Array, sweeps: Dataset) -> dict[str, Any]:
-    """What the network answers to each sweep, as JSON."""
+    """The network's logits for each sweep, as JSON."""
     return {
         "labels": sweeps.labels.tolist(),
         "position": sweeps.group("position").tolist(),
@@ -189,8 +186,8 @@ def _given(logits: Array, sweeps: Dataset) -> dict[str, Any]:
 
 
 def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any]:
-    """Of each set the share of right answers and its 95 % interval over positions; the confusion of
-    all but training, of which there is the cross entropy."""
+    """Accuracy on each set with its 95 % interval over positions; the confusion matrices of the
+    test sets, and the cross entropy of the training set."""
     point: dict[str, Any] = {
         "cost": round(float(log_loss(given["train"].labels, softmax(logits["train"]))), 6)
     }

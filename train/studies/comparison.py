@@ -1,5 +1,4 @@
-"""Ours beside the best peer. In: accuracies with their intervals. Out: a line of a table, with what
-fell short said in words."""
+"""Our accuracy beside the best peer's: a line of a table, with the verdict in words."""
 
 from __future__ import annotations
 
@@ -12,15 +11,15 @@ from train.reports.formatting import points
 
 Json = Mapping[str, Any]
 NEAR = -0.01
-"""Wanted of ours everywhere: no further below the best peer."""
+"""Ours may be this far below the best peer."""
 ROUNDING = 1e-9
 
 
 def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
-    """A line of the table: the best of `peers` by name (it is chosen after the fact), the
-    difference, and a verdict.
+    """A line of the table: the best of `peers` by name, chosen in hindsight, the difference, and a
+    verdict.
 
-    Entries have `mean`, `low` and `high`. Without a peer there is no verdict.
+    Entries have `mean`, `low` and `high`. If there are no peers, there is no verdict either.
     """
     if not peers:
         return {
@@ -47,7 +46,7 @@ def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
 
 
 def verdict(gap: Estimate) -> str:
-    """A difference, ours less the best peer, in words; not certain where its interval holds 0."""
+    """A difference (ours less the best peer) in words; "not certain" if its interval contains 0."""
     middle, low, high = gap
     if abs(middle) < ROUNDING:
         return "level"

@@ -1,5 +1,4 @@
-"""How often a skin that has moved is marked. In: what alignment measured. Out: a picture,
-SVG text."""
+"""Draws the results of the study `alignment`: accuracy and flagged sweeps over displacement."""
 
 from __future__ import annotations
 
@@ -23,13 +22,13 @@ from train.reports.plot_style import (
 
 Json = dict[str, Any]
 HEIGHT = 4.7
-"""Of the picture, inches."""
+"""Height of the picture, inches."""
 DIRECTIONS = {"rows": "along the finger, towards row 4", "columns": "across, towards column 4"}
 
 
 def draw(results: Json) -> str:
-    """Share named rightly and share marked over how far the skin was moved, along the finger and
-    across: SVG."""
+    """Share of correct answers and share of flagged sweeps over the displacement, along the finger
+    and across: SVG."""
     figure = Figure((WIDTH, HEIGHT))
     for number, (direction, points) in enumerate(results["moved"].items()):
         top = 1 - (0.5 + 2.15 * number) / HEIGHT

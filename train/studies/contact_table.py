@@ -1,8 +1,7 @@
-"""What the box answers where the skin has moved. In: what alignment measured. Out: tables
-in Markdown.
+"""The results of the study `alignment` as tables in Markdown.
 
-What it names by label alone stands beside what it answers, since the two are far apart where a skin
-has moved.
+They show the answers of the box beside the labels of the network alone, because these differ much
+for a displaced contact.
 """
 
 from __future__ import annotations
@@ -52,11 +51,11 @@ WAYS = {
     "columns, backwards": "towards column 1",
 }
 ROW_MM = 4.0
-"""From taxel to taxel of the simulated skin."""
+"""Pitch of the taxels of the simulated skin, mm."""
 
 
 def headline(result: Json) -> str:
-    """What was reached and what was missed, a line each."""
+    """A table of the main questions with their answers."""
     every = [point for points in result["moved"].values() for point in points]
     (still,) = (point for point in result["moved"]["rows"] if point["mm"] == 0)
     off = [point for point in every if abs(point["mm"]) == ROW_MM]
@@ -97,7 +96,8 @@ def headline(result: Json) -> str:
 
 
 def _losses(result: Json) -> Iterator[str]:
-    """For each direction where five points are lost, and what share is marked there."""
+    """For each direction, the displacement that costs five points, and the share of sweeps flagged
+    there."""
     for key, way in WAYS.items():
         lost = result[key]["lost_at_mm"]
         yield (
@@ -114,8 +114,8 @@ def _span(values: Iterable[float]) -> str:
 
 
 def table(result: Json) -> str:
-    """A line for each displacement of SHOWN and for T-HARD, with 95 % intervals, and what it was
-    measured on."""
+    """A line for each displacement of SHOWN and for T-HARD, with 95 % intervals, under a caption
+    with bundle, sets and commit."""
     rows = [("T-HARD, a row ahead and all else anew", result["T-HARD"]), *_moved(result)]
     caption = (
         f"Bundle {result['bundle']}, commit {result['commit']}, {result['machine']}: {result['T-HARD']['n']} sweeps of "
@@ -130,8 +130,8 @@ def table(result: Json) -> str:
 
 
 def sentence(result: Json) -> str:
-    """What a moved skin costs, in a sentence for the manual. Raises LookupError where a distance
-    was not measured."""
+    """The cost of a displaced contact, in a sentence for the manual. Raises LookupError if a
+    displacement was not measured."""
     still, row, far = (
         {point["mm"]: point for point in result["moved"]["rows"]}[mm] for mm in (0.0, 4.0, 6.0)
     )

@@ -1,8 +1,6 @@
-"""The development sets as a chart. In: the figures of development_experiment. Out: dots and axes,
-as pareto has them.
+"""The results of `development` as a chart: dots and axes, as pareto has them.
 
-Accuracies are of today's runs, times of development_times: all models of a chart took turns in one
-process.
+Times are from development_times, for which all models took turns in one process.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ Accuracies = Mapping[str, Json]
 MEAN = "development"
 """Key of the mean of lines, among a dot's accuracies."""
 SHOWN = ("mean", "low", "high", "n", "seeds")
-"""Of an accuracy, on the chart."""
+"""Decimals of an accuracy on the chart."""
 UNIT = "minirocket"
 """The method whose time is 1."""
 PROTOCOLS = {
@@ -52,7 +50,7 @@ PROTOCOLS = {
         "trained and tested on the parts that its publishers set",
     ),
 }
-"""Of a protocol: what it asks, and how."""
+"""By protocol: the question in few words, and the test in a sentence."""
 PUBLISHED = {
     "ACSF1": "power drawn by household appliances",
     "OSULeaf": "outlines of leaves",
@@ -60,16 +58,16 @@ PUBLISHED = {
     "ArrowHead": "outlines of arrowheads",
     "GunPoint": "a hand that draws a gun or only points",
 }
-"""The series of other fields, in a few words."""
+"""The published series, each in a few words."""
 
 
 def plain_case(case: Json) -> str:
-    """What a line tests, for people: "7 fabrics: a force it never felt"."""
+    """The test of a case in words: "7 fabrics: a force it never felt"."""
     return f"{case['case'].partition(', ')[0]}: {PROTOCOLS.get(case['protocol'], (case['protocol'],))[0]}"
 
 
 def about_case(case: Json) -> str:
-    """What a line tests, in a sentence without a stop."""
+    """The test of a case as a sentence without a full stop."""
     name = case["case"].partition(", ")[0]
     what = "simulated sweeps" if case["simulated"] else PUBLISHED.get(name, "real sweeps")
     return f"{what}, {case['materials']} classes: {PROTOCOLS.get(case['protocol'], ('', case['protocol']))[1]}"
@@ -102,10 +100,10 @@ def dots(
     cases: Sequence[Json],
     shared: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """A dot for each method or form that was timed, with its accuracy on each case that it has, and
-    on the mean of `shared`.
+    """A dot for each timed method and precision, with its accuracy on each of its cases and the
+    mean over `shared`.
 
-    The mean is of a method that has all of them. What has no accuracy at all has no dot.
+    Only a method with all of `shared` has a mean. A method without any accuracy gets no dot.
     """
     sets = {case["case"]: case["set"] for case in cases}
     found = []
@@ -133,13 +131,13 @@ def dots(
 
 
 def _form(figures: Json | None, form: str | None) -> Json | None:
-    """Accuracy of a method, or of its other precision `form`; None where it has none."""
+    """Accuracy of a method, or of its other precision `form`; None if it is missing."""
     return figures["forms"].get(form) if figures and form else figures
 
 
 def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
-    """Mean of a method's accuracies by case, with its interval. sets: what each case is made of;
-    those of one set err together."""
+    """Mean of a method's accuracies by case, with its interval. sets: the set of each case. Errors
+    of cases on one set are correlated."""
     groups: dict[str, list[Estimate]] = {}
     for case, figures in entries.items():
         groups.setdefault(sets[case], []).append(differences.of(figures))
@@ -147,7 +145,7 @@ def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
 
 
 def quickest(times: Iterable[Json]) -> dict[str, float]:
-    """Median time of a sweep in ms by method, of the form and library in which it is quickest."""
+    """Median time of a sweep in ms by method, in the precision and library in which it is quickest."""
     ms: dict[str, float] = {}
     for one in times:
         ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))
@@ -155,13 +153,12 @@ def quickest(times: Iterable[Json]) -> dict[str, float]:
 
 
 def relative_times(times: Iterable[Json], names: Sequence[str]) -> dict[str, str]:
-    """Time of a sweep with each method, in those of MiniRocket where it is quickest: "1/94" or
-    "11"."""
+    """Time of a sweep with each method, relative to MiniRocket: "1/94" or "11"."""
     ms = quickest(times)
     unit = ms.get(UNIT)
     return {name: ratio(ms[name] / unit) for name in names if name in ms} if unit else {}
 
 
 def ratio(value: float) -> str:
-    """A ratio as people say it: "1/94" or "11"."""
+    """A ratio as a fraction or a whole number: "1/94" or "11"."""
     return f"1/{1 / value:.0f}" if value < 0.5 else f"{value:.2g}"

@@ -1,8 +1,8 @@
 """The study `development`: all methods on all development sets.
 
-One set is never enough to tune on: a recipe that overfits one set shows it on the others. Accuracy comes from evaluate, whose finished folds are kept: an interrupted command goes on
-where it was, and `kept` reports what there is. The skin that was attached anew (T-HARD) is not
-among the sets: the simulator cannot be trusted with it, see decision 10.
+One set is never enough to tune on: a recipe that overfits one set shows it on the others. evaluate
+caches folds, so an interrupted command goes on where it was. T-HARD, the skin attached anew, is not
+among the sets, because the simulator cannot be trusted with it (decision 10).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from train.studies.study import NO_DATA, Study, StudyCase, StudyRun
 
 Json = dict[str, Any]
 OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
-"""No peers; the first of them that is there is compared with the peers."""
+"""Our methods. The first of them with results is compared with the peers."""
 PEERS = (
     "minirocket",
     "minirocket-augmented",
@@ -34,7 +34,7 @@ PEERS = (
     "edge-spectral",
 )
 EACH = (5, 10, 20)
-"""Points of a learning curve, as far as a set has more sweeps of each material than that."""
+"""Training sweeps of each material at the points of a learning curve, if a set has more of them."""
 
 
 FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
@@ -93,7 +93,7 @@ class Development:
     skipped: Sequence[str] = ()
 
     def results(self) -> Json:
-        """`cases` with what they were run on, and `results` by case, method and number of training
+        """The results: `cases` with their sets, and entries by case, method and number of training
         sweeps.
 
         Raises FormatError for an unknown method, and for a skipped case that does not exist.
@@ -161,15 +161,15 @@ def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
 
 
 def _name(case: str, each: int) -> str:
-    """Of a case, or of a point of its curve."""
+    """Name of a case, or of a point of its curve."""
     return f"{case}, {each} each" if each else case
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
-    """`run` with what it lacks of `earlier` runs: methods, their entries, what they left out, who
-    ran when, and times.
+    """`run` with the methods, entries, reasons, runs and times of `earlier` runs that it does not
+    have itself.
 
-    Raises FormatError where an earlier run was of other sweeps.
+    Raises FormatError if an earlier run was of other sweeps.
     """
     made = dict(run)
     for one in earlier:
@@ -226,8 +226,7 @@ def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
 
 
 def _entry(results: Sequence[Json]) -> Json:
-    """Accuracy with its interval, and costs, of the results of all seeds; so too of each other
-    precision."""
+    """Accuracy with its interval, and costs, over the results of all seeds, for each precision."""
     seeds = [result["seed"] for result in results]
     forms = {
         name: joined(

@@ -1,4 +1,4 @@
-"""Pictures of the development page. In: accuracies by case and method. Out: SVG text."""
+"""Pictures of the development page (SVG) from accuracies by case and method."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
 )
 THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
 FEW = (0, 0.5, 0.8, 0.9, 0.95, 1)
-"""Ticks of small plots."""
+"""Number of ticks in small plots."""
 
 
 def lines(
     cases: Sequence[Json], table: Mapping[str, Accuracies], ours: str, peers: Sequence[str]
 ) -> str:
-    """A line for each case: every peer a grey dot, the best of them dark and named, ours in the
-    accent colour with its interval."""
+    """A line for each case: every peer a grey dot, the best peer dark and named, ours in the accent
+    colour with its interval."""
     figure, axes = single_axes(0.36 * len(cases) + 1.0, left=0.56, right=0.95, top=0.42, bottom=0.5)
     lows: list[float] = []
     for y, case in enumerate(cases):
@@ -93,8 +93,8 @@ def lines(
 
 
 def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> str:
-    """A plot for each case: accuracy over training sweeps of a material; ours stands out, and the
-    peer that has most in the end.
+    """A plot for each case: accuracy over training sweeps of each material. Ours and the peer with
+    the best end stand out.
 
     found: {case: {method: {training sweeps, 0 for all: entry}}}.
     """
@@ -151,8 +151,8 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
 
 
 def _leader(those: Mapping[str, Mapping[int, Json]], ours: str) -> str:
-    """The peer with the whole curve that is most accurate with all sweeps; "" where there is no
-    peer."""
+    """The peer with a complete curve that is most accurate with all sweeps; "" if there are no
+    peers."""
     points = max(map(len, those.values()))
     whole = [
         name for name, line in those.items() if name not in (ours, *OURS) and len(line) == points

@@ -43,10 +43,10 @@ WANTED = {
     "4 fabrics, a direction out": 0.76,
     "simulated tubes, a position out": 0.985,
 }
-"""Accuracy that is wanted of ours, by case."""
+"""Target accuracy of ours, by case."""
 AHEAD, QUICKER, MOST_LOST, HALF = 0.01, 100, 0.005, 0.5
-"""Wanted of ours on the mean, less the best peer; of its speed, in MiniRocket's; most that int8 may
-lose of its own float's accuracy, and most that it may take of its time."""
+"""Targets of ours: lead on the best peer's mean, speed in MiniRocket's, largest loss of int8
+against float, largest time of int8 against float."""
 
 
 REAL = "real and published"
@@ -56,7 +56,7 @@ REAL = "real and published"
 def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
     """The pages (HTML) and pictures (SVG) by name; "chart" is there if something was timed.
 
-    Raises FormatError where there is no result of a method of ours.
+    Raises FormatError without a result of a method of ours.
     """
     quick: bool = figures.get("quick", False)
     table = by_case(figures["results"])
@@ -126,7 +126,7 @@ def _beside_peers(
     main: Json,
     times: Sequence[Json],
 ) -> dict[str, Any]:
-    """What the page says of ours beside the best peer of each line, and of what was wanted."""
+    """Ours beside the best peer of each case, and the targets."""
     lines = [
         comparison.line(
             plain_case(one),
@@ -147,7 +147,7 @@ def _beside_peers(
 def _words(
     of: Mapping[str, Json], names: Sequence[str], missing: Mapping[str, Sequence[str]]
 ) -> dict[str, Any]:
-    """Lines and methods as the page calls them; `missing` are the lines that a method lacks."""
+    """Names of cases and methods in words. missing: by method the cases without a result."""
     plain = {case: plain_case(one) for case, one in of.items()}
     return {
         "plain": plain,
@@ -163,7 +163,7 @@ def _words(
 
 
 def _with_origin(dots: Sequence[Json], figures: Json) -> list[dict[str, Any]]:
-    """The dots with what the chart says of where its figures are from."""
+    """The dots with commit, machine, set and seeds."""
     commits = ", ".join(dict.fromkeys(run["commit"] for run in figures["runs"]))
     seeds = sorted({seed for run in figures["runs"] for seed in run["seeds"]})
     known = {
@@ -185,7 +185,7 @@ def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
 
 
 def subject(table: Mapping[str, Accuracies]) -> str:
-    """The first of OURS with a result. Raises FormatError where there is none."""
+    """The first of OURS with a result. Raises FormatError if none has one."""
     for name in OURS:
         if any(name in row for row in table.values()):
             return name
@@ -205,7 +205,7 @@ def _means(
     names: Sequence[str],
     peers: Sequence[str],
 ) -> dict[str, Json]:
-    """Means of lines by what they are of; those over the same lines as an earlier one are left
+    """Means over cases, by the kind of cases. A mean over the same cases as an earlier one is left
     out."""
     real = [case for case in cases if not case["simulated"]]
     means: dict[str, Json] = {}
@@ -236,7 +236,7 @@ def mean_row(
     """Means over the cases (`shared`) that ours and the peers `of` have, in `entries` by method,
     and ours beside the best peer.
 
-    A method that lacks one has no mean. Without `of` it is those peers and cases that make the
+    A method without all of these cases has no mean. Without `of`, peers and cases are those of the
     largest table without gaps.
     """
     sets = {case["case"]: case["set"] for case in cases}
@@ -270,7 +270,7 @@ def targets(
     mean: Json,
     times: Sequence[Json],
 ) -> Iterator[Json]:
-    """What was wanted of ours, and what it has: a line each, reached or not."""
+    """A line for each target: wanted, reached, and whether it is met."""
     judged = [line for line in lines if line["best"]]
     if judged:
         near = sum(not line["short"] for line in judged)
@@ -308,7 +308,7 @@ def targets(
 
 
 def _time_targets(times: Sequence[Json], ours: str) -> Iterator[Json]:
-    """What was wanted of the time of a sweep, as far as it was measured."""
+    """Lines for the targets of time, if times were measured."""
     if (quick := quickest(times)).keys() >= {ours, UNIT}:
         share = quick[ours] / quick[UNIT]
         yield {
@@ -331,8 +331,7 @@ def _time_targets(times: Sequence[Json], ours: str) -> Iterator[Json]:
 def precisions(
     table: Mapping[str, Accuracies], cases: Sequence[str], names: Iterable[str]
 ) -> Iterator[Json]:
-    """Of each method that was run in int8 and in float: the means of both over those `cases` that
-    it has."""
+    """For each method with results in int8 and in float, the means of both over its `cases`."""
     for name in names:
         entries = [
             table[case][name]
@@ -360,8 +359,7 @@ def _missing(
     names: Sequence[str],
     left_out: Mapping[str, str],
 ) -> dict[str, list[str]]:
-    """Of each method the cases in which it has no result, and for which no other reason is
-    given."""
+    """By method the cases without a result and without another reason."""
     lacks = {
         name: [
             case for case in cases if name not in table[case] and f"{name}, {case}" not in left_out
@@ -372,8 +370,8 @@ def _missing(
 
 
 def learning_curves(results: Iterable[Json]) -> dict[str, dict[str, dict[int, Json]]]:
-    """{case: {method: {training sweeps of each material, 0 for all: entry}}} of cases that have
-    more than one."""
+    """{case: {method: {training sweeps of each material, 0 for all: entry}}} of cases with more
+    than one point."""
     curves: dict[str, dict[str, dict[int, Json]]] = {}
     for entry in results:
         curves.setdefault(entry["case"], {}).setdefault(entry["method"], {})[entry["each"]] = entry

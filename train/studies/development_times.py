@@ -1,8 +1,7 @@
-"""How long a sweep takes with each method, all in turns in one process. In: methods, sweeps. Out:
-figures for results.json.
+"""Time of a sweep with each method, all in turns in one process.
 
-What has a graph is packed and timed by the box's classifier, with its checks and features; what
-runs in a library alone is timed there, without checks.
+A method with a graph is packed as a bundle and timed in the box's classifier, with checks and
+features. Other methods are timed in their own library, without checks.
 """
 
 from __future__ import annotations
@@ -29,14 +28,12 @@ from train.studies.development_experiment import OURS
 Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
-SET = "sim:T-REAL:1"
-"""What all methods are trained on to be timed: sweeps of the packaged bundle's format."""
 ROUNDS = 10
-"""Of timing: the slowest methods take a hundred times as long as those of the chart."""
+"""Rounds of timing. The slowest methods take a hundred times as long as those of the chart."""
 EVERY, SHARE = 5, 0.25
 """A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
-iterations: what it has learnt makes it neither slower nor quicker. Ours choose their size, so they
-are trained as always."""
+iterations: training does not change the time of a sweep. Ours are trained as always, because
+training chooses their size."""
 
 
 def measured(
@@ -48,10 +45,10 @@ def measured(
     effort: Effort = FULL_EFFORT,
     rounds: int = ROUNDS,
 ) -> Json:
-    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep, of
-    a graph also `weights`, `macs` and `file_kb`, and what was `left_out`.
+    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep,
+    for graphs also `weights`, `macs` and `file_kb`, and the methods that are `left_out`.
 
-    Bundles are kept in `cache`, as those of the chart are.
+    Bundles are cached in `cache`, as for the chart.
     """
     entries: list[Json] = []
     calls: dict[str, measure.Call] = {}
@@ -80,8 +77,7 @@ def measured(
 
 
 def _briefly(name: str, effort: Effort) -> Method:
-    """The method, with SHARE of the iterations where it is a peer and the effort is not smaller
-    anyway."""
+    """The method, for a peer with SHARE of its iterations, unless the effort is smaller anyway."""
     return methods.find(
         [name], effort if name in OURS else replace(effort, share=min(SHARE, effort.share))
     )[0]
@@ -90,7 +86,7 @@ def _briefly(name: str, effort: Effort) -> Method:
 def _callable(
     method: Method, sweeps: Dataset, seed: int, cache: Path
 ) -> list[tuple[Json, measure.Call]]:
-    """The method in each of its precisions as the box runs it, and as its own library does."""
+    """The method in each precision of the box, and in its own library."""
     if method.library:
         some = sweeps.take(np.arange(0, len(sweeps), EVERY))
         model = method.train(some, model_inputs(method.input, some), seed)
@@ -116,6 +112,6 @@ def _callable(
 
 
 def _alone(model: Model, counts: Array) -> Array:
-    """Logits [K] of raw counts [T, R, C]."""
+    """Logits [K] from raw counts [T, R, C]."""
     logits: Array = model.logits(counts[None])[0]
     return logits

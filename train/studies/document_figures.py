@@ -1,7 +1,7 @@
 """Texts and pictures of results in README and written pages.
 
-The lists below say what stands where. `python -m train.studies figures` writes all of it, and a
-test fails if a document or a picture differs.
+FIGURES and PICTURES list them with their places. `python -m train.studies figures` writes all of
+them, and a test fails if a document or a picture differs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ README, ALIGN = "README.md", "docs/how-to/align.md"
 SPECIFICATIONS = "docs/reference/specifications.md"
 ALIGNMENT, FABRICS = "docs/alignment/README.md", "docs/fabricslide/README.md"
 MADE_BY = {"bench": "make bench"}
-"""The command that makes results which are not a study's."""
+"""The command that makes results which no study makes."""
 
 
 @dataclass(frozen=True, slots=True)

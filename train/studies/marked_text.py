@@ -1,5 +1,4 @@
-"""What a command writes into a document, between two markers. In: the document, a name, text. Out:
-the document."""
+"""Text of a command in a document, between two markers."""
 
 from __future__ import annotations
 
@@ -9,7 +8,8 @@ from appliance.core.errors import FormatError
 def insert(document: str, name: str, text: str, path: str) -> str:
     """`document` with `text` between <!-- NAME --> and <!-- /NAME -->.
 
-    Raises FormatError, naming the document's `path`, where these markers are not there once.
+    Raises FormatError with the document's `path` if it does not have this pair of markers exactly
+    once.
     """
     begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
     before, found, rest = document.partition(begin)

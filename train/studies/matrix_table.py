@@ -1,5 +1,4 @@
-"""What was reached and what was missed in a matrix of methods by protocols. In: the list that
-evaluate writes. Out: a picture, a table in a page."""
+"""Methods by protocols, from the list of `evaluate --json`: a picture, and a table for a page."""
 
 from __future__ import annotations
 
@@ -23,14 +22,13 @@ HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "
 
 
 def draw(results: Sequence[Json], out: Path, recordings: bool = False) -> None:
-    """The picture of all methods, an SVG file: of recordings instead of windows where
-    `recordings`."""
+    """Write the picture of all methods as SVG. recordings: count recordings instead of windows."""
     picture = plots.matrix(results, count="recording" if recordings else "window")
     put(out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
 
 
 def insert(results: Sequence[Json], page: Path) -> None:
-    """The headline, between the markers of a page. Raises FormatError where it has none."""
+    """Write the table between the markers of a page. Raises FormatError if it has no markers."""
     text = marked_text.insert(
         page.read_text(encoding="utf-8"), "matrix", headline(results), str(page)
     )
@@ -38,8 +36,8 @@ def insert(results: Sequence[Json], page: Path) -> None:
 
 
 def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
-    """A line for each test: `ours`, the best of the others (chosen after the fact), their
-    difference, a verdict.
+    """A line for each test: `ours`, the best of the others (chosen in hindsight), their difference,
+    a verdict.
 
     Sweeps without means come first. Each figure is the mean over seeds, with its 95 % interval.
     """

@@ -1,5 +1,4 @@
-"""Methods as people call them. In: the name that a command takes. Out: a name for pictures and
-pages, and what it is in a line."""
+"""Names and descriptions of methods for pictures and pages."""
 
 from __future__ import annotations
 
@@ -8,8 +7,8 @@ from train.models.methods import SHIPPED
 
 OURS = "Palpate"
 TRAINED = "compact"
-"""Our trained networks: the command's name of each says a bound of its weights, so people are told
-the weights."""
+"""Our trained networks. The name in commands contains a bound of the weights, so people see the
+number of weights."""
 NAMES = {
     SHIPPED: (
         f"{OURS}, as shipped",
@@ -87,12 +86,12 @@ FAMILIES = {
     "train.models.peers.edge_spectral": "edge tools",
 }
 OTHERS = "related work"
-"""Where a method is from, by its module."""
+"""The origin of a method, by its module."""
 
 
 def plain_name(method: str, weights: int | None = None) -> str:
-    """What people call a method; of our trained networks with their number of `weights` where that
-    is known."""
+    """The name of a method for people. A trained network of ours has its number of `weights`, if
+    that is known."""
     if method in NAMES:
         return NAMES[method][0]
     if method.partition("-")[0] == TRAINED:
@@ -101,7 +100,7 @@ def plain_name(method: str, weights: int | None = None) -> str:
 
 
 def about(method: str) -> str:
-    """What a method is, in a line; "" where nobody has said it."""
+    """A method in a line; "" if there is no description."""
     if method in NAMES:
         return NAMES[method][1]
     return (
@@ -112,10 +111,10 @@ def about(method: str) -> str:
 
 
 def size(weights: int) -> str:
-    """A number of weights: 28638 is "29 k", 2248 "2.2 k"."""
+    """A number of weights in words: 28638 is "29 k", 2248 is "2.2 k"."""
     return f"{weights / 1000:.{0 if weights >= 9950 else 1}f} k"
 
 
 def family(method: str) -> str:
-    """Where a method is from: OURS for ours."""
+    """The origin of a method: OURS for ours."""
     return FAMILIES.get(methods.module_of(method), OTHERS) if method in methods.every() else OTHERS

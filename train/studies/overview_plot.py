@@ -1,5 +1,4 @@
-"""The README's picture: finger, signal, answer. In: one simulated sweep and the packaged bundle.
-Out: SVG text."""
+"""Draws the README's picture: finger, signal and answer of one simulated sweep (SVG)."""
 
 from __future__ import annotations
 
@@ -32,9 +31,9 @@ from train.reports.plot_style import (
 
 WIDE, HIGH = 10.0, 3.5
 SEED = 7
-"""Of the simulated world: not one that the packaged bundle was trained on."""
+"""Seed of the simulated world. The packaged bundle was not trained on it."""
 SHOWN_S = 0.4
-"""How much of the sweep's middle is drawn."""
+"""Seconds of the middle of the sweep that are drawn."""
 
 
 def draw(material: str, seed: int = SEED) -> str:
@@ -70,7 +69,7 @@ def draw(material: str, seed: int = SEED) -> str:
 
 
 def _verdict(loaded: bundle.Bundle, samples: NDArray[Any]) -> Verdict:
-    """What the bundle answers to raw counts [T, R, C]."""
+    """The bundle's answer to raw counts [T, R, C]."""
     number = np.arange(len(samples))
     classifier = Classifier(loaded, SystemClock())
     return classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, samples)))

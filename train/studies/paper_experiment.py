@@ -58,11 +58,10 @@ def load(case: StudyCase, world: int) -> Dataset:
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same parts and worlds. fold_s: on one core, to
-    estimate the time left.
+    """Methods that are trained and tested in the same cases (`parts`) and worlds.
 
-    means_removed: from each taxel of each sweep; the methods' names then end in
-    paper_values.CENTRED.
+    fold_s: seconds of a fold on one core, to estimate the time left. means_removed: each taxel's
+    mean is subtracted in each sweep; the names of the methods then end in paper_values.CENTRED.
     """
 
     methods: tuple[str, ...]
@@ -94,8 +93,7 @@ FULL_STEPS = (
     Step(NETWORKS, EASY, (1,), 30),
     Step(("paper-cnn",), ("lopo",), (1,), 170),
 )
-"""Hard parts come first, so that a run that was interrupted has the most important results: see
-`kept`."""
+"""Hard cases come first: an interrupted run then has the most important results."""
 NEAR = ("position<=2",)
 QUICK = {
     "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
@@ -119,11 +117,11 @@ QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a method in a part of a simulated world, without the sweeps: labels [n], logits
-    [n, K] of those tested.
+    """The result of a method in a case of a simulated world: labels [n] and logits [n, K] of the
+    tested sweeps.
 
-    place: int [n], the attachment of the skin; no two worlds share one. costs: of each fold that
-    has them, [iterations, 2]. about: its entry in the results.
+    place: int [n], the attachment of the skin, unique over worlds. costs: of each fold that has
+    them, [iterations, 2]. about: its entry in the results.
     """
 
     part: str
@@ -147,12 +145,12 @@ class Outcome:
 
     @cached_property
     def explorations(self) -> Array:
-        """What `objects` draws of these sweeps."""
+        """The explorations that `objects` draws of these sweeps."""
         return objects(self.labels, self.place, self.world)
 
     @property
     def right(self) -> Array:
-        """bool [n], which were named rightly."""
+        """bool [n], whether the label is right."""
         return np.asarray(self.logits.argmax(1) == self.labels)
 
 
@@ -160,10 +158,10 @@ STUDY = Study("paper", FULL, tuple(dict.fromkeys(m for step in FULL_STEPS for m 
 
 
 def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None) -> Json:
-    """Train and test all of the plan; the results.
+    """Train and test the whole plan; the results.
 
     only: methods that are run; all others stay as in `earlier` results. Raises FormatError as
-    evaluate, and where `only` has none of the plan's methods.
+    evaluate does, and for a name in `only` that the plan does not have.
     """
     cases, steps = (QUICK, QUICK_STEPS) if how.quick else (FULL, FULL_STEPS)
     if how.quick:
@@ -174,7 +172,7 @@ def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None
 
 
 def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
-    """The steps with these methods alone. Raises FormatError for one that no step has."""
+    """The steps with these methods alone. Raises FormatError for a method without a step."""
     known = dict.fromkeys(m for step in steps for m in step.methods)
     for name in only:
         if name not in known:
@@ -186,7 +184,7 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
 
 
 def planned(found: Json, steps: Sequence[Step]) -> Json:
-    """What `found` has of methods that are still in the plan."""
+    """`found` without methods that are not in the plan any more."""
     known = {m for step in steps for m in step.methods}
     lists = {
         key: [
@@ -206,8 +204,8 @@ def planned(found: Json, steps: Sequence[Step]) -> Json:
 
 
 def joined(found: Json, earlier: Json) -> Json:
-    """Two results as one: of what both have, `found` counts. Raises FormatError where one of
-    them is a quick run."""
+    """Two results as one. Entries of `found` replace those of `earlier`. Raises FormatError for a
+    quick run beside a whole one."""
     if found["quick"] != earlier["quick"]:
         raise FormatError(
             "a quick run and a whole one cannot be joined; write the quick one to another --out"
@@ -224,12 +222,12 @@ def joined(found: Json, earlier: Json) -> Json:
 
 
 def _at(one: dict[str, Any]) -> tuple[Any, ...]:
-    """Part, method and world, or worlds, of a line."""
+    """Key of an entry: part, method, means removed, world."""
     return one["part"], one["method"], one.get("means_removed"), one.get("world")
 
 
 def with_curve(found: Json, curve: Json) -> Json:
-    """Results with the paper's CNN as cnn_curve has followed it so far. Raises FormatError for the
+    """Results with the newest point of cnn_curve for the paper's CNN. Raises FormatError for the
     curve of another training."""
     if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
         raise FormatError(
@@ -239,7 +237,7 @@ def with_curve(found: Json, curve: Json) -> Json:
 
 
 def as_printed(curve: Json, cases: Mapping[str, StudyCase]) -> Json:
-    """A summary of the paper's CNN from what cnn_curve has followed so far, as its newest point."""
+    """A summary of the paper's CNN at the newest point of its curve."""
     point, ran = (
         curve["points"][-1],
         f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50",
@@ -283,7 +281,7 @@ def as_printed(curve: Json, cases: Mapping[str, StudyCase]) -> Json:
 def _outcomes(
     cases: Mapping[str, StudyCase], steps: Sequence[Step], how: StudyRun
 ) -> Iterator[Outcome]:
-    """Step by step; after each fold `log` gets the progress and an estimate of the time left."""
+    """Run step by step. After each fold `log` gets the progress and an estimate of the time left."""
     todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
     expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
     pace = 1 / (os.cpu_count() or 1)
@@ -309,7 +307,7 @@ def _outcomes(
 def summary(
     outcomes: Sequence[Outcome], cases: Mapping[str, StudyCase], effort: Effort = FULL_EFFORT
 ) -> dict[str, Any]:
-    """All that paper_report needs, as plain numbers."""
+    """All figures of the page, as plain numbers."""
     groups: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in outcomes:
         groups.setdefault((outcome.part, outcome.method), []).append(outcome)
@@ -341,8 +339,7 @@ def summary(
 
 
 def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
-    """One line of the table. attachments: how many there are, and the accuracy of the worst and the
-    best of them."""
+    """One line of the table. attachments: their number, and the accuracy of the worst and the best."""
     right, place = (
         np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place")
     )
@@ -362,7 +359,7 @@ def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
 
 
 def _median(values: Sequence[float | None]) -> float | None:
-    """None where one was not measured."""
+    """The median; None if a value was not measured."""
     measured = [value for value in values if value is not None]
     return round(float(np.median(measured)), 4) if len(measured) == len(values) else None
 
@@ -373,11 +370,11 @@ def estimate(right: Array, place: Array) -> list[float]:
 
 
 def objects(labels: Array, place: Array, seed: int) -> Array:
-    """Explorations of one object each, indices of sweeps [n, S]: sec. V.D, sweeps of one material
-    from the test set.
+    """Explorations of one object each, indices of sweeps [n, S] (paper, sec. V.D: sweeps of one
+    material from the test set).
 
-    Every sweep comes first once; others of its material and place follow in random order, as many
-    as every group has.
+    Every sweep comes first once. Others of its material and attachment follow in random order, as
+    many as the smallest group has.
     """
     rng = np.random.default_rng(seed)
     alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
@@ -389,8 +386,8 @@ def objects(labels: Array, place: Array, seed: int) -> Array:
 
 
 def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
-    """Estimates after one, two, three sweeps of an object, by "vote" and by "product", as the box
-    fuses."""
+    """Accuracy after one, two and three sweeps of an object, by "vote" and by "product", the rules
+    of the box."""
     estimates: dict[str, list[list[float]]] = {}
     for rule in ("vote", "product"):
         for n in range(1, SEVERAL + 1):
@@ -402,7 +399,7 @@ def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
 
 
 def _fused(outcome: Outcome, n: int, rule: str) -> Array:
-    """bool [n], whether the first `n` sweeps of each exploration give its material."""
+    """bool [n], whether the first `n` sweeps of each exploration give the right material."""
     scores = softmax(outcome.logits)
     drawn = outcome.explorations[:, :n]
     named = np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn])

@@ -1,8 +1,7 @@
-"""The page of the paper's experiment, in the paper's order. In: its summary, as results.json holds
-it. Out: page, pictures.
+"""Renders the page of the study `paper`, in the order of the paper.
 
-Nothing is computed here but differences. Every sentence with a number takes it from the summary, so
-that it is true of whatever was run.
+It computes nothing but differences. Every sentence with a number takes it from the results, so it
+is true of each run.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ COLUMNS = {
 FIVE = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 BEST = "H-svm"
 OWN = ("default-reattached", "default")
-"""Ours, that of the packaged bundle first."""
+"""Our methods, the packaged recipe first."""
 NEAR, NEAR_ON_AVERAGE = 0.06, 0.03
-"""What the calibration aims at."""
+"""Targets of the calibration."""
 Row = Mapping[str, Any]
 Key = tuple[str, str]
 """Part and method."""
@@ -55,10 +54,9 @@ Key = tuple[str, str]
 def render(
     summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = None
 ) -> tuple[str, dict[str, str]]:
-    """The page (HTML) of a summary, as paper_experiment.summary gives it, and its pictures (SVG) by
-    name.
+    """The page (HTML) of the results, and its pictures (SVG) by name.
 
-    box_on_hard: what the box answers to T-HARD's sweeps, see pages.box_on_hard.
+    box_on_hard: the box's answers to T-HARD's sweeps, see pages.box_on_hard.
     """
     report = PaperReport(summary)
     pictures = report.pictures()
@@ -77,7 +75,7 @@ def render(
 
 
 class PaperReport:
-    """What page and pictures show of a summary."""
+    """Content of page and pictures."""
 
     def __init__(self, summary: Mapping[str, Any]) -> None:
         self.summary = summary
@@ -130,7 +128,7 @@ class PaperReport:
         }
 
     def run(self) -> dict[str, Any]:
-        """What was run, and what came out in short."""
+        """Methods, sets and commits of the run, and the results in short."""
         summary, table = self.summary, self.summary["table"]
         sets = [
             [
@@ -207,7 +205,7 @@ class PaperReport:
         }
 
     def network(self) -> dict[str, Any]:
-        """Figs. 9 to 12; `network` is empty where the paper's CNN was not run."""
+        """Figs. 9 to 12; `network` is empty if the paper's CNN was not run."""
         if not self.cnns:
             return {"network": "", "curve": None, "own": [short_name(m) for m in self.own]}
         names, confusion, costs = (
@@ -232,12 +230,11 @@ class PaperReport:
         }
 
     def _shown(self) -> list[str]:
-        """The paper's network, or the form of it that was run, and ours."""
+        """The paper's network, or the variant that was run, and ours."""
         return [*self.cnns[:1], *self.own]
 
     def _commits(self) -> list[list[str]]:
-        """Each commit, and the methods whose results are of it; the one with the most results
-        last."""
+        """Each commit with the methods of its results. The commit with most results comes last."""
         by_commit: dict[str, dict[str, None]] = {}
         for result in self.summary["results"]:
             by_commit.setdefault(result["commit"], {})[result["method"]] = None
@@ -247,8 +244,7 @@ class PaperReport:
         ]
 
     def _overview(self, method: str) -> dict[str, Any]:
-        """One line of the summary at the top: its result in each of HARD, None where there is
-        none."""
+        """One line of the summary at the top: its result in each of HARD, None if there is none."""
         rows = [self.rows.get((part, method)) for part in HARD]
         return {
             "name": display_name(method),
@@ -257,7 +253,8 @@ class PaperReport:
         }
 
     def _match(self) -> dict[str, Any]:
-        """How far the simulator is from the printed accuracies of the five classical methods."""
+        """Differences between the simulator and the printed accuracies of the five classical
+        methods."""
         rows = [self.rows[part, m] for part in FIGURES for m in FIVE if (part, m) in self.rows]
         away = np.array([row["share"][0] - row["printed"] for row in rows])
         off = [
@@ -276,7 +273,7 @@ class PaperReport:
         }
 
     def _figure(self, part: str) -> dict[str, Any]:
-        """One of Figs. 4 to 7: its title and numbers, and the best of ours and of those printed."""
+        """One of Figs. 4 to 7: title, numbers, the best of ours and of those printed."""
         rows = [self.rows[part, m] for m in FIVE if (part, m) in self.rows]
         return {
             "title": TITLES[part],
@@ -294,7 +291,7 @@ class PaperReport:
         return plots.Bar(short_name(row["method"]), tuple(row["share"]), row["printed"])
 
     def _compared(self) -> list[Key]:
-        """What Fig. 10 compares."""
+        """The bars of Fig. 10."""
         return [
             (part, m) for part in HARD for m in (BEST, *self._shown()) if (part, m) in self.rows
         ]
@@ -303,8 +300,8 @@ class PaperReport:
         return [np.array(cost) for cost in self.summary["costs"][self.cnns[0]]]
 
     def _numbers(self, those: Sequence[Key]) -> list[Row]:
-        """Lines of a table of numbers, each with a name; the part is in it where there are
-        several."""
+        """Lines of a table of numbers, each with a name. If there are several parts, the name has
+        the part."""
         several_parts = len({part for part, _ in those}) > 1
         return [
             {
@@ -321,7 +318,7 @@ class PaperReport:
 
 
 def _readable(name: str) -> str:
-    """A set's name with letters for the numbers that differ from world to world."""
+    """A set's name with letters for numbers that differ between worlds."""
     return name.format(w="W", a="A", b="B")
 
 

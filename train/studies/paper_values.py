@@ -1,7 +1,7 @@
-"""Values printed in the paper: accuracies by part and method, training cost, confusion, several
+"""Values printed in the paper: accuracies by case and method, training cost, confusion, several
 sweeps.
 
-Its figures did not survive as text; these are the values printed in them. Parts are named as in
+The figures of the paper are not text; these are the values printed in them. Cases are named as in
 paper_experiment.
 """
 
@@ -20,10 +20,10 @@ ACCURACY: dict[str, dict[str, float]] = {
 }
 """Figs. 4 to 7."""
 CENTRED = ", means out"
-"""Ends the name of a method, in results.json, that got sweeps without each taxel's mean."""
+"""Suffix of a method whose sweeps had each taxel's mean subtracted."""
 CNNS = ("paper-cnn", "paper-cnn" + CENTRED)
-"""The paper's network, and the same on sweeps without each taxel's mean, which needs far fewer
-iterations: the printed numbers are those of the first, and the second is compared with them."""
+"""The paper's network, and the same network on sweeps without each taxel's mean, which needs far
+fewer iterations. The printed numbers are those of the first; the second is compared with them."""
 for _cnn in CNNS:
     ACCURACY["lopo"][_cnn], ACCURACY["hard"][_cnn] = 0.923, 0.917  # Fig. 10
 COST = ((500, 0.08), (2500, 0.002))

@@ -1,9 +1,8 @@
-"""The Pareto front of the chart, and its axes. In: dots, as chart.json lists them. Out: a spot for
-each network.
+"""The Pareto front of the chart, and its axes.
 
-A network may have been measured in several forms: in float and in int8, by the box's runtime and by
-a library of its own. It is shown once, where it costs least. scatter draws the spots, chart_page
-lets a reader choose among them.
+A network may be measured in several forms: in float and in int8, by the box's runtime and by its
+own library. It is shown once, in the cheapest form. scatter draws the spots; chart_page lets a
+reader choose axes.
 """
 
 from __future__ import annotations
@@ -19,16 +18,15 @@ from train.studies.method_names import OURS, plain_name
 
 Dot = Mapping[str, Any]
 ONCE_SHIPPED = "compact"
-"""What was shipped before methods.SHIPPED: the one of ours that stands out in charts that are older
-than it."""
+"""The packaged method before methods.SHIPPED. It stands out in older charts."""
 
 
 @dataclass(frozen=True)
 class ChartAxis:
-    """A figure that can be on an axis. short: its name; about: what it is, in a sentence; unit: ""
-    for shares and counts.
+    """A figure that can be on an axis.
 
-    chance: of an accuracy, the share that guessing names rightly.
+    short: its name. about: its meaning in a sentence. unit: "" for shares and counts. chance: of an
+    accuracy, that of guessing.
     """
 
     short: str
@@ -59,10 +57,9 @@ COSTS = {
     ),
     "weights": ChartAxis("weights", "numbers found by training"),
 }
-"""Less is better."""
+"""Costs: less is better."""
 TUBES, FABRICS = 1 / len(MATERIALS), 1 / 7
-"""What guessing reaches on the simulated tubes, and on the fabrics of FabricSlide that the chart
-shows."""
+"""Accuracy of guessing on the simulated tubes, and on the fabrics of FabricSlide in the chart."""
 ACCURACIES = {
     "speed": ChartAxis(
         "a speed it never felt",
@@ -111,16 +108,16 @@ ACCURACIES = {
         "shift": ("skin shifted by a row", "the skin sits one row of taxels further along"),
     }.items()
 }
-"""More is better; real ones first. A taxel is one sensing element of the skin."""
+"""Accuracies: more is better. Real sets come first."""
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A network on the chart. dot: the form that costs least; x: its cost; y: its accuracy; best:
-    whether it is on the front.
+    """A network on the chart.
 
-    methods: all that are this network. on_box: whether the box can run any form of it. other: cost
-    and accuracy in the other precision, float or int8, where it was measured so.
+    dot: the cheapest form. x: its cost. y: its accuracy. best: whether it is on the front. methods:
+    all methods with this network. on_box: whether the box can run a form of it. other: cost and
+    accuracy in the other precision, float or int8, if it was measured.
     """
 
     dot: Dot
@@ -133,10 +130,10 @@ class Spot:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which of `points` (cost, accuracy) no other dominates, that is, costs no more, is no less
-    accurate, and better in one.
+    """For each of `points` (cost, accuracy), whether it is on the Pareto front.
 
-    Equal points are all on the front or all behind it.
+    A point is dominated by another point that is not worse in both figures and better in one. Equal
+    points are all on the front, or all behind it.
     """
     return [
         not any(c <= cost and a >= accuracy and (c, a) != (cost, accuracy) for c, a in points)
@@ -145,7 +142,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def placed(dots: Sequence[Dot], x: str, y: str) -> list[Spot]:
-    """A spot for each network that has both figures, cheapest first."""
+    """A spot for each network with both figures, the cheapest first."""
     forms: dict[int, list[Dot]] = {}
     for network, dot in zip(networks(dots), dots, strict=True):
         if dot.get(x) is not None and y in dot["accuracy"]:
@@ -157,7 +154,7 @@ def placed(dots: Sequence[Dot], x: str, y: str) -> list[Spot]:
 
 
 def _spot(forms: Sequence[Dot], x: str, y: str) -> Spot:
-    """One network's, whose forms all have both figures."""
+    """The spot of one network, whose forms all have both figures."""
     by_cost = sorted(forms, key=lambda dot: (dot[x], dot["precision"] != "int8"))
     other = next((dot for dot in by_cost if dot["precision"] != by_cost[0]["precision"]), None)
     return Spot(
@@ -174,10 +171,10 @@ def _at(dot: Dot, x: str, y: str) -> tuple[float, float]:
 
 
 def networks(dots: Sequence[Dot]) -> list[int]:
-    """Of each dot the number of the first one that is the same network.
+    """For each dot the number of the first dot of the same network.
 
-    Forms of a method are one network; so are two methods of ours with the same weights and
-    operations that were right equally often under every protocol that both were run under.
+    Forms of a method are one network. Two methods of ours are one network if they have the same
+    weights and operations, and equal counts of right answers under every common protocol.
     """
     first: dict[str, int] = {}
     of = [first.setdefault(dot["method"], i) for i, dot in enumerate(dots)]
@@ -201,22 +198,22 @@ def _same(one: Dot, other: Dot) -> bool:
 
 
 def subject(dots: Sequence[Dot]) -> str:
-    """The method that stands out: what the box ships, or shipped when the dots were measured; ""
-    where neither is there."""
+    """The method that stands out: the packaged method of today, or of the day of the measurement;
+    "" if neither is there."""
     return next(
         (name for name in (SHIPPED, ONCE_SHIPPED) if any(dot["method"] == name for dot in dots)), ""
     )
 
 
 def name(dot: Dot) -> str:
-    """A dot's name, unique in a chart, as commands take it."""
+    """A dot's name in commands, unique in a chart."""
     return f"{dot['method']} {dot['precision']}" + (
         "" if dot["runtime"] == "onnx" else f" in {dot['runtime']}"
     )
 
 
 def label(dot: Dot, short: bool = False) -> str:
-    """A network's name for people. short: without saying that it is ours, for a picture whose
-    colour says so."""
+    """A network's name for people. short: without "Palpate", for pictures in which colour marks
+    ours."""
     full = plain_name(str(dot["method"]), dot.get("weights"))
     return full.removeprefix(f"{OURS}, ").removesuffix(" weights") if short else full

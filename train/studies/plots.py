@@ -1,4 +1,4 @@
-"""Pictures of results. In: numbers, as evaluate and paper give them. Out: SVG text.
+"""Pictures of results (SVG) for evaluate and the study `paper`.
 
 Our results are in the accent colour, values printed in the paper are hollow diamonds; all else is
 grey.
@@ -59,7 +59,7 @@ THIN: dict[str, Any] = {"color": GREY, "linewidth": 0.6, "alpha": 0.6}
 
 @dataclass(frozen=True)
 class Bar:
-    """One row of `bars`: our result, and the value printed in the paper, where there is one."""
+    """One row of `bars`: our result, and the value printed in the paper, if there is one."""
 
     name: str
     ours: Estimate
@@ -67,9 +67,9 @@ class Bar:
 
 
 def bars(groups: Mapping[str, Sequence[Bar]], about: str, chance: float = 0.0) -> str:
-    """Bars with 95 % intervals; printed values as marks, and both as numbers beside them.
+    """Bars with 95 % intervals, printed values as marks, and both as numbers beside them.
 
-    groups: rows by heading ("" for none). chance: share right of a random guess, drawn as a line.
+    groups: rows by heading ("" for none). chance: accuracy of guessing, drawn as a line.
     """
     lines = [
         line
@@ -111,10 +111,9 @@ def _bar(axes: Axes, y: float, bar: Bar) -> None:
 
 
 def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: str) -> str:
-    """Cost over iterations, both logarithmic: each fold thin, the median strong. costs: [n, 2]
-    each, as Fold.cost.
+    """Cost over iterations, both logarithmic: each fold thin, the median strong.
 
-    printed: marks (iteration, cost).
+    costs: [n, 2] each, as Fold.cost. printed: marks (iteration, cost).
     """
     figure, axes = single_axes(2.9, left=0.14, right=0.97, top=0.25, bottom=0.45)
     folds = [np.maximum(cost, [1, 1e-5]) for cost in costs if len(cost)]
@@ -165,8 +164,7 @@ def sweeps(
     printed: Mapping[str, Sequence[float | None]],
     about: str,
 ) -> str:
-    """A panel for each method: share right after one, two, three … sweeps, by "product" and by
-    "vote"."""
+    """A panel for each method: accuracy after one, two, three … sweeps, by "product" and by "vote"."""
     lowest = min(e[1] for rules in ours.values() for line in rules.values() for e in line)
     bottom, figure = max(np.floor(lowest * 10) / 10, 0), Figure((WIDTH, 2.7))
     for i, (name, rules) in enumerate(ours.items()):
@@ -199,8 +197,7 @@ def sweeps(
 def _fusion_panel(
     axes: Axes, rules: Mapping[str, Sequence[Estimate]], printed: Sequence[float | None]
 ) -> int:
-    """Both rules of one method, and marks of what was printed; how many sweeps there are at
-    most."""
+    """Draw both rules of one method, and marks of printed values; the largest number of sweeps."""
     looks: dict[str, tuple[dict[str, Any], int]] = {
         "vote": ({"color": GREY, "linewidth": 1.4}, -12),
         "product": (STRONG[0], 7),
@@ -253,7 +250,7 @@ def matrix(
 
 
 def _left_out(protocol: str) -> str:
-    """What a protocol leaves out, in two lines."""
+    """The condition that a protocol leaves out, in two lines."""
     kind, _, name = protocol.partition(":")
     name = {"rep": "repetition"}.get(name, name.split("=")[0])
     return {"leave": f"{name}\nleft out", "split": f"split by\n{name}", "random": "random\nparts"}[
@@ -267,11 +264,10 @@ def _mean(seeds: Sequence[Estimate]) -> Estimate:
 
 
 def grid(panels: Mapping[str, Grid], about: str) -> str:
-    """Per cent with intervals in a table of rows x columns for each panel; a deeper colour for
-    more.
+    """A table of rows x columns for each panel: per cent with intervals, more in a deeper colour.
 
-    Columns are in the given order, so put the hard ones first; rows with the best of the first
-    panel on top.
+    Columns keep their order, so give the hard ones first. The best rows of the first panel are on
+    top.
     """
     first = next(iter(panels.values()))
     names = list(dict.fromkeys(row for panel in panels.values() for row, _ in panel))
@@ -306,7 +302,7 @@ def _table(axes: Axes, panel: Grid, names: Sequence[str]) -> None:
 
 
 def _ease(protocol: str) -> int:
-    """Hard protocols first."""
+    """Sort key: hard protocols first."""
     return ("leave", "split", "random").index(protocol.split(":")[0])
 
 

@@ -45,7 +45,7 @@ class ResultFile:
 
     @property
     def command(self) -> str:
-        """As a person types it."""
+        """The command line."""
         first, *rest = self.words
         return " ".join([COMMANDS.get(first, f"python -m {first}"), *rest])
 
@@ -90,12 +90,12 @@ REPORTS = (
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)
     ),
 )
-"""The most important come first. The last three measure this machine: run nothing else
+"""All results, the most important first. The last three measure this machine: run nothing else
 meanwhile."""
 
 
 def names() -> list[str]:
-    """Of all reports."""
+    """Names of all reports."""
     return [report.name for report in REPORTS]
 
 
@@ -107,7 +107,7 @@ def named(wanted: Sequence[str]) -> list[ResultFile]:
 
 
 def require_project() -> None:
-    """Raises FormatError where the working folder is not the project's."""
+    """Raises FormatError if the working folder is not the project's."""
     if not (DOCS.is_dir() and Path("README.md").is_file()):
         raise FormatError(
             f"{Path.cwd()} has no docs/ and README.md; run this in the project's folder"
@@ -115,7 +115,7 @@ def require_project() -> None:
 
 
 def table(reports: Sequence[ResultFile]) -> str:
-    """A line for each report: its name, its command, and why it would be made again or left out."""
+    """A line for each report: name, command, and the reason to make it again or to leave it out."""
     width = max(len(report.name) for report in reports)
     lines = [
         f"{report.name:<{width}}  {_state(report)}\n{'':<{width}}  {report.command}"
@@ -137,8 +137,8 @@ def make(
     """Make the reports that are named, or all that are stale. where: options for commands that
     compute folds.
 
-    What is lacking is left out by name; after a failure the others are still made. Raises
-    FormatError at the end where a report failed or one that was named is lacking something.
+    A report whose needs are not met is left out by name. After a failure the others are still made.
+    At the end, raises FormatError if a report failed, or if a named report was left out.
     """
     reports = [report for report in named(wanted) if wanted or report.stale()]
     left: dict[str, str] = {}

@@ -1,8 +1,8 @@
-"""The chart without scripts: accuracy over cost. In: dots, as chart.json lists them. Out: SVG text.
+"""The chart without scripts: accuracy over cost (SVG), from dots as chart.json has them.
 
-Each network is one mark: ours in the accent colour, what the box ships in a ring; of the others
-dark where none is both cheaper and more accurate, else grey. Squares are int8, circles float, and
-an arrow leads from the one to the other; what cannot run on the box is hollow.
+Each network is one mark. Ours are in the accent colour, with a ring around the packaged recipe.
+Peers are dark on the front, else grey. Squares are int8, circles float; an arrow joins both
+precisions of a network. A network that cannot run on the box is hollow.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from train.studies.pareto import (
 HEIGHT, ABOVE, BELOW, FOOT = 3.9, 0.7, 0.5, 0.42
 """Inches: of a panel, above and below its plot, and of the legend."""
 HEAD = 33.0
-"""Points from a plot to its title: two lines stand between them."""
+"""Points between a plot and its title, for two lines."""
 LETTER = 0.56
 """Width of a letter, in sizes of the text: more than the mean of most fonts."""
 MARK = 3.2
-"""Half of a mark, points."""
+"""Half the size of a mark, points."""
 RING, FARTHER, GUESSED = 13.5, 1.5, 6.0
-"""Around what is shipped, points across; how much farther its name is; what is kept free above the
-floor, where guessing is."""
+"""Points: the ring around the packaged recipe; the additional distance of its name; the space above
+the floor for the line of guessing."""
 PLACES = [
     (6, 0, "left"),
     (0, 10, "center"),
@@ -72,11 +72,11 @@ PLACES = [
     (-8, 16, "right"),
     (-8, -16, "right"),
 ]
-"""Where a name may stand, points from its dot, and its alignment; the best first."""
+"""Places of a name relative to its dot, in points, and its alignment; the best first."""
 SIDES = {"left": 0.0, "center": 0.5, "right": 1.0}
-"""Where along a name its dot is."""
+"""The side of a name at which its dot is."""
 LEADER = {"arrowstyle": "-", "color": ACCENT, "linewidth": 0.9, "shrinkA": 0, "shrinkB": RING / 2}
-"""From the name of what is shipped to its dot."""
+"""The line from the name of the packaged recipe to its dot."""
 Box = tuple[float, float, float, float]
 
 
@@ -86,7 +86,7 @@ def chart(
     cost: str = "ms_p50",
     accuracies: Mapping[str, ChartAxis] = ACCURACIES,
 ) -> str:
-    """Accuracy over `cost`, a panel for each of `panels` that some dot has."""
+    """Accuracy over `cost`, a panel for each of `panels` that a dot has."""
     there = [y for y in panels if placed(dots, cost, y)]
     height = HEIGHT * len(there) + FOOT
     figure, chosen = Figure((WIDTH, height), dpi=72), subject(dots)
@@ -143,7 +143,7 @@ def _panel(
 
 
 def _head(axes: Axes, spots: Sequence[Spot], title: str, cost: ChartAxis, chosen: str) -> None:
-    """What is upwards, and what one is to read first: what the box ships, and the most accurate
+    """The title of an axis, and the two main results: the packaged recipe, and the most accurate
     other method."""
     shipped = next((spot for spot in spots if chosen in spot.methods), None)
     peer = max(
@@ -170,7 +170,7 @@ def _head(axes: Axes, spots: Sequence[Spot], title: str, cost: ChartAxis, chosen
 
 
 def colour(spot: Spot) -> str:
-    """Of a network's mark."""
+    """Colour of a network's mark."""
     return ACCENT if spot.dot["family"] == OURS else BLACK if spot.best else GREY
 
 
@@ -220,8 +220,8 @@ def _mark(axes: Axes, spot: Spot, y: str, chosen: str) -> None:
 
 
 def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any], chosen: str) -> None:
-    """Names beside the dots, each once, what the box ships first; a name that fits nowhere is left
-    out.
+    """Names beside the dots, each once, the packaged recipe first. A name without a free place is
+    left out.
 
     stairs [n, 2]: the front's corners, in points.
     """
@@ -245,8 +245,8 @@ def _labels(axes: Axes, spots: Sequence[Spot], stairs: NDArray[Any], chosen: str
 def _name(
     axes: Axes, spot: Spot, at: NDArray[Any], taken: list[Box], own: int, frame: Box, chosen: str
 ) -> None:
-    """The name of a spot at the first of PLACES that is free; it is then taken. own: its mark's
-    number in `taken`."""
+    """The name of a spot at the first free one of PLACES, which is then taken. own: number of its
+    mark in `taken`."""
     mine = chosen in spot.methods
     text, far = label(spot.dot, short=not mine), FARTHER if mine else 1.0
     width = LETTER * SMALL * len(text) * (1.12 if mine else 1.0)
@@ -274,8 +274,8 @@ def _name(
 
 
 def _important(spots: Sequence[Spot], chosen: str) -> Iterator[int]:
-    """Indices of the spots in the order in which they get names: what ships, the front, the best of
-    each family, the rest."""
+    """Indices of the spots in the order in which they get names: the packaged recipe, the front,
+    the best of each family, the rest."""
     families: dict[str, int] = {}
     for i, spot in enumerate(spots):
         if spot.y > spots[families.setdefault(spot.dot["family"], i)].y:

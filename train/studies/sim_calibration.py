@@ -1,9 +1,8 @@
-"""Calibration of the simulator: the paper's baselines on simulated sweeps beside its printed
-accuracies.
+"""The study `calibrate`: the paper's baselines on simulated sweeps beside its printed accuracies.
 
-In: seeds of simulated worlds. Out: the twenty accuracies of Figs. 4 to 7, how far they are from the
-printed ones, and what they are without each of the simulator's effects. No network is used: what
-the CNNs reach is a result.
+It measures the twenty accuracies of Figs. 4 to 7, their distance from the printed ones, and the
+effect of each part of the simulator. Networks are not calibrated to, so their accuracies remain a
+result.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from train.models.peers import baselines
 Array = NDArray[Any]
 METHODS = tuple(baselines.ESTIMATORS)
 ATTACHMENTS = 5
-"""T-HARD is one attachment in the paper. A single one varies much: a seed's accuracy is the mean
-over so many."""
+"""Attachments of T-HARD in a seed. The paper has one, but the accuracy at a single attachment
+varies much, so a seed's accuracy is a mean over several."""
 LAB, REAL, HARD = 0, 1, tuple(range(2, 2 + ATTACHMENTS))
 """The sets that `draw` joins, by their number in the group "set"."""
 
@@ -60,8 +59,8 @@ def draw(
 ) -> sets.Dataset:
     """T-LAB, T-REAL and ATTACHMENTS times T-HARD of one seed, joined in this order.
 
-    Equal seeds draw the same places, attachments and noise in every world, so that worlds can be
-    compared. per_material: sweeps of each tube at each position; None stands for the paper's count.
+    Equal seeds draw the same positions, attachments and noise in every world, so worlds can be
+    compared. per_material: sweeps of each tube at each position; None for the paper's count.
     """
     parts = []
     hard: list[tuple[skin.SetName, int]] = [
@@ -80,8 +79,7 @@ def draw(
 
 
 def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
-    """The share of right answers, float64 [figures, methods], on what `draw` drew. seed: of the
-    random folds."""
+    """The accuracies, float64 [figures, methods], on the sets of `draw`. seed: of the random folds."""
     inputs = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
@@ -100,8 +98,8 @@ def _right(
     labels: Array,
     folds: Sequence[tuple[Array, Array]],
 ) -> int:
-    """How many answers of all folds are right, by the estimator itself: labels need no temperature
-    and no graph."""
+    """Number of right answers of all folds, from the estimator itself: labels need neither
+    temperature nor graph."""
     features = features.astype(np.float64)
     return sum(
         int(
@@ -121,10 +119,10 @@ def measure(
     jobs: int = -1,
     per_material: int | None = None,
 ) -> dict[str, Any]:
-    """The twenty accuracies, means over `seeds`, ready for JSON; with `ablate` also those without
-    each effect.
+    """The twenty accuracies, means over `seeds`, ready for JSON; with `ablate` also without each
+    effect.
 
-    jobs: processes, -1 one for each core; results do not depend on it.
+    jobs: processes, -1 for one on each core; results do not depend on it.
     """
     worlds = {"": world} | {
         e: replace(world, off=world.off | {e}) for e in (skin.EFFECTS if ablate else ())
@@ -176,17 +174,16 @@ def _match(ours: Array) -> dict[str, Any]:
 
 
 def _standard_error(values: Array) -> Array:
-    """Of the mean over the first axis; 0 where there is one value only, of which nothing is
-    known."""
+    """Standard error of the mean over the first axis; 0 for a single value."""
     error: Array = values.std(axis=0) / np.sqrt(max(len(values) - 1, 1))
     return error
 
 
 def table(result: dict[str, Any]) -> str:
-    """What `measure` returned, for a person: each accuracy as printed, ours with its spread over
+    """The results of `measure` for a person: each accuracy as printed, ours with its spread over
     seeds, and the difference.
 
-    Below, where effects were switched off: by how much each accuracy changed, in hundredths.
+    Below, for effects that were switched off: the change of each accuracy, in hundredths.
     """
     names = [name.ljust(20) for name in result["methods"]]
     text = [(" " * 32 + "".join(names)).rstrip()]

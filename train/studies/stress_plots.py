@@ -1,5 +1,5 @@
-"""Pictures of corrupted sweeps, a small one for each corruption. In: curves of robustness and
-bundle_stress. Out: SVG."""
+"""Pictures of corrupted sweeps (SVG), a small one for each corruption, from curves of robustness
+and bundle_stress."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
     {"color": GREEN, "linewidth": 1.5, "linestyle": (0, (6, 1.5, 1.2, 1.5))},
     {"color": BLACK, "linewidth": 1.0},
 )
-"""Of the methods that are drawn, the first ones. Told apart by line as well as by colour."""
+"""Lines of the first methods, told apart by style as well as by colour."""
 AREAS: Mapping[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "named rightly": (("rightly",), {"color": ACCENT, "alpha": 0.5}),
     "unsure, unknown": (("unsure", "unknown"), {"color": FAINT, "alpha": 0.7}),
     "refused": (("refused",), {"color": GREY, "alpha": 0.6}),
     "named wrongly": (("wrongly",), {"color": ORANGE}),
 }
-"""What the box answers, from below."""
+"""The kinds of answers of the box, from below."""
 AREA = 8.0
-"""Width of the line that stands for an area in a legend."""
+"""Width of the line for an area in a legend."""
 NETWORK: Mapping[str, Any] = {"color": BLACK, "linewidth": 1.0, "linestyle": (0, (3, 1.5))}
 COLUMNS, HEIGHT = 3, 1.42
-"""Small pictures beside each other; inches of each with its title and labels."""
+"""Small pictures in a row; height of each in inches, with title and labels."""
 LINE, LONGEST = 0.2, 16
-"""Of a legend: inches of a line, and the letters of a text of which three fit beside each other."""
+"""In a legend: length of a line in inches, and the letters of a text if three fit in a row."""
 
 
 def methods(curves: Mapping[str, Json]) -> str:
-    """Share named rightly over severity: a small picture for each corruption that costs a drawn
-    method five points.
+    """Accuracy over severity: a small picture for each corruption that costs a drawn method five
+    points.
 
-    curves: by method and corruption, the first method ours, whose band is shown and whose first
-    loss comes first; methods beyond the first of LOOKS are not drawn.
+    curves: by method and corruption. The first method is ours: its band is shown, and its first
+    losses come first. Methods beyond LOOKS are not drawn.
     """
     looks = dict(zip(curves, LOOKS, strict=False))
 
@@ -80,17 +80,16 @@ def methods(curves: Mapping[str, Json]) -> str:
 
 
 def shown(curves: Mapping[str, Json]) -> list[str]:
-    """Corruptions that cost a method with a colour five points: those that break ours, the first of
-    them first, and others."""
+    """Corruptions that cost a drawn method five points, those that break ours first."""
     coloured = list(curves.values())[: len(LOOKS)]
     return list(dict.fromkeys(name for those in coloured for name in breaks_first(those)))
 
 
 def box(curves: Mapping[str, Json]) -> str:
-    """What the box answers over severity, stacked: rightly, unsure or unknown, refused, wrongly;
-    and its network alone.
+    """The box's answers over severity, stacked: right, unsure or unknown, refused, wrong; and its
+    network alone.
 
-    A small picture for each corruption that costs five points or makes so many wrong names.
+    A small picture for each corruption that costs five points, or that makes as many wrong labels.
     """
     right, wrong = curves["rightly"], curves["wrongly"]
     named = [
@@ -123,7 +122,7 @@ def _panels(
     legend: Sequence[tuple[str, Mapping[str, Any]]],
     about: str,
 ) -> str:
-    """A small picture for each of `curves`, below a legend. draw: fills one, given its name."""
+    """A small picture for each of `curves`, below a legend. draw: draws one by its name."""
     beside = COLUMNS if max(len(text) for text, _ in legend) <= LONGEST else 2
     rows, above = -(-len(curves) // COLUMNS), 0.25 + LINE * -(-len(legend) // beside)
     figure = Figure((WIDTH, above + max(rows, 1) * HEIGHT))
@@ -149,8 +148,8 @@ def _panels(
 
 
 def _frame(axes: Axes, curve: Json, bare: bool) -> None:
-    """Title, ticks and grid of one small picture. bare: without labels of shares, beside one that
-    has them."""
+    """Title, ticks and grid of one small picture. bare: without labels of shares, beside a picture
+    that has them."""
     x, unit = curve["severities"], curve["unit"]
     axes.set_title(curve["title"], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
     axes.set_xlim(x[0], x[-1])

@@ -18,18 +18,16 @@ from train.studies.method_names import about, plain_name
 
 Json = Mapping[str, Any]
 EARLIER = plain_name("compact")
-"""The recipe that `fit` used before the default of today: nowhere may ours be more than NEAR below
-it."""
+"""The recipe of `fit` before today's default. Ours may nowhere be more than NEAR below it."""
 NEAR = 0.01
 ROUNDING = 1e-9
 PACKAGED = "the packaged bundle, as the box answers"
 SHOWN = 3
-"""Corruptions of each method in the table of what breaks it first."""
+"""Corruptions of each method in the table of the first losses."""
 
 
 def render(result: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. Raises FormatError where no method has a
-    result."""
+    """The page (HTML) and its pictures (SVG) by name. Raises FormatError if no method has a result."""
     entries = {
         plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
     }
@@ -76,13 +74,13 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
 
 
 def headline(curves: Json) -> Json:
-    """What breaks a method first, and how many corruptions do in all."""
+    """The corruptions that break a method first, and the number of all that do."""
     falls, broken = first(curves)
     return {"first": falls, "broken": broken, "all": len(curves)}
 
 
 def first(curves: Json) -> tuple[list[str], int]:
-    """What breaks a method first, then next; and how many corruptions do in all."""
+    """The corruptions that break a method first, in order, and the number of all that do."""
     broken = breaks_first(curves)
     return [_fall(curves[name]) for name in broken[:SHOWN]], len(broken)
 
@@ -97,7 +95,7 @@ def _of(curve: Json, i: int) -> tuple[float, float, float]:
 
 
 def most_wrong(curves: Json) -> Json:
-    """Where the box gives most wrong names: the corruption, its severity, the share."""
+    """The corruption and severity with most wrong labels of the box, and their share."""
     name, i = max(
         ((name, i) for name, curve in curves.items() for i in range(len(curve["accuracy"]))),
         key=lambda at: curves[at[0]]["accuracy"][at[1]],
@@ -111,8 +109,7 @@ def most_wrong(curves: Json) -> Json:
 
 
 def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
-    """What was wanted of ours: nowhere more than NEAR below the recipe before it. Empty where that
-    was not tested."""
+    """The target of ours: nowhere more than NEAR below EARLIER. Empty if EARLIER was not tested."""
     if EARLIER not in curves or ours == EARLIER:
         return []
     differences = [
@@ -133,8 +130,10 @@ def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
 
 
 def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
-    """A line for each of TARGETS. cells: by method; difference: of ours less EARLIER; box: rightly,
-    wrongly, network."""
+    """A line for each of TARGETS.
+
+    cells: by method. difference: ours less EARLIER. box: right, wrong, network alone.
+    """
     found = {name: at_targets(those) for name, those in curves.items()}
     answered = (
         {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")}
@@ -165,8 +164,8 @@ def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]
 
 
 def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
-    """Of each corruption what it does, and the severity at which each method, and the box, has lost
-    five points."""
+    """For each corruption its description, and the severity at which each method, and the box, has
+    lost five points."""
     columns = [*curves.values(), *([box["rightly"]] if box else [])]
     about = {name: curve for those in columns for name, curve in those.items()}
     return [
@@ -186,13 +185,13 @@ def _cell(curve: Json | None) -> str:
 
 
 def missing(curves: Mapping[str, Json], ours: str) -> list[str]:
-    """Corruptions that have no picture, since they cost no drawn method five points."""
+    """Corruptions without a picture: they cost no drawn method five points."""
     shown = stress_plots.shown(curves)
     return [curve["title"] for name, curve in curves[ours].items() if name not in shown]
 
 
 def trouble(entries: Mapping[str, Json], box: Mapping[str, str]) -> list[list[str]]:
-    """Of each uninformative sweep what methods make of it, and the box."""
+    """For each uninformative sweep the answers of methods and of the box."""
     rows = []
     for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
         answers: Counter[str] = Counter(

@@ -76,7 +76,7 @@ class StudyRun:
     """One run of a study: where folds are computed and cached, on which sweeps, with which effort.
 
     data: folder of real sweeps. quick: a few sweeps and iterations of everything; its figures mean
-    nothing. left_out: by name what is missing, and why; the run fills it.
+    nothing. left_out: missing names, each with the reason; the run fills it.
     """
 
     where: Where

@@ -37,8 +37,9 @@ TARGETS = {
     "early": 0.5,
     "lost": 0.005,
 }
-"""AUROC; shares of known sweeps that the limit keeps and of unknown ones that it lets through;
-share of the fully trained accuracy from five sweeps; share of the sweep; of the accuracy."""
+"""Targets: AUROC; shares of known sweeps kept and of unknown sweeps let through at the limit; share
+of the full accuracy after five sweeps of enrolment; share of the sweep for early answers, and their
+loss of accuracy."""
 LINE: dict[str, Any] = {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 3.5}
 OTHER: dict[str, Any] = {
     "color": BLACK,
@@ -65,9 +66,9 @@ ORIGIN = {
     "machine": "machine",
     "took_s": "seconds that it took",
 }
-"""What was run: names in the results and on the page."""
+"""The run: names in the results and on the page."""
 FLOORS = {0.0: 0.2, 0.5: 0.1, 0.8: 0.05, 0.9: 0.02, 0.95: 0.01}
-"""Where an axis of shares may begin, and the step of its ticks."""
+"""Possible starts of an axis of shares, and the step of its ticks."""
 
 
 def render(figures: Json) -> tuple[str, dict[str, str]]:
@@ -109,7 +110,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
 
 
 def _worst(figures: Json) -> str:
-    """The material that is most often taken for a known one; "" where none was left out."""
+    """The material that is most often taken for a known one; "" if no material was left out."""
     materials: Mapping[str, Json] = figures.get("unknown", {}).get("materials", {})
     if not materials:
         return ""
@@ -183,7 +184,7 @@ def _share(of: Json, name: str) -> str:
 
 
 def _targets(figures: Json) -> Iterator[Json]:
-    """Each target with what was reached."""
+    """Each target with the measured figure."""
     before, after = (figures["calibration"][when]["error"] for when in ("before", "after"))
     yield {
         "what": "calibration error after temperature scaling",
@@ -242,7 +243,7 @@ def _targets(figures: Json) -> Iterator[Json]:
 
 
 def _distinct(rules: Iterable[Json]) -> list[Json]:
-    """Each rule once, those that ask for the highest probability last."""
+    """Each rule once, by rising probability."""
     pairs = sorted({(rule["least"], rule["agree"]) for rule in rules})
     return [{"least": least, "agree": agree} for least, agree in pairs]
 
@@ -381,8 +382,8 @@ def _banded(axes: Axes, points: Sequence[Json], x: str, y: str, look: Json) -> N
 
 
 def _plot(height: float) -> tuple[Figure, Axes]:
-    """A picture of this height in inches with one plot that has room for a legend and for the names
-    of both axes."""
+    """A picture of this height in inches with one plot, with room for a legend and the names of
+    both axes."""
     return single_axes(height, left=0.15, right=0.97, top=0.35, bottom=0.5)
 
 
@@ -395,9 +396,9 @@ def _frame(
     *,
     percent: bool = False,
 ) -> None:
-    """Limits, ticks, grid and the names of both axes; the vertical one is always a share.
+    """Set limits, ticks, grid and the names of both axes. The vertical axis is always a share.
 
-    percent: so is the horizontal one.
+    percent: the horizontal axis is a share too.
     """
     (left, right), (low, high) = x, y
     margin = 0.03 * max(right - left, 1e-3)
@@ -411,7 +412,7 @@ def _frame(
 
 
 def _legend(axes: Axes, entries: Sequence[tuple[str, str]]) -> None:
-    """Names in their colours, above the plot."""
+    """Write names in their colours above the plot."""
     for i, (text, colour) in enumerate(entries):
         axes.annotate(
             text,
@@ -425,7 +426,7 @@ def _legend(axes: Axes, entries: Sequence[tuple[str, str]]) -> None:
 
 
 def _floor(lows: Sequence[float]) -> float:
-    """Where an axis of shares begins: the highest of FLOORS that is below all."""
+    """Start of an axis of shares: the highest of FLOORS below all values."""
     return max(floor for floor in FLOORS if floor <= max(min(lows, default=0), 0))
 
 

@@ -136,7 +136,7 @@ def _run(args: argparse.Namespace, quick_effort: Effort | None = None) -> StudyR
 
 
 def _done(run: StudyRun, path: Path) -> None:
-    """Print what was left out, and where the results are."""
+    """Print the names that were left out, and the path of the results."""
     for name, why in run.left_out.items():
         print(f"left out: {name}: {why}")
     print(path)

@@ -209,8 +209,8 @@ def run_stress(args: argparse.Namespace) -> None:
 def _box_under_stress(
     folder: Path | None, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None]
 ) -> dict[str, Any]:
-    """What a bundle answers. Raises FormatError where it cannot; of the packaged one (None) the
-    curves are missing then."""
+    """The answers of a bundle under corruption. Raises FormatError if it cannot answer these
+    sweeps; for the packaged one (None) the curves are then missing."""
     box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock())
     try:
         curves = bundle_stress.under_corruptions(box, test, seeds, log)
