@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 
@@ -147,3 +148,15 @@ def test_a_baseline_of_which_nothing_is_known_is_said():
     assert find_limit(low).contact == pytest.approx(110, abs=1)
     one = replace(high, samples=high.samples[:, :, :1, :1])
     assert find_limit(one).contact == pytest.approx((REST + 1000) / 10, rel=0.01)
+
+
+@pytest.mark.parametrize("baseline", [False, True], ids=["contacts", "no-limit"])
+def test_contacts_survive_their_file(baseline: bool):
+    """Arrays and figures, as JSON, give the same limit and centres; also without a limit."""
+    sweeps = known()
+    contacts = Contacts.of(replace(sweeps, unloaded=None) if baseline else sweeps)
+    assert (contacts.limit.contact is None) == (contacts.centres is None) == baseline
+    again = Contacts.read(contacts.arrays(), json.loads(json.dumps(contacts.figures())))
+    assert again.positions(4.0) == contacts.positions(4.0)
+    assert (again.limit.contact, again.limit.why) == (contacts.limit.contact, contacts.limit.why)
+    assert again.limit.tare.tolist() == contacts.limit.tare.tolist()

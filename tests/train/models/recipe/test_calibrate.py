@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+import json
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from appliance.bundle.bundle import Early
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.sweep_sets import easy
+from train.calibration.displacement import AugmentedCopies
+from train.calibration.early_exit import EarlyRule
 from train.models.recipe import recipe
-from train.models.recipe.calibrate import fit_calibration
+from train.models.recipe.calibrate import Calibration, fit_calibration
 from train.models.recipe.fitted import ONE_IN, calibration_inputs
 
 NOISE = np.array([0.0, 0.0, 0.0, 12.0])
@@ -71,3 +78,23 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     assert not (judged & faulty).any()
     assert not set(groups[faulty]) & set(groups[judged])
     assert not any((prefixes[~faulty] == row).all(axis=(1, 2)).any() for row in prefixes[faulty])
+
+
+@pytest.mark.parametrize("early", [None, Early((0.9,) * 9, 2)], ids=["no-rule", "rule"])
+@pytest.mark.parametrize("reattached", [False, True], ids=["no-copies", "copies"])
+def test_a_calibration_survives_its_file(early: Early | None, reattached: bool):
+    """Arrays and figures, as JSON, give the same calibration, with a rule for early answers and for
+    displaced contacts or without."""
+    x, y, at = world()
+    given = plain_inputs(x, y, at, at >= 6, 1)
+    if reattached:
+        copied = AugmentedCopies(x[:, -1], y, at, at >= 6)
+        given = replace(given, copied=copied)
+    made = replace(fit_calibration(given), rule=EarlyRule(early, "why", 0.5, 0.1, 7))
+    assert (made.displacement is not None) == reattached
+    again = Calibration.of(made.arrays(), json.loads(json.dumps(made.figures())))
+    assert again.figures() == made.figures()
+    assert again.displacement_rule() == made.displacement_rule()
+    assert again.arrays().keys() == made.arrays().keys()
+    for name, values in made.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)
