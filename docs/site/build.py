@@ -102,7 +102,7 @@ def results(out: Path) -> None:
     ):
         command = [sys.executable, "-m", *words]
         subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
-    written = sorted(pages.glob("*/*.html"))
+    written = sorted(pages.glob("*/index.html"))
     titles = {page: TITLE.search(page.read_text("utf-8")) for page in written}
     links = (
         f'- <a href="results/{page.relative_to(pages)}">{title[1] if title else page.stem}</a>'
