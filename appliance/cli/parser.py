@@ -31,12 +31,12 @@ MENU = Menu(
             "bench": "measure latency, memory, start and processor share on this machine",
         },
         "look": {
-            "check": "self-test: bundle, golden sweeps, devices",
-            "status": "state of the service, and its last verdicts",
-            "watch": "the running box live: skin, verdicts, latency and loss, over its feed",
+            "check": "test bundle, golden sweeps and devices",
+            "status": "show the state of the service, and its last verdicts",
+            "watch": "show the running box live: skin, verdicts, latency and loss",
             "align": "show where the contact lies on the skin, and where it should",
-            "replay": "judge a capture, a kept sweep or a folder of them again",
-            "config": "print each value with its source",
+            "replay": "classify a capture, a kept sweep or a folder of them again",
+            "config": "print each setting with its source",
         },
         "record and learn": {
             "record": "keep each sweep with its label, for training; needs no bundle",
@@ -54,7 +54,7 @@ MENU = Menu(
     ending=EXIT_CODES,
 )
 BUNDLE_ACTIONS = {
-    "list": "which bundle runs, and which bundle `rollback` returns to",
+    "list": "show which bundle runs, and which bundle `rollback` returns to",
     "install": "check the signed bundle in DIR, and run it on trial from the next start on",
     "verify": "check the signed bundle in DIR, and change nothing",
     "commit": "end the trial of the bundle that runs: it stays",
@@ -62,10 +62,10 @@ BUNDLE_ACTIONS = {
     "promote": "run the candidate on trial from the next start on",
 }
 SKIN_ACTIONS = {
-    "list": "all skin profiles, with missing features, and whether the skin was measured",
-    "detect": "what is plugged in, and which profile fits; only listens",
-    "check": "whether the skin's firmware keeps to PROTOCOL.md, part by part",
-    "show": "the skin live: heat map, rate, noise, dead and stuck taxels",
+    "list": "show all profiles, with missing features, and whether a device was measured",
+    "detect": "find connected skins and the profiles that fit; sends nothing",
+    "check": "compare the skin's firmware with PROTOCOL.md, part by part",
+    "show": "show the skin live: heat map, rate, noise, dead and stuck taxels",
     "new": "listen to a skin without a profile, propose one and write it; sends nothing",
 }
 WEB_PORT = 8137
@@ -118,11 +118,10 @@ def _devices(add: Callable[..., argparse.Action]) -> None:
     add(
         "--skin",
         metavar="NAME",
-        help="profile of the skin, or the file of one (skin.profile); with --sim the name of an"
-        " emulated skin",
+        help="profile of the skin, or its file (skin.profile); with --sim the name of an emulated skin",
     )
     add("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
-    add("--seed", type=int, default=0, help="of the simulated tubes (default 0)")
+    add("--seed", type=int, default=0, help="seed of the simulated tubes (default 0)")
 
 
 def _skin_port(add: Callable[..., argparse.Action], text: str = "") -> None:
@@ -164,7 +163,7 @@ def _count(text: str) -> int:
     """A number of sweeps, for argparse."""
     if not text.isdecimal() or not 1 <= (number := int(text)) <= 1_000_000_000:
         raise argparse.ArgumentTypeError(
-            f"{text} is no number of sweeps; use a whole number from 1 on"
+            f"{text} is not a number of sweeps; use a whole number from 1 on"
         )
     return number
 
@@ -177,7 +176,7 @@ def _seconds(text: str, least: float = 1.0) -> float:
         seconds = 0.0
     if not least <= seconds <= 3600:
         raise argparse.ArgumentTypeError(
-            f"{text} is no number of seconds that will do; use {least:g} to 3600"
+            f"{text} is not a number of seconds; use {least:g} to 3600"
         )
     return seconds
 
@@ -213,7 +212,7 @@ def _demo(command: CommandParser) -> None:
 def _bench(command: CommandParser) -> None:
     command.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     command.add_argument(
-        "--seed", type=int, default=2000, help="of the simulated sweeps (default 2000)"
+        "--seed", type=int, default=2000, help="seed of the simulated sweeps (default 2000)"
     )
     command.add_argument(
         "--references",
@@ -224,7 +223,7 @@ def _bench(command: CommandParser) -> None:
     command.add_argument(
         "--part",
         choices=("memory", "stream"),
-        help="one part alone, as JSON, with the sweeps of --acts",
+        help="measure a part alone, as JSON, with the sweeps of --acts",
     )
     command.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
 
@@ -277,7 +276,7 @@ def _record(command: CommandParser) -> None:
     command.add_argument(
         "--format",
         metavar="RxC:TYPE:HZ",
-        help="what the skin sends, e.g. 5x3:float32:100 (default: what it announces)",
+        help="format of the skin, e.g. 5x3:float32:100 (default: the announced format)",
     )
     command.add_argument(
         "--window",
@@ -314,7 +313,7 @@ def _enrol(command: CommandParser) -> None:
     _skin_port(command.add_argument)
     _trigger(command)
     command.add_argument(
-        "label", metavar="LABEL", help="its name; all sweeps from now on are of this material"
+        "label", metavar="LABEL", help="name of the new material; all sweeps are of this material"
     )
     command.add_argument(
         "--out",
@@ -350,7 +349,7 @@ def _bundles(command: CommandParser) -> None:
     install(
         "--other-skin",
         action="store_true",
-        help="even if it is for another skin than the skin that streams",
+        help="even if another skin streams",
     )
 
 
@@ -368,7 +367,9 @@ def _skin(command: CommandParser) -> None:
         help="time to listen, 1 to 3600 (default: check 10, new 3)",
     )
     command.only_for("detect")(
-        "--write", action="store_true", help="with --port: also ask, and send commands for starting"
+        "--write",
+        action="store_true",
+        help="with --port: also ask the skin, and send start commands",
     )
     _web(command.only_for("show"), f"also as a page on localhost (default port {WEB_PORT})")
     _new_skin(command)
@@ -384,7 +385,7 @@ def _new_skin(command: CommandParser) -> None:
     new(
         "--grid",
         metavar="RxC[xA]",
-        help="rows, columns and axes; without it, proposals are printed alone",
+        help="rows, columns and axes; without it, only proposals are printed",
     )
     new(
         "--proposal",

@@ -32,8 +32,8 @@ def _played_bundle(settings: Config) -> Bundle:
         return load_bundle(settings, answers=False)
     except PermissionError as e:
         log.warning(
-            f"{e.filename}: {e.strerror}, so the packaged bundle plays; the deployed one with sudo"
-            " -u palpate"
+            f"{e.filename}: {e.strerror}, so the packaged bundle plays; use"
+            " sudo -u palpate for the deployed bundle"
         )
         return bundles.load(bundles.DEFAULT)
 

@@ -216,7 +216,7 @@ def _start(silent: bool, first: Reception, listener: Listener) -> PartResult:
             "a second START disturbs the stream; it must have no effect while frames are sent",
         )
     return PartResult(
-        "start", "ok", "silent before it, frames after it, a second one changes nothing"
+        "start", "ok", "silent before it, frames after it, a second START changes nothing"
     )
 
 
@@ -271,9 +271,9 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
     if lost:
         flags = sum(bool(p.flags & packets.Flag.OVERFLOW) for _, p in heard.packets)
         why = (
-            f"{flags} packets tell of an overflow"
+            f"{flags} packets report an overflow"
             if flags
-            else "no packet tells of an overflow: they were never taken"
+            else "no packet reports an overflow: the frames were never taken"
         )
         detail = f"{lost} of {heard.frames + lost} frames are missing, {why}; lower the rate"
         yield PartResult("loss", "FAIL", detail)
@@ -287,7 +287,7 @@ def _stream(heard: Reception, form: SkinFormat) -> Iterator[PartResult]:
         by_count,
         RATE_TOLERANCE,
         f"FORMAT says {form.rate_hz:g} Hz",
-        "announce the rate that it has",
+        "announce the real rate",
     )
     yield rate
     clock = _compared("clock", by_clock, CLOCK_TOLERANCE, "bytes 16 to 19", "count microseconds")
@@ -303,7 +303,7 @@ def _packets(heard: Reception, form: SkinFormat) -> PartResult:
             return PartResult(
                 "packets",
                 "FAIL",
-                f"it sends {sent}, FORMAT says otherwise; bytes 8 to 11 must be those of FORMAT",
+                f"it sends {sent}, FORMAT announces another format; correct one of them",
             )
     sizes = [len(p.taxels) for _, p in heard.packets]
     if max(sizes) > form.packet_frames:
@@ -407,7 +407,7 @@ def _requests(listener: Listener) -> PartResult:
             "no frames after requests; go on sending, and leave unknown requests alone",
         )
     return PartResult(
-        "requests", "ok", "answered while frames are sent; an unknown one changes nothing"
+        "requests", "ok", "answered while frames are sent; an unknown request changes nothing"
     )
 
 

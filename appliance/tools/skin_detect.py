@@ -265,4 +265,6 @@ def on_usb(config: SkinConfig) -> list[str]:
     except usb.core.NoBackendError:
         return []
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
-    return [f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: has the ids of skin.usb" for d in found]
+    return [
+        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: its ids are those of skin.usb" for d in found
+    ]

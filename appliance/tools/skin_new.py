@@ -100,7 +100,7 @@ def choose(heard: PortSample, text: str, number: int) -> tuple[Proposal, Grid]:
         ", ".join(grid_text(grid) for proposal in offered for grid in proposal.grids)
         or "rows x columns"
     )
-    raise ConfigError(f"--grid {text} has as many values as no proposal; use one such as {fits}")
+    raise ConfigError(f"no proposal has as many values as --grid {text}; use a grid such as {fits}")
 
 
 def profile(proposal: Proposal, grid: Grid, baud: int, port: PortInfo) -> str:

@@ -81,7 +81,7 @@ class PageBoard:
             act(self, line)
         except (KeyError, TypeError, ValueError, AttributeError) as e:
             raise FormatError(
-                f"the feed's line {line.get('type')!r} is not as PROTOCOL.md has it: {e!r}; update"
+                f"the feed's line {line.get('type')!r} does not fit PROTOCOL.md: {e!r}; update"
                 " one of both"
             ) from e
 
@@ -177,7 +177,7 @@ def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         if now["bundle"] != before["bundle"]
         else "the same bundle"
     )
-    return f"the box was started anew, with {changed}"
+    return f"the box was restarted, with {changed}"
 
 
 _LINES: dict[str, Callable[[PageBoard, Mapping[str, Any]], None]] = {

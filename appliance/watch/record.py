@@ -52,15 +52,14 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
         asked = json.loads(body)
     except (ValueError, RecursionError) as e:
         raise FormatError(
-            'an order is not json; send {"command": "MATERIAL", "text": "wood"}'
+            'an order is not JSON; send {"command": "MATERIAL", "text": "wood"}'
         ) from e
     if not isinstance(asked, dict) or not asked.keys() <= {"command", "text"}:
         raise FormatError('an order holds "command" and "text" and nothing else')
     name, text = str(asked.get("command")), asked.get("text", "")
     if name not in allowed or not isinstance(text, str):
         raise FormatError(
-            f"no order that the page has; its commands are {' '.join(allowed)}, each with a text"
-            " or none"
+            f"unknown order; the commands are {' '.join(allowed)}, each with a text or none"
         )
     text = text.strip()
     if name in LABELS:

@@ -303,7 +303,7 @@ class _Handler(RequestHandler):
         if given:
             self.page.wrong.update(
                 "a wrong token",
-                f"page: wrong token from {request.remote_ip}; further ones are not logged",
+                f"page: wrong token from {request.remote_ip}; further wrong tokens are not logged",
             )
             await asyncio.sleep(WRONG_S)
             self.clear_cookie(COOKIE, path="/", secure=True)

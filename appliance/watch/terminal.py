@@ -67,7 +67,7 @@ class WatchedBox:
             take(self, line)
         except (KeyError, TypeError, ValueError, AttributeError, FormatError) as e:
             raise FormatError(
-                f"the feed's line {line['type']} is not as it must be ({e!r}); update palpate"
+                f"the feed's line {line['type']} is malformed ({e!r}); update palpate"
             ) from e
 
     def report(self) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class WatchedBox:
                 f"of {len(values)}"
             )
         if self.missed:
-            facts["feed"] = f"{self.missed:,} lines missed, since they were not read in time"
+            facts["feed"] = f"{self.missed:,} lines missed: they were not read in time"
         return {**self.health, **facts, "running": True, "verdicts": list(self.verdicts)}
 
     @property

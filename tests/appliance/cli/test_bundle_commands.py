@@ -111,8 +111,8 @@ def test_the_command_refuses_it_unless_it_is_told(
     assert main(command) == 78
     said = capsys.readouterr()
     assert (
-        "it would answer no sweep; if another skin comes with it, use --other-skin (make deploy OTHER_SKIN=1)"
-        in said.err
+        "it would answer no sweep; if another skin comes with it, use --other-skin (make deploy"
+        " OTHER_SKIN=1)" in said.err
     )
     assert sorted(Path(box.how.folder).rglob("*")) == before
     assert main([*command, "--other-skin"]) == 0

@@ -586,7 +586,7 @@ def test_a_window_is_a_length_of_time(text: str, capsys: pytest.CaptureFixture[s
         main(["record", "--sim", "skin", "--virtual", "--window", text])
     assert ended.value.code == 2
     assert (
-        f"argument --window: {text} is no number of seconds that will do; use 0.01 to 3600"
+        f"argument --window: {text} is not a number of seconds; use 0.01 to 3600"
         in capsys.readouterr().err
     )
 
@@ -702,8 +702,8 @@ def test_skin_check_fails_with_a_part(
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["--seconds", "0"], 2, "0 is no number of seconds that will do; use 1 to 3600"),
-        (["--seconds", "long"], 2, "long is no number of seconds"),
+        (["--seconds", "0"], 2, "0 is not a number of seconds; use 1 to 3600"),
+        (["--seconds", "long"], 2, "long is not a number of seconds"),
         (
             ["--set", "skin.link=serial", "--set", "skin.port=/dev/none"],
             69,

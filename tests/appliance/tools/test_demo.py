@@ -131,7 +131,7 @@ def test_a_number_of_sweeps_is_a_number(text: str, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit) as e:
         main(["demo", "--sweeps", text])
     assert e.value.code == 2
-    assert f"{text} is no number of sweeps" in capsys.readouterr().err
+    assert f"{text} is not a number of sweeps" in capsys.readouterr().err
 
 
 def test_the_order_of_a_set_depends_on_the_seed_alone():

@@ -211,7 +211,7 @@ FAULTS: dict[str, tuple[Fault, str, str]] = {
         "the number never changes",
     ),
     "number restarts": (restarting, "sequence", "restarts of the count"),
-    "packets lost": (of_bytes(every(10, lambda d: b"")), "loss", "no packet tells of an overflow"),
+    "packets lost": (of_bytes(every(10, lambda d: b"")), "loss", "no packet reports an overflow"),
     "rate too high": (of_format(rate_hz=800.0), "rate", "FORMAT says 800 Hz: -6.25 %"),
     "rate too low": (of_format(rate_hz=700.0), "rate", "FORMAT says 700 Hz: +7.1"),
     "clock of milliseconds": (
@@ -409,7 +409,9 @@ def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
         found = of_a_port(capsys, port, "--seconds", "3")
     verdict, detail = found["loss"]
     assert verdict == "FAIL"
-    assert detail.endswith("no packet tells of an overflow: they were never taken; lower the rate")
+    assert detail.endswith(
+        "no packet reports an overflow: the frames were never taken; lower the rate"
+    )
     assert found["sequence"][0] == "ok"
     # at 3.2 kB/s the kernel's buffer for a port lasts longer than the longest pause
     assert found["overflow"][0] == "unknown"

@@ -171,7 +171,8 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     """Centre and radius of each."""
     return seen.page.eval_on_selector_all(
         which,
-        "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r: e.r.baseVal.value}))",
+        "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r:"
+        " e.r.baseVal.value}))",
     )
 
 

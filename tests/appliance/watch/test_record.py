@@ -296,7 +296,10 @@ def test_other_ways_to_order_are_refused(
     machine's."""
     page = recorded.page.server
     host = f"localhost:{port(page)}" if host is None else host
-    more = f"Origin: http://{host}\r\nX-Palpate-Key: {page.key}\r\nContent-Type: {KIND}\r\nContent-Length: 2\r\n"
+    more = (
+        f"Origin: http://{host}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
+        f" {KIND}\r\nContent-Length: 2\r\n"
+    )
     assert status(ask(page, "/order", method, host, more, body=b"{}")) == answer
     assert waiting(recorded) == 0
 
@@ -461,7 +464,8 @@ def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
     with one:
         page, body = one.page.server, json.dumps(WOOD).encode()
         head = (
-            f"Origin: https://localhost:{port(page)}\r\nX-Palpate-Key: {page.key}\r\nContent-Type: {KIND}\r\n"
+            f"Origin: https://localhost:{port(page)}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
+            f" {KIND}\r\n"
             f"Content-Length: {len(body)}\r\n"
         )
         host = f"localhost:{port(page)}"

@@ -101,7 +101,10 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
     assert "spectrogram up to" in seen.page.get_attribute("#spectrogram", "aria-label")
     recorded.sweep(Status.NO_CONTACT, "taxel 2.2 is loaded most, with 1 count")
     until(lambda: seen.text("#status") == "no-contact")
-    said = "no taxel is loaded; check that the finger touches the object; it is not counted; taxel 2.2 is loaded most, with 1 count"
+    said = (
+        "no taxel is loaded; check that the finger touches the object; it is not counted; taxel"
+        " 2.2 is loaded most, with 1 count"
+    )
     assert seen.text("#check") == said
     recorded.sweep(Status.SHORT)
     until(lambda: seen.text("#status") == "short")

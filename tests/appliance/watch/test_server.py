@@ -128,7 +128,8 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
         "Cache-Control: no-store",
         "X-Frame-Options: DENY",
         "X-Content-Type-Options: nosniff",
-        "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'",
+        "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self';"
+        " connect-src 'self'",
         "frame-ancestors 'none'",
         "Server: palpate",
     ):
@@ -444,7 +445,7 @@ def test_wrong_tokens_are_slowed_and_logged_once(
         )
     assert len(waited) == 10
     assert [line for line in logged if "token" in line] == [
-        "<4>page: wrong token from 127.0.0.1; further ones are not logged"
+        "<4>page: wrong token from 127.0.0.1; further wrong tokens are not logged"
     ]
 
 

@@ -169,9 +169,7 @@ def test_a_line_that_is_not_as_it_must_be_is_named(tmp_path: Path, change: dict[
     lines = [*lines_of(tmp_path), {"type": "lost", "lines": 1}]
     state = state_of(lines)
     whole = next(line for line in lines if line["type"] == change["type"])
-    with pytest.raises(
-        FormatError, match=f"the feed's line {change['type']} is not as it must be"
-    ) as e:
+    with pytest.raises(FormatError, match=f"the feed's line {change['type']} is malformed") as e:
         state.take(whole | change)
     assert str(e.value).isprintable()
     assert drawn(state)
@@ -300,7 +298,7 @@ def test_what_cannot_be_read_is_said_and_tried_again(
     offered.turns(2)
     for _ in range(4):
         watch.step()
-    assert "NO FEED: the feed's line verdict is not as it must be" in out.getvalue()
+    assert "NO FEED: the feed's line verdict is malformed" in out.getvalue()
     offered.feed.stopping()
 
 

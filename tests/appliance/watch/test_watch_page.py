@@ -420,7 +420,10 @@ def test_every_text_can_be_read(
 def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
     """Each section stays where it is over verdicts of all kinds, views and a box that goes away."""
     seen = opened(browser, shown)
-    boxes = "() => [...document.querySelectorAll('#watch > section')].map((e) => [e.offsetLeft, e.offsetTop, e.offsetWidth, e.offsetHeight])"
+    boxes = (
+        "() => [...document.querySelectorAll('#watch > section')].map((e) => [e.offsetLeft,"
+        " e.offsetTop, e.offsetWidth, e.offsetHeight])"
+    )
     before = seen.page.evaluate(boxes)
     for number, (label, status) in enumerate(
         [("foam", "ok"), ("", "no-start"), ("plastic smooth", "unsure")], 41
