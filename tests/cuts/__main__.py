@@ -1,9 +1,8 @@
-"""Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`. In: scenes by name.
-Out: a line for each command, and in build/cuts.jsonl one for each crash point, with the machine and
-the commit.
+"""Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`.
 
-An interrupted run is continued as long as neither the box nor the scenes have changed. Exit code 1
-if anything is wrong.
+Prints a line for each command, and writes to build/cuts.jsonl a line for each crash point, with the
+machine and the commit. An interrupted run is continued as long as neither the box nor the scenes
+have changed. The exit code is 1 if anything is wrong.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
     "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
 }
-"""Each gets an empty folder for what it needs."""
+"""Makes each scene; the argument is an empty folder for the files that it needs."""
 HOWS = ("kill", "power", "kill_then_power")
 
 
 def main() -> int:
-    """Cut the named scenes, or all."""
+    """Cut the named scenes, or all scenes."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.cuts", description=__doc__.split("\n\n")[0]
     )
@@ -70,8 +69,8 @@ def main() -> int:
 
 
 class CrashPointLog:
-    """Points by their moments. Each is a line of a file; the first line names the program and the
-    machine."""
+    """Crash points by their moments: one line of a file each, under a head that names the code and
+    the machine."""
 
     def __init__(self, path: Path) -> None:
         self._path, head = path, json.dumps(_head())
@@ -79,16 +78,16 @@ class CrashPointLog:
         first, *lines = path.read_text().splitlines() if path.exists() else [""]
         lines = [
             line for line in lines if first == head and line.endswith("}")
-        ]  # the last one may be cut off
+        ]  # the last line may be incomplete
         path.write_text("".join(f"{line}\n" for line in (head, *lines)))
         self._points = [_point(json.loads(line)) for line in lines]
 
     def points(self, scene: str = "") -> list[CrashPoint]:
-        """Those of a scene, or all."""
+        """The points of a scene, or of all scenes."""
         return [point for point in self._points if scene in ("", point.scene)]
 
     def add(self, point: CrashPoint) -> None:
-        """Write a point down."""
+        """Append a point to the file."""
         self._points.append(point)
         with self._path.open("a") as file:
             file.write(json.dumps(asdict(point)) + "\n")
@@ -99,7 +98,7 @@ def _point(reported: dict[str, Any]) -> CrashPoint:
 
 
 def _head() -> dict[str, str]:
-    """The program that was cut: its commit, a digest of its files, and the machine."""
+    """The head of a log: the commit, a digest of the code itself, and the machine."""
     git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     sources = (tree.read(ROOT / folder) for folder in ("appliance", "tests/cuts"))
@@ -117,8 +116,8 @@ def _head() -> dict[str, str]:
 
 
 def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
-    """All points of a scene that are not in the ledger yet, cut in these ways; each is written
-    down."""
+    """Cut a scene in these ways at all points that are not in the log yet; each is appended to
+    it."""
     done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
     with stage() as work:
         play = ScenePlay(scene, Path(work))
@@ -131,7 +130,7 @@ def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> I
 
 
 def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
-    """A line for each command, and one for all."""
+    """A line for each command, and a line for all."""
     steps: dict[str, list[CrashPoint]] = {}
     for point in points:
         for name in (f"{point.scene}: {point.step}", "all"):

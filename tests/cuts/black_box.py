@@ -1,8 +1,8 @@
-"""The black box, cut short. A program keeps the last sweeps in service; the judge of the scene
-finds every lost sweep except the sweep in progress.
+"""The black box, cut short: a program that keeps the last sweeps in service, and a judge of losses
+beyond the sweep in progress.
 
-`python -m tests.cuts.black_box FOLDER` is that program: it goes on in the folder, and says of each
-sweep when it is kept.
+`python -m tests.cuts.black_box FOLDER` is this program: it continues in the folder, and reports
+each sweep that it has kept.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.cuts.scene import CutScene, Found, SceneStep
 from tests.factories import log_lines
 
 MOST = 2
-"""Sweeps that are kept: so few that each run takes old ones away."""
+"""Number of sweeps that are kept, so small that each run removes old sweeps."""
 KEPT = re.compile(r"^kept (\S+)$", re.MULTILINE)
 
 

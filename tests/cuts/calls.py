@@ -1,9 +1,9 @@
-"""The system calls of a command, in their order, seen by strace; and the command killed at one of
-them. In: a command. Out: the calls with their paths and data, and how it ended.
+"""The system calls of a command in their order, recorded by strace; and the command killed at one
+of them.
 
-strace delivers the SIGKILL on entry, and Linux does not carry out a call that a killed process has
-only entered: so a kill at call k leaves the disk as it is after call k-1 and before call k. (strace
-6.1 delivers no signal where its seccomp filter is in use, so killed runs do without it.)
+strace sends SIGKILL on entry, and Linux does not carry out a call that a killed process has only
+entered. So a kill at call k leaves the disk as it is after call k-1 and before call k. (strace 6.1
+delivers no signal while its seccomp filter is in use, so killed runs do without it.)
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ WATCHED = (
     "open|creat|p?write|lseek|sendfile|copy_file|splice|f?truncate|fallocate|fsync|fdatasync|sync|rename|unlink|rmdir|"
     "mkdir|symlink|link|f?chmod|f?chown|mknod"
 )
-"""The calls that matter, by how their names begin."""
+"""System calls that matter, by the beginnings of their names."""
 MOST_BYTES = 1 << 24
-"""Of one write that strace shows."""
+"""Largest number of bytes of a write that strace prints."""
 DEADLINE_S = 120
 LINE = re.compile(r"(\d+) +(\w+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
 END = re.compile(r"\d+ +\+\+\+ .* \+\+\+")
@@ -33,16 +33,15 @@ DESCRIPTOR = re.compile(r"(AT_FDCWD|\d+)<((?:\\x[0-9a-f]{2})*)>")
 
 
 class NotFollowed(Exception):
-    """The command did something to its files that is not followed here."""
+    """The command did something to its files that this module does not follow."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystemCall:
-    """One system call. nth: its number among the calls of that name in its process, from 1, as
-    strace counts. paths: its files, absolute. data: the bytes that it writes, or the target of a
-    symlink. words: its arguments as strace shows them. result: None where the process was killed in
-    it.
-    """
+    """One system call. nth: its number among the calls of this name in its process, from 1, as
+    strace counts. paths: its absolute paths. data: the bytes that it writes, or the target of a
+    symlink. words: its arguments as strace prints them. result: None if the process was killed in
+    it."""
 
     process: int
     name: str
@@ -54,15 +53,14 @@ class SystemCall:
 
     @property
     def descriptor(self) -> int:
-        """The number of the file descriptor that it is about, -1 where it has none."""
+        """The number of its file descriptor, -1 if it has none."""
         number = re.match(r"(\d+)<", self.words)
         return int(number[1]) if number else -1
 
 
 @dataclass(frozen=True, slots=True)
 class TracedRun:
-    """How a command went: its calls, all that it wrote to standard output and standard error, its
-    exit code."""
+    """The course of a command: its calls, its standard output and standard error, its exit code."""
 
     calls: tuple[SystemCall, ...]
     output: str
@@ -70,7 +68,7 @@ class TracedRun:
 
 
 def lacking() -> str:
-    """What to install before calls can be seen here; empty where nothing is missing."""
+    """The packages to install before calls can be recorded here; empty if none is missing."""
     if not shutil.which("strace"):
         return "strace (apt-get install strace)"
     tried = subprocess.run(["strace", "-o", os.devnull, "true"], capture_output=True, check=False)
@@ -87,9 +85,10 @@ def run(
     at: SystemCall | None = None,
     env: dict[str, str] | None = None,
 ) -> TracedRun:
-    """Run a command under strace, in the folder of the log; `at`: kill it when it enters this call.
+    """Run a command under strace, in the folder of the log. at: the call at whose entry the command
+    is killed.
 
-    env: variables to add to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
+    env: additions to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
     """
     how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
     done = subprocess.run(
@@ -128,8 +127,8 @@ def run(
 
 
 def output(call: SystemCall) -> str:
-    """The text that the command writes to standard output or standard error by this call; its
-    children do not count."""
+    """The bytes that this call writes to standard output or standard error; children do not
+    count."""
     heard = (
         call.process == 0
         and call.name in ("write", "writev")
@@ -140,8 +139,8 @@ def output(call: SystemCall) -> str:
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
-    """The calls in the order in which they ended; last those that did not, since the process was
-    killed in them."""
+    """The calls in the order in which they ended; last those that did not end because the process
+    was killed."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
     for line in _joined(lines):
@@ -164,7 +163,7 @@ def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
 
 
 def _joined(lines: list[str]) -> Iterator[str]:
-    """Each call as one line, where strace broke it in two since another process came between."""
+    """Each call as one line; strace splits a call in two if another process comes between."""
     begun: dict[str, str] = {}
     for line in (line for line in lines if not END.fullmatch(line)):
         if line.endswith(CUT):
@@ -177,7 +176,7 @@ def _joined(lines: list[str]) -> Iterator[str]:
 
 
 def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], bytes]:
-    """Paths and data among the arguments of a call: a path is relative to the descriptor before it,
+    """Paths and data among the arguments of a call. A path is relative to the descriptor before it,
     or to `folder`."""
     paths: list[str] = []
     data, base = b"", folder

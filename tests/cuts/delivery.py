@@ -1,7 +1,7 @@
-"""Delivery and enrolment, cut short. In: signed bundles that are copied to the box, taken, started,
-committed and left again, and labels that it learns. Out: scenes, whose judge finds each box that
-does not come back with either the old or the new bundle, whole.
+"""Delivery and enrolment, cut short. Signed bundles are copied to the box, taken, started,
+committed and replaced, and the box learns labels.
 
+The judges find each box that does not come back with either the old or the new bundle, whole.
 `python -m tests.cuts.delivery WAY ARGUMENT ...` is `palpate` in one of WAYS: it crashes, or is
 wrong on purpose.
 """
@@ -38,12 +38,11 @@ from tests.factories.paths import ROOT
 
 STORE, INCOMING = "store", "store/incoming"
 ENROLMENT = "enrolment"
-"""Folder of the key of the box, beside the shop's bundles."""
+"""Folder of the box's own key, beside the shop's bundles."""
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
-"""What is copied, until it is installed, and what is in the folders that are not complete: nobody
-reads that."""
+"""Copies before they are installed, and contents of incomplete folders: nobody reads these."""
 PROBATION = 2
-"""Sweeps."""
+"""Number of sweeps on probation."""
 ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6}([0-9a-f]{8}),")
 PROMISE = re.compile(
     r"bundle ([0-9a-f]{8}) (?:is installed; it )?runs (?:on trial )?from the next start on.*"
@@ -51,7 +50,7 @@ PROMISE = re.compile(
 )
 DIED = 3
 LABELS = ("cork", "felt")
-"""What the box learns, one after the other; each from a sweep of another simulated tube."""
+"""Labels that the box learns, one after the other, each from a sweep of another simulated tube."""
 NAMES = ("packaged", "first", "second", "third", "fourth", "fifth", "last")
 START = ("run", "--sim", "skin", "--virtual", "--sweeps", "1")
 START_AND_COMMIT = (*START[:-1], str(PROBATION))
@@ -60,20 +59,20 @@ import shutil, sys; from pathlib import Path; old, new = map(Path, sys.argv[1:])
 shutil.rmtree(new, ignore_errors=True); new.mkdir()
 for path in sorted(old.iterdir()): (new / path.name).write_bytes(path.read_bytes())
 """
-"""Somebody's program that copies a bundle to the box, in place of what an earlier attempt left; it
-syncs nothing."""
+"""A user's program that copies a bundle to the box and replaces the remains of an earlier attempt;
+it syncs nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shop:
-    """The bundles for the box, in a folder beside it: these NAMES, each with the next counter,
-    signed by one key. The box's key for enrolments lies there, too."""
+    """A folder beside the box with its deliveries: bundles with these NAMES and rising counters,
+    signed by one key. It also holds the box's own key for enrolments."""
 
     folder: Path
 
     @classmethod
     def opened(cls, folder: Path) -> Shop:
-        """Make all that."""
+        """Make the bundles and keys."""
         key = folder / "key"
         run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", key], check=True)
         (folder / "allowed_signers").write_text(f"shop {key.with_suffix('.pub').read_text()}")
@@ -88,19 +87,19 @@ class Shop:
         return cls(folder)
 
     def at(self, name: str) -> Path:
-        """Where a bundle is before it is delivered."""
+        """The path of a bundle before it is delivered."""
         return bundle.DEFAULT if name == "packaged" else self.folder / name
 
     def words(self, folder: Path, *words: str | Path) -> list[str]:
-        """A command of the box in `folder`. @: where bundles are copied to."""
+        """A command of the box in `folder`. @ stands for the folder to which bundles are copied."""
         output = [str(word).replace("@", f"{folder / INCOMING}/") for word in words]
         where = f"store.folder={folder / STORE}", f"store.keys={self.folder}"
         how = "store.runtime=", f"store.trial_sweeps={PROBATION}"
         return output + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
-        """A command of the box, in one of WAYS or as it is. code: how it ends, if not as its way
-        does."""
+        """A command of the box, in one of WAYS or unchanged. code: its exit code, if it differs
+        from that of its way."""
         program = ["tests.cuts.delivery", way] if way else ["appliance"]
         ends = code if code is not None else DIED if way == "crash" else 0
         return SceneStep(
@@ -108,13 +107,12 @@ class Shop:
         )
 
     def copy(self, name: str) -> SceneStep:
-        """Somebody copies a bundle to the box."""
+        """A user copies a bundle to the box."""
         command = [sys.executable, "-S", "-c", COPY, self.at(name)]
         return SceneStep(f"copy {name}", lambda folder: [*command, folder / INCOMING / name])
 
     def steps(self) -> Iterator[tuple[str, SceneStep]]:
-        """The commands that a box runs; before each, the bundles that may run if that command is
-        cut short."""
+        """The commands on a box, each after the bundles that may run if it is cut short."""
         do = self.palpate
         yield "packaged", self.copy("first")
         yield "packaged first", do("install the first ever", "bundles", "install", "@first")
@@ -145,11 +143,11 @@ class Shop:
         yield "fifth", do("commit it by hand", "bundles", "commit")
 
     def scene(self) -> CutScene:
-        """All steps; each of their commands is cut short."""
+        """The scene of all steps; each command is cut short."""
         return self._scene("delivery", _bare, list(self.steps()))
 
     def enrolment(self) -> CutScene:
-        """A box that runs the first bundle learns LABELS, one after the other, gives one up, and
+        """A box that runs the first bundle learns LABELS, one after the other, removes a label, and
         gets another bundle; each command is cut short."""
         return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
 
@@ -169,12 +167,12 @@ class Shop:
         return self.palpate(name or f"enrol {label}", *words, way=way, code=0)
 
     def learns(self, way: str) -> CutScene:
-        """Nothing but an enrolment, in one of WAYS, on a box that runs the first bundle."""
+        """A single enrolment, in one of WAYS, on a box that runs the first bundle."""
         steps = [("first cork", self.enrols(LABELS[0], way))]
         return self._scene("enrolment", self._delivered, steps, self._learned(LABELS[:1]))
 
     def _enrolments(self) -> Iterator[tuple[str, SceneStep]]:
-        """As `steps`; a label stands for the bundle that ends with it."""
+        """As `steps`; a label stands for the bundle that has learned up to it."""
         do = self.palpate
         yield "first cork", self.enrols("cork")
         yield "cork", do("start it and end in order", *START)
@@ -189,7 +187,7 @@ class Shop:
         yield "felt second", do("install another", "bundles", "install", "@second")
 
     def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
-        """The id that the bundle has with each of the labels: the same sweeps give the same
+        """The ids of the bundle with each of the labels added: the same sweeps give the same
         bytes."""
         with TemporaryDirectory() as aside:
             self._delivered(folder := Path(aside))
@@ -210,7 +208,7 @@ class Shop:
         return ids
 
     def alone(self, way: str) -> CutScene:
-        """Nothing but an install, in one of WAYS, on a box that runs the first bundle."""
+        """A single install, in one of WAYS, on a box that runs the first bundle."""
         step = self.palpate(
             "install another", "bundles", "install", str(self.at("second")), way=way
         )
@@ -282,8 +280,8 @@ def _bare(folder: Path) -> None:
 
 
 def _promised(output: str) -> str:
-    """The bundle that is to run from the next start on, where the command that is cut has just said
-    so."""
+    """The bundle that must run from the next start on, if the command that is cut has just
+    announced it."""
     reported = PROMISE.fullmatch(output.splitlines()[-1])
     return reported[1] or reported[2] if reported else ""
 
@@ -293,9 +291,10 @@ def _end(output: str) -> str:
 
 
 def _apart(words: list[str]) -> tuple[int, str]:
-    """Run a command of the box in a child that has its libraries already; exit code and output."""
+    """Run a command of the box in a child that has loaded its libraries already; exit code and
+    output."""
     reported = os.memfd_create("output")
-    sys.stdout.flush()  # or the child prints it, too
+    sys.stdout.flush()  # otherwise the child prints it too
     child = os.fork()
     if not child:
         signal.alarm(DEADLINE_S)
@@ -311,8 +310,8 @@ def _apart(words: list[str]) -> tuple[int, str]:
 
 
 def _signs(args: argparse.Namespace, settings: Config) -> EnrolmentKey:
-    """A label enrolled with a simulated skin is signed as with a real skin; the box itself refuses
-    that."""
+    """Signs labels from a simulated skin like labels from a real skin; the box itself refuses
+    to."""
     return EnrolmentKey(settings.store.enrolment_key)
 
 
@@ -328,8 +327,8 @@ WAYS: dict[str, tuple[object, str, Callable[..., object]]] = {
     "the link is gone for a moment": (storage, "link", _gone_for_a_moment),
     "the ledger in place": (storage, "put", Path.write_bytes),
 }
-"""What is put in place of what; after the first two wrong on purpose, and the judge must find
-that."""
+"""The parts of the program that each way replaces. All but the first two are wrong on purpose, and
+the judge must find that."""
 
 
 if __name__ == "__main__":

@@ -1,16 +1,18 @@
-"""A disk that keeps only synced data for certain. In: a folder, and the calls that change it. Out:
-all the folders that may be found when the power comes back.
+"""A disk that is only certain to keep synced data: computes all states of a folder that may be
+found when the power returns.
 
-Data is on the disk for certain only after a sync: a file's content after an fsync of the file, a
-name (new, moved, gone) after an fsync of its folder. Before that it may be there or not:
+Written data are certain to be on the disk only after a sync: the content of a file after an fsync
+of the file, a name (new, renamed, removed) after an fsync of its folder. Until then:
 
-- names: those of one folder are kept in their order; those of different folders in any order. A rename is never half
-  done, also from folder to folder, and a folder's fsync takes with it whatever had to happen before.
-- contents: all of it, the last synced content, nothing, the first half, or as many zeros; each file by itself, too.
+- Changed names of one folder reach the disk in their order; those of different folders in any
+  order. A rename is never half done, also from folder to folder, and an fsync of a folder includes
+  everything that had to happen before.
+- The content of a file may be all of it, the last synced content, nothing, the first half, or as
+  many zeros; also for each file separately.
 
-That is less than ext4 promises (there a sync of one file takes all earlier names with it), and
-about what POSIX does. A symlink leads where it leads as soon as its name is there. Modes and owners
-are not looked at.
+These guarantees are weaker than ext4's (where a sync of a file includes all earlier names), and
+about those of POSIX. The target of a symlink is present as soon as its name is. Modes and owners
+are ignored.
 """
 
 from __future__ import annotations
@@ -25,13 +27,14 @@ from tests.cuts.calls import NotFollowed, SystemCall
 from tests.cuts.tree import NOTHING, Tree, digest
 
 MOST_STATES = 4096
-"""Of the names at one moment; who leaves more open should have synced long ago."""
+"""Largest number of states of the names at one moment; a program with more should have synced
+earlier."""
 
 
 @dataclass(eq=False, slots=True)
 class File:
-    """A file. synced: its content as the disk has it for sure. at: where the next write goes, None
-    for the end."""
+    """A file. synced: its content that is certain to be on the disk. at: position of the next
+    write, None for the end."""
 
     data: bytes = b""
     synced: bytes = b""
@@ -40,7 +43,8 @@ class File:
 
 @dataclass(eq=False, slots=True)
 class Folder:
-    """A folder. names: as a program sees them. synced: as the disk has them for sure."""
+    """A folder. names: as a program sees them. synced: the names that are certain to be on the
+    disk."""
 
     names: dict[str, Inode] = field(default_factory=dict)
     synced: dict[str, Inode] = field(default_factory=dict)
@@ -55,14 +59,14 @@ class Link:
 
 Inode = File | Folder | Link
 Change = tuple[tuple[Folder, str, Inode | None], ...]
-"""Names that change at once: folder, name, what it then stands for (None: nothing)."""
+"""Names that change at once: folder, name, and its new inode (None if removed)."""
 
 
 class Disk:
-    """A `folder`, and the part of it that is on the disk (`there`); then the change of `effect`
-    happens.
+    """The disk under `folder`. It starts with the tree `there`, all of it synced; `effect` applies
+    a call.
 
-    apart: paths that do not matter: their contents are not varied.
+    apart: paths whose contents do not matter and are not varied.
     """
 
     def __init__(self, folder: Path, there: Tree, apart: re.Pattern[str] = NOTHING) -> None:
@@ -81,14 +85,13 @@ class Disk:
             above.names[last] = above.synced[last] = inode
 
     def follow(self, calls: Iterable[SystemCall]) -> None:
-        """All this happens to the folder. Raises NotFollowed."""
+        """Apply all calls. Raises NotFollowed."""
         for call in calls:
             if effect := self.effect(call):
                 effect()
 
     def effect(self, call: SystemCall) -> Callable[[], None] | None:
-        """The change that this call makes to the folder; None without a change. Raises
-        NotFollowed."""
+        """The effect of this call on the folder; None if it has none. Raises NotFollowed."""
         if call.result is None or call.result < 0:
             return None
         if call.name == "sync":
@@ -117,7 +120,7 @@ class Disk:
                 return lambda: self._sync(self._at(call.paths[0]))
             case "syncfs":
                 return self._sync_all
-            case "sync_file_range":  # promises nothing
+            case "sync_file_range":  # guarantees nothing
                 return None
             case name if name.endswith(("mod", "modat", "own", "ownat")):
                 return lambda: None
@@ -164,7 +167,7 @@ class Disk:
         file, n = self._at(call.paths[0]), call.result
         assert n is not None
         if not isinstance(file, File) or not n:
-            return None  # it has no name any more
+            return None  # the file has no name any more
 
         def write() -> None:
             alone = call.name == "pwrite64"
@@ -195,9 +198,8 @@ class Disk:
     def _find(
         self, path: str, follow: bool = False, depth: int = 0
     ) -> tuple[Folder, str, Inode | None]:
-        """The folder of `path`, its name there, and its entry. Symlinks on the way are followed; at
-        its end only where that is wanted.
-        """
+        """The folder that contains `path`, its name there, and its inode. Symlinks on the way are
+        followed; a symlink at the end only if `follow` is set."""
         if depth > 40 or not self._inside(path):
             raise NotFollowed(f"{path} leads out of {self._path}")
         folder, done = self._root, self._path
@@ -216,7 +218,7 @@ class Disk:
         return folder, last, folder.names.get(last)
 
     def _at(self, path: str) -> Inode | None:
-        """What `path` is."""
+        """The inode at `path`."""
         return self._root if Path(path) == self._path else self._find(path)[2]
 
     def _change(self, *change: tuple[Folder, str, Inode | None]) -> None:
@@ -252,7 +254,7 @@ class Disk:
         }
 
     def left(self) -> Iterator[Tree]:
-        """Each folder that may be found if the power goes now, once."""
+        """Each folder that may be found if the power fails now, once."""
         reported = set()
         for happened in self._happened():
             there = list(_walk(self._root, _overlay(happened)))
@@ -278,9 +280,8 @@ class Disk:
                     yield found
 
     def _happened(self) -> list[tuple[Change, ...]]:
-        """Each set of the changes not synced yet that may have reached the disk: none without those
-        before it that have a folder in common with it.
-        """
+        """Each set of unsynced changes that may have reached the disk: a change needs all earlier
+        changes that share a folder with it."""
         sets: list[tuple[int, ...]] = [()]
         for i, change in enumerate(self._open):
             folders = {id(folder) for folder, _, _ in change}
@@ -303,7 +304,7 @@ def _set(names: dict[str, Inode], name: str, inode: Inode | None) -> None:
 
 
 def _settle(changes: list[Change]) -> None:
-    """These names are on the disk for sure."""
+    """These names are now certain to be on the disk."""
     for change in changes:
         for folder, name, inode in change:
             _set(folder.synced, name, inode)
@@ -320,7 +321,7 @@ def _overlay(changes: list[Change] | tuple[Change, ...]) -> dict[int, dict[str, 
 def _walk(
     folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = ""
 ) -> Iterator[tuple[str, Inode]]:
-    """Paths and inodes below a folder: its synced names, and the changes since."""
+    """Paths and inodes below a folder: its synced names, overridden by `over`."""
     for name, inode in sorted(
         {**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]
     ):

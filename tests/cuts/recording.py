@@ -1,8 +1,8 @@
-"""Recording, cut short. In: programs that record sweeps, the box's program and some that are wrong
-on purpose. Out: scenes, whose judge finds every lost sweep except the sweep in progress.
+"""Recording, cut short: the box's program that records sweeps, programs that are wrong on purpose,
+and a judge of losses beyond the sweep in progress.
 
 `python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it continues in the folder,
-and prints the sentences for a robot and the sweep that it is asked to discard.
+prints the sentences to the robot, and names the sweep that it is asked to discard.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from appliance.sim import skin
 from tests.cuts.scene import CutScene, Found, SceneStep
 
 SHORT = SweepFormat(4, 4, 750, 40, "uint8")
-"""What the programs that are not the box's record."""
+"""Format of the sweeps of all programs except the box's."""
 KEPT = "kept/sweeps"
-"""Below the folder of the scene, and not there at first: who makes it has to sync that, too."""
+"""Folder below that of the scene; it does not exist at first, so the program that makes it must
+sync it too."""
 HEARD = re.compile(
     r",REC,(?P<id>\d+),stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|^(?P<how>discard\w+) (?P<gone>\S+)",
     re.MULTILINE,
@@ -36,8 +37,7 @@ Files = Mapping[Path, bytes]
 
 
 def record(way: str, folder: Path, session: str) -> None:
-    """Record two sweeps, discard the second, record a third; way: how the files get onto the
-    disk."""
+    """Record two sweeps, discard the second, record a third. way: how the files are written."""
     storage.put_all = WAYS[way]
     running = recording(
         folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True)
@@ -73,7 +73,8 @@ def taken(number: int, format: SweepFormat) -> tuple[Sweep, Verdict]:
 def _aside(
     files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]
 ) -> None:
-    """Write all files aside, then give them their names; settle: called with each name then."""
+    """Write all files under temporary names, then rename them; settle: called for each name
+    afterwards."""
     for path, data in files.items():
         write(path.with_name(path.name + storage.PART), data)
     for path in files:
@@ -103,12 +104,11 @@ WAYS: dict[str, Callable[[Files], None]] = {
     "under its own name": _in_place,
     "description last": lambda files, put=storage.put_all: put(dict(reversed(files.items()))),
 }
-"""How files get onto the disk: all but the first are wrong on purpose, and the judge must find
-that."""
+"""Ways to write files: all but the first are wrong on purpose, and the judge must find that."""
 
 
 def judge(format: SweepFormat, found: Found) -> list[str]:
-    """Faults of the sweeps that were found in this layout, and of the next run in their folder."""
+    """Faults of the sweeps of this format that were found, and of the next run in their folder."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
     owed, gone = reported(found.heard)
@@ -124,7 +124,7 @@ def judge(format: SweepFormat, found: Found) -> list[str]:
 
 
 def read(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Which sweeps cannot be read; session and number of each that can."""
+    """Sweeps that cannot be read; session and number of each that can."""
     wrong, there = [], {}
     for path in sorted(folder.glob("*.npy")):
         try:
@@ -137,9 +137,8 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
-    """The reports to a robot: session and number of the stored sweeps, and of the discarded sweeps.
-    A sweep that is being discarded is in neither.
-    """
+    """The robot's knowledge: session and number of the stored sweeps, and of the discarded. A sweep
+    that is being discarded is in neither."""
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
     leaving = ""

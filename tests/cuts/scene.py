@@ -1,10 +1,10 @@
-"""Plays a scene and cuts it short. In: commands that change a folder, one after another, and a
-judge of the folder. Out: one point for each moment, with all faults that the judge found.
+"""Plays a scene and cuts it short: commands change a folder one after another, and a judge examines
+the folder after each cut.
 
-The scene is first played to its end, and its calls are noted. A moment lies before each call that
-changes the folder or syncs something in it, and after the last one of each command: after a call is
-before the next one. At each moment the command is killed there, or the power is cut there. The
-judge then examines the folder.
+The scene is first played to its end, and its calls are recorded. A moment lies before each call
+that changes the folder or syncs a part of it, and after the last call of each command. At each
+moment the command is killed, or the power is cut. The judge gets the folder that is found
+afterwards, and each moment becomes a point with its findings.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from tests.cuts.disk import Disk
 from tests.factories.paths import ROOT
 
 MEMORY = Path("/dev/shm")
-"""Where scenes are best played: what a sync does is known here, and on a real disk it takes its
+"""Folder in memory for scenes: the effect of a sync is modelled, and on a real disk it would take
 time."""
 BETWEEN = "\n"
-"""Said before each command, so that the last line is its own."""
+"""Printed before each command, so that the last line is its own."""
 ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
 
 
@@ -36,8 +36,8 @@ def stage() -> TemporaryDirectory[str]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Input of a judge: the folder, which it may change; the command that was cut; the part of the
-    output that it needs."""
+    """The judge's input: the folder, which it may change; the command that was cut; the output that
+    it asked for."""
 
     folder: Path
     step: str
@@ -46,9 +46,8 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class SceneStep:
-    """A command, for the folder that it gets. code: how it ends, None for any way. killed: the call
-    that it does not get beyond.
-    """
+    """A command for a given folder. code: its exit code, None for any. killed: the call at which it
+    is killed."""
 
     name: str
     command: Callable[[Path], Sequence[str | Path]]
@@ -58,9 +57,9 @@ class SceneStep:
 
 @dataclass(frozen=True, slots=True)
 class CutScene:
-    """prepare: makes the folder as it is before the first command. judge: finds faults. apart:
-    paths that it does not look at. hears: selects the part of the output that the judge needs.
-    """
+    """prepare: makes the folder as it is before the first command. judge: returns the faults.
+    apart: paths that the judge ignores. hears: extracts the part of the output that the judge
+    needs."""
 
     name: str
     prepare: Callable[[Path], None]
@@ -72,10 +71,9 @@ class CutScene:
 
 @dataclass(frozen=True, slots=True)
 class CrashPoint:
-    """A scene that was cut at one moment. how: a method of Play. call: the first call that was not
-    carried out. states: number of different folders that may be left. wrong: faults of these
-    folders.
-    """
+    """A scene that was cut at one moment. how: a method of ScenePlay. call: the call that was not
+    carried out. states: number of different folders that the cut may leave. wrong: the judge's
+    findings."""
 
     scene: str
     step: str
@@ -88,7 +86,7 @@ class CrashPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Before a call that changes something; call None: after the last one."""
+    """The moment before a call that changes something; call None: after the last call."""
 
     step: int
     number: int
@@ -99,10 +97,9 @@ class Moment:
 
 @dataclass(slots=True)
 class ScenePlay:
-    """A scene that was played to its end in `work`. said: earlier output. before: content of the
-    folder before each command. runs: their results. Raises NotFollowed if the folder differs from
-    the result of the calls.
-    """
+    """A scene that was played to its end in `work`. said: the output before each command. before:
+    the folder before each command. runs: the runs of the commands. Raises NotFollowed if the folder
+    differs from the modelled effect of the calls."""
 
     scene: CutScene
     work: Path
@@ -128,8 +125,8 @@ class ScenePlay:
         return self.work / "folder"
 
     def moments(self) -> Iterator[Moment]:
-        """All moments in their order. The changes of the command before the last are on the disk by
-        then."""
+        """All moments in their order. At each moment, the effects of the command before the
+        previous are on the disk."""
         output = self.output
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)
@@ -145,7 +142,7 @@ class ScenePlay:
             yield Moment(i, number, None, output, disk)
 
     def power(self, moment: Moment) -> CrashPoint:
-        """The power goes: each folder that may be left is judged."""
+        """The power fails: each folder that may be found is judged."""
         step, wrong, states = self.scene.steps[moment.step], [], 0
         for left in moment.disk.left():
             states += 1
@@ -161,9 +158,8 @@ class ScenePlay:
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
-        """The command is killed there and started again in the same folder; at each of its moments
-        the power fails. Raises NotFollowed.
-        """
+        """The command is killed there and started again in the same folder; at each moment of this
+        second run the power fails. Raises NotFollowed."""
         step, before = self.scene.steps[moment.step], self.before[moment.step]
         steps = replace(step, killed=moment.call), replace(step, code=None)
         twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
@@ -184,7 +180,8 @@ class ScenePlay:
         return self._point("kill_then_power", moment, states, wrong)
 
     def _run(self, step: SceneStep, at: SystemCall | None) -> TracedRun:
-        """Run a command, and compare the folder with the result of its calls."""
+        """Run a command, and compare the folder that it leaves with the modelled effect of its
+        calls."""
         disk = Disk(self.folder, tree.read(self.folder))
         run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
         disk.follow(run.calls)
@@ -203,7 +200,7 @@ class ScenePlay:
         tree.write(held, self.folder)
 
     def _judged(self, left: tree.Tree, step: SceneStep, output: str) -> tuple[str, ...]:
-        """Faults of a folder; each folder is judged once."""
+        """The judge's findings on a folder; each folder is judged once."""
         heard = self.scene.hears(output)
         key = tree.digest(left, self.scene.apart), step.name, heard
         if key not in self.judged:

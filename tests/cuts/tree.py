@@ -1,5 +1,4 @@
-"""A folder as a value. In: a folder. Out: all that is in it, which can be compared, hashed, and
-written again."""
+"""A folder as a value that can be compared, hashed, and written again."""
 
 from __future__ import annotations
 
@@ -9,13 +8,13 @@ import re
 from pathlib import Path
 
 Tree = dict[str, bytes | str | None]
-"""Path below the folder -> content of a file, where a symlink leads, or None for a folder."""
+"""Path below the folder -> content of a file, target of a symlink, or None for a folder."""
 NOTHING = re.compile("(?!)")
 MADE_UP = re.compile(r"-[a-z0-9_]{8}(?=/|$)")
 
 
 def read(folder: Path) -> Tree:
-    """The entries of a folder."""
+    """The contents of a folder."""
     found: Tree = {}
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))
@@ -26,7 +25,7 @@ def read(folder: Path) -> Tree:
 
 
 def write(found: Tree, folder: Path) -> None:
-    """Make an empty folder hold this."""
+    """Make an empty folder hold these contents."""
     for name, held in sorted(found.items()):
         if held is None:
             (folder / name).mkdir()
@@ -37,8 +36,8 @@ def write(found: Tree, folder: Path) -> None:
 
 
 def digest(found: Tree, apart: re.Pattern[str] = NOTHING) -> str:
-    """The same for the same. Paths that are `apart` do not count, nor do the names that tempfile
-    makes up."""
+    """Equal for equal contents. Paths that match `apart` do not count, nor do names made by
+    tempfile."""
     digested = hashlib.sha256()
     for name, held in sorted(
         (MADE_UP.sub("-*", name), held) for name, held in found.items() if not apart.fullmatch(name)

@@ -1,8 +1,9 @@
 """`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a
 shell in it.
 
-`ground` builds the part that is the same for every commit, `lacking` lists the missing Debian
-packages, and `table` prints the reaction of the box to each fault that the tests have injected.
+`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that
+are missing on this machine, and `table` prints how the box responded to each fault that the tests
+have injected.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
-    """Let the robot sweep; print the touched material, the answer, and the levels of the GPIO
+    """Let the robot sweep; print the touched material, the answer of the box, and the levels of its
     lines."""
     begun = time.monotonic()
     cell.plug()
@@ -39,8 +40,8 @@ def show(cell: Cell, sweeps: int) -> None:
 
 
 def shell(cell: Cell) -> None:
-    """Run lines from the keyboard in the guest, as root, while the skin streams; `sweep` makes the
-    robot sweep."""
+    """Run commands from the keyboard in the guest, as root, while the skin streams; `sweep` makes
+    the robot sweep."""
     cell.plug()
     print(
         "a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends"

@@ -1,7 +1,7 @@
 """The robot cell around a guest: a robot that sweeps on request, and reads sentences and lines as a
 controller does.
 
-In: a Guest. Out: answers, each with the touched material and the time.
+It returns the answers of the box, with the material and the times of each touch.
 """
 
 from __future__ import annotations
@@ -20,29 +20,28 @@ from appliance.sim import rig, script, skin
 from tests.rig.machine import Guest
 
 FIFO = 22_500
-"""Frames that a board holds: half a minute, so that what is lost was lost by the box and not by a
-cable that came late."""
+"""Frames that a board can hold: half a minute, so that the box causes every loss, and never a cable
+that was plugged in late."""
 IDLE = 75
 """Frames of an empty skin between two sweeps: a tenth of a second."""
 BEHIND_NS = 50_000_000
-"""A touch begins only while the box takes frames no older than this: else its edges, which lie
-ahead of its frames by the clock, would come at once and its sweep be too short.
-"""
+"""A touch begins only while the newest frame of the box is at most this old. Edges follow the
+clock: if the box were further behind, edges would overtake the frames and the sweep would be too
+short."""
 SEEN_S = 20
-"""Longest wait until the box has seen that the skin is gone."""
+"""Longest wait until the box reports that the skin is gone."""
 BEGUN_S = 60
-"""Longest wait for a touch to begin, while a box that did something else works off what it has not
-taken yet."""
+"""Longest wait for a touch to begin, while a box that was busy catches up with its frames."""
 ANSWER_S = 30
-"""Longest wait for an answer after the stop edge, in the guest's time as all waits are."""
+"""Longest wait for an answer after the stop edge, in the guest's time like all waits."""
 
 
 @dataclass(slots=True)
 class Touch:
-    """One sweep as the robot made it. first: number of its first frame; start_ns, stop_ns: when its
-    edges come.
+    """One sweep of the robot. first: number of its first frame; start_ns, stop_ns: times of its
+    edges.
 
-    played: set once the board has come to it.
+    played: set once the board has reached it.
     """
 
     act: rig.Act
@@ -55,8 +54,7 @@ class Touch:
 
 
 class CellRobot:
-    """The script that a board plays: an empty skin, and a touch whenever one is asked for (see
-    sim.rig.Robot)."""
+    """The script that a board plays: an empty skin, and a touch on request (see sim.rig.Robot)."""
 
     def __init__(self, lines: rig.EdgeLines, clock: Clock, seed: int) -> None:
         self.skipped = None
@@ -64,7 +62,7 @@ class CellRobot:
         self._lines, self._clock, self._rng = lines, clock, np.random.default_rng(seed)
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> rig.Act:
-        """The next touch, its edges scheduled, or an empty skin."""
+        """The next touch with its edges scheduled, or an empty skin."""
         if self.touches.empty() or self._clock.now_ns() - frame_ns(first) > BEHIND_NS:
             return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
         touch = self.touches.get_nowait()
@@ -86,11 +84,11 @@ class CellRobot:
 
 
 class Cell:
-    """A guest with a robot around it; the skin is in the robot's hand, and plugged in when `plug`
-    is called.
+    """A guest with a robot around it. The skin is in the robot's hand, and plugged in by `plug`.
 
-    acts: the robot's sweeps in order, over the simulator's six tubes, drawn from `seed`.
-    packet_frames: of its boards; more of them in a packet spare an emulator half of its work.
+    acts: materials and motions of the sweeps in order; by default the simulator's six tubes, drawn
+    from `seed`. packet_frames: frames in a packet of its boards; larger packets save half of the
+    emulator's work.
     """
 
     def __init__(self, machine: Guest, seed: int = 1) -> None:
@@ -106,14 +104,14 @@ class Cell:
         self.packet_frames = 6
 
     def board(self, **arguments: Any) -> rig.ReadoutBoard:
-        """A board in the robot's hand; arguments: those of sim.rig.ReadoutBoard (ppm, latency, serial and
-        others)."""
+        """A board in the robot's hand; arguments: those of sim.rig.ReadoutBoard (ppm, latency,
+        serial and others)."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
         return rig.ReadoutBoard(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
     def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard:
-        """Plug a board in, by default a sound one. An old board is unplugged first, and a running
-        box has reported FAULT by then."""
+        """Plug in `board`, by default a working board. A board that was plugged in is removed
+        first, and a running box has reported FAULT before this goes on."""
         board = board or self.board()
         if self.cable.board:
             self.unplug()
@@ -126,20 +124,21 @@ class Cell:
         self.cable.unplug()
 
     def until_ready(self, timeout_s: float = 60) -> None:
-        """Wait until the box says READY. Raises AssertionError where it does not."""
+        """Wait until the box reports READY. Raises AssertionError if it does not."""
         if not (
             self.lines.wait("READY", True, timeout_s) and self.lines.wait("FAULT", False, timeout_s)
         ):
             raise AssertionError(f"not READY within {timeout_s} s; the box says: {self.journal()}")
 
     def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
-        """Begin a sweep, without waiting for its end. start, stop: whether the edge is given."""
+        """Begin a sweep, without waiting for its end. start, stop: whether the robot sends that
+        edge."""
         touch = Touch(next(self.acts), start, stop)
         self.hand.touches.put(touch)
         return touch
 
     def sweep(self, timeout_s: float = ANSWER_S) -> tuple[Touch, Answer]:
-        """A whole sweep; the touch and the answer of the box. Raises AssertionError if no answer
+        """A whole sweep: the touch and the answer of the box. Raises AssertionError if no answer
         comes."""
         since = len(self.serial.heard)
         touch = self.touch()
@@ -147,35 +146,35 @@ class Cell:
         return touch, self.answer(since, timeout_s + 6)
 
     def begun(self, touch: Touch) -> None:
-        """Wait until the board has come to a touch. Raises AssertionError where it does not."""
+        """Wait until the board has reached a touch. Raises AssertionError if it does not."""
         if not self.clock.until(touch.played.is_set, BEGUN_S):
             raise AssertionError(
                 f"the box is {BEGUN_S} s behind the skin; the box says: {self.journal()}"
             )
 
     def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:
-        """The first RES of the lines from number `since` on."""
+        """The first RES sentence from line number `since` on."""
         answer = Answer.read(self.serial.wait_for("$PPLP,RES,", timeout_s, since))
         assert answer
         return answer
 
     def answers(self, since: int = 0) -> list[Answer]:
-        """All RES of the lines from number `since` on."""
+        """All RES sentences from line number `since` on."""
         read = (Answer.read(line) for _, line in self.serial.heard[since:])
         return [answer for answer in read if answer]
 
     def state(self) -> list[str]:
-        """The fields of the newest STA after now."""
+        """The fields of the next STA sentence."""
         since = len(self.serial.heard)
         return self.serial.wait_for("$PPLP,STA,", 30, since).split("*")[0].split(",")[2:]
 
     def journal(self, lines: int = 15) -> str:
-        """The last lines of the service."""
+        """The last lines of the service's log."""
         return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
 
     def restore(self) -> None:
-        """Put everything in order: lines low, cable and port working, a sound skin; wait until the
-        box is READY."""
+        """Return to normal: lines low, cable and port working, a working skin; wait until the box
+        is READY."""
         for name in ("START", "STOP"):
             self.lines.set(name, False)
         self.cable.mangle, self.cable.slow_s = bytes, 0.0

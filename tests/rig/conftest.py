@@ -1,7 +1,6 @@
-"""Fixtures of the tests on the virtual box. PALPATE_RIG=quick runs them, =full with the counts of
-the report; otherwise they are skipped. `python -m tests.campaigns test-rig` sets it, and makes the
-box first.
-"""
+"""Fixtures of the tests on the virtual box. PALPATE_RIG=quick runs them, =full runs them with the
+counts of the report; otherwise they are skipped. `python -m tests.campaigns test-rig` sets it, and
+builds the box first."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ def image() -> Image:
 
 @pytest.fixture(scope="session")
 def count() -> Callable[[int, int], int]:
-    """How often something is done: count(quick, full)."""
+    """Number of repetitions: count(quick, full)."""
     return lambda quick, full: full if HOW == "full" else quick
 
 
@@ -62,7 +61,7 @@ def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture
 def cell(shared: Cell) -> Cell:
-    """The guest of this file, with a sound skin, quiet lines and a robot that listens; the box is
+    """The guest of this file, with a working skin, quiet lines and a robot that reads; the box is
     READY."""
     shared.restore()
     return shared
@@ -70,8 +69,7 @@ def cell(shared: Cell) -> Cell:
 
 @pytest.fixture
 def note(request: pytest.FixtureRequest) -> Callable[[str, str, int], None]:
-    """Writes down what became of a fault, for the table of the report: note(fault, outcome,
-    times)."""
+    """Records the outcome of a fault for the table of the report: note(fault, outcome, times)."""
 
     def write(fault: str, outcome: str, times: int) -> None:
         print(f"{fault}: {outcome}, {times} times")

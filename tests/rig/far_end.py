@@ -1,5 +1,4 @@
-"""The robot's end of the guest's serial port. In: what to send. Out: the sentences that came, with
-times of the guest."""
+"""The robot's end of the guest's serial port. Sentences that arrive have times of the guest."""
 
 from __future__ import annotations
 
@@ -10,11 +9,11 @@ from pathlib import Path
 from tests.rig.guest_clock import GuestClock
 
 ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
-"""What the guest calls an emulated USB serial adapter with the serial number R1."""
+"""The guest's path of an emulated USB serial adapter with the serial number R1."""
 
 
 class FarEnd:
-    """heard: (ns, line) of all lines, in order. While `deaf` nothing is read, and the guest's port
+    """heard: (ns, line) of all lines, in order. While `deaf`, nothing is read, and the guest's port
     fills up."""
 
     def __init__(self, path: Path, clock: GuestClock) -> None:
@@ -55,14 +54,14 @@ class FarEnd:
         self._socket.sendall(data)
 
     def ask(self, command: str, timeout_s: float = 10) -> str:
-        """Send a command; the sentence that answers it."""
+        """Send a command; returns the sentence that answers it."""
         since = len(self.heard)
         self.say(command.encode() + b"\r\n")
         return self.wait_for("$PPLP,ANS,", timeout_s, since)
 
     def wait_for(self, start: str, timeout_s: float, since: int = 0) -> str:
-        """The first line that begins so, of those from number `since` on. Raises AssertionError
-        where none comes."""
+        """The first line that begins with `start`, from line number `since` on. Raises
+        AssertionError if none comes."""
         found: list[str] = []
 
         def there() -> bool:
@@ -90,4 +89,4 @@ class FarEnd:
                     (now_ns, line.decode("ascii", "replace").rstrip("\r")) for line in lines
                 ]
         except OSError:
-            return  # closed
+            return  # the cable was pulled

@@ -1,11 +1,10 @@
-"""The guest's own time, seen from outside. In: a counter of the guest's hardware. Out: nanoseconds,
-and waits in them.
+"""The guest's own time, read from outside in nanoseconds, and waits in it.
 
-The guest's time goes by the instructions that its processors have done (`-icount`), or with the
-host's while they have nothing to do. So a host that is busy makes the guest slow, but never late:
-skin, robot and every wait of a test go by this clock, too. Its counter is WALCLK of an Intel HD
-Audio controller that no driver of the guest claims: 24 MHz, 32 bits, read over qtest without the
-guest's noticing (High Definition Audio Specification 1.0a, 3.3.22).
+The guest's time advances with the instructions of its processors (`-icount`), or with the host's
+time while the guest is idle. A busy host therefore makes the guest slow, but never late: skin,
+robot and every wait of a test use this clock too. The counter is WALCLK of an Intel HD Audio
+controller that no driver of the guest claims: 24 MHz, 32 bits. It is read over qtest, unnoticed by
+the guest (High Definition Audio Specification 1.0a, 3.3.22).
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from appliance.core.clock import Clock, SystemClock
 from tests.rig.qtest import Qtest
 
 SHIFT = 1
-"""An instruction takes 2 ** SHIFT ns of the guest's time, however long it takes to emulate: half of
-a Raspberry Pi 4."""
+"""An instruction takes 2 ** SHIFT ns of the guest's time, however long its emulation takes: half
+the speed of a Raspberry Pi 4."""
 TICK_US = 1000
-"""QEMU brings its counter up to date at least so often, by a timer; else it stood still while the
-guest sleeps."""
+"""QEMU updates its counter at least this often, by a timer; otherwise the counter would stand still
+while the guest sleeps."""
 STEADY = (
     "-icount",
     f"shift={SHIFT},sleep=on",
@@ -31,25 +30,25 @@ STEADY = (
     "-object",
     f"filter-buffer,id=tick,netdev=none,interval={TICK_US}",
 )
-"""QEMU's arguments; the timer is that of a network filter through which nothing goes."""
+"""QEMU's arguments. The timer is that of an unused network filter."""
 SLOT = 10
 DEVICE = ("-device", f"intel-hda,addr={SLOT:#x}")
 ECAM, WINDOW = 0x40_1000_0000, range(0x1000_0000, 0x3EFF_0000)
-"""Of QEMU's `virt`: configuration space of PCI, and where 32-bit cards lie once the kernel has set
-them up."""
+"""In QEMU's machine `virt`: the configuration space of PCI, and the addresses of 32-bit cards after
+the kernel has set them up."""
 COMMAND, BAR, WALCLK = 0x04, 0x10, 0x30
 HZ, WRAP = 24_000_000, 1 << 32
 LOOK_S = 0.01
 STILL_S = 120
-"""Host time after which a counter that has not moved is taken for dead."""
+"""Host time after which a counter that stands still is considered dead."""
 
 
 class GuestClock:
-    """A clock as appliance.core.clock.Clock, by a counter of HZ that wraps; read it more often than
-    every 179 s.
+    """A clock like appliance.core.clock.Clock, from a 32-bit counter with HZ ticks per second. Read
+    it at least every 179 s.
 
-    latest_ns: the newest reading, for those who may not ask. host: the time by which a dead counter
-    is noticed.
+    latest_ns: the newest reading, for callers that may not use the socket. host: the clock for
+    noticing a dead counter.
     """
 
     def __init__(self, counter: Callable[[], int], host: Clock | None = None) -> None:
@@ -58,8 +57,7 @@ class GuestClock:
         self._ticks, self._moved_ns, self._reading = 0, self._host.now_ns(), threading.Lock()
 
     def now_ns(self) -> int:
-        """The guest's time. Raises TimeoutError where it stands still, OSError where QEMU has
-        gone."""
+        """The guest's time. Raises TimeoutError if it stands still, OSError if QEMU has ended."""
         with self._reading:
             more = (self._counter() - self._ticks) % WRAP
             host_ns = self._host.now_ns()
@@ -78,16 +76,16 @@ class GuestClock:
         return self.now_ns() / 1e9
 
     def sleep_until(self, t_ns: int) -> None:
-        """Return at `t_ns` of the guest's time, or at once where that has passed."""
+        """Return at `t_ns` of the guest's time, or at once if that has passed."""
         while (left_ns := t_ns - self.now_ns()) > 0:
             self._host.sleep_until(self._host.now_ns() + left_ns)
 
     def sleep(self, seconds: float) -> None:
-        """Let so much of the guest's time pass."""
+        """Wait for this much of the guest's time."""
         self.sleep_until(self.now_ns() + round(seconds * 1e9))
 
     def until(self, done: Callable[[], object], timeout_s: float) -> bool:
-        """Wait until `done`; False where it is not within so much of the guest's time."""
+        """Wait until `done`; False if it is not within this much of the guest's time."""
         end_ns = self.now_ns() + round(timeout_s * 1e9)
         while not done():
             if self.now_ns() >= end_ns:
@@ -97,8 +95,8 @@ class GuestClock:
 
 
 def find(qtest: Qtest, timeout_s: float) -> GuestClock:
-    """The clock of a guest whose kernel has set up its cards, or does so now. Raises TimeoutError
-    where it does not."""
+    """The clock of a guest whose kernel has set up its cards or is doing so. Raises TimeoutError if
+    it does not."""
     config, end_s = ECAM + (SLOT << 15), time.monotonic() + timeout_s
 
     def read(address: int) -> int:
@@ -110,5 +108,5 @@ def find(qtest: Qtest, timeout_s: float) -> GuestClock:
         time.sleep(0.1)
     qtest.ask(
         f"writew {config + COMMAND:#x} 0x2"
-    )  # it answers reads of its memory; no driver has seen to that
+    )  # enables reads of its memory, because no driver has done so
     return GuestClock(lambda: read(place + WALCLK))

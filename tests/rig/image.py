@@ -1,10 +1,10 @@
-"""Builds the virtual box. In: Debian's and Python's packages, this checkout. Out: disks, cached
-under their hash.
+"""Builds the virtual box from packages of Debian and Python and this checkout: disks, cached under
+their hash.
 
-Two steps. A *ground*: Debian for arm64 with its stock kernel and a virtual environment with the
-box's locked dependencies; it takes minutes and is the same for every commit. On it a *box*: the
-wheel, units, rules and settings of this checkout, installed in the running guest as a person would,
-and a snapshot of the guest when its service has started.
+The first step is a *ground*: Debian for arm64 with its stock kernel and a virtual environment with
+the box's locked dependencies. It takes minutes and is the same for every commit. The second is a
+*box*: the wheel, units, rules and settings of this checkout, installed in the running guest as a
+person would, and a snapshot of the guest after its service has started.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ GUEST = HERE / "guest"
 CACHE = emulated_machines.HOME.parent / "rig"
 SUITE = "bookworm"
 GUEST_PYTHON = "3.11"
-"""Python of that suite."""
+"""Python version of SUITE."""
 PACKAGES = (
     "systemd",
     "systemd-sysv",
@@ -62,7 +62,7 @@ MODULES = (
 EARLY = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic")
 """Modules that the ramdisk loads; everything else comes from the disk."""
 LINES = ("START", "STOP", "READY", "FAULT", "RESULT-VALID", "CLASS-0", "CLASS-1", "CLASS-2")
-"""What the kernel of the guest calls the eight lines of its PL061, by offset."""
+"""Names of the guest's eight PL061 lines, by offset."""
 DISK = "2G"
 MACHINE = (
     "-machine",
@@ -143,14 +143,14 @@ def box(on: Path, log: Callable[[str], None] = print) -> Image:
 
 
 def layer(on: Path, folder: Path) -> Path:
-    """A new disk in `folder` on top of a ground's, which stays as it is."""
+    """A new disk in `folder` on top of a ground's disk, which is not changed."""
     disk = folder / "disk.qcow2"
     run("qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", on / "disk.img", disk)
     return disk
 
 
 def lacking(tools: Iterable[str] = TOOLS) -> list[str]:
-    """Debian packages of those tools that are not installed."""
+    """Debian packages of those of `tools` that are not installed."""
     path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
     return sorted({TOOLS[name] for name in tools if not shutil.which(name, path=path)})
 
@@ -235,8 +235,8 @@ def _make_ground(part: Path) -> None:
 
 
 def guest_lock() -> str:
-    """The locked dependencies as they are for the guest's Python and processor: pip would choose by
-    this machine's."""
+    """The locked dependencies for the guest's Python and processor; pip would choose them for this
+    machine's."""
     return run_here(
         f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', 'aarch64'))"
     )
@@ -281,7 +281,8 @@ def _make_root(part: Path, version: str) -> None:
 
 
 def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> list[Path]:
-    """Copy modules and their dependencies to a root; their files in the order of loading."""
+    """Copy modules and their dependencies to a root; returns their files in the order of
+    loading."""
     source, target = kernel / "lib/modules" / version, root / "lib/modules" / version
     if not (source / "modules.dep").exists():
         run("depmod", "-b", kernel, version)
@@ -326,8 +327,8 @@ def _make_ramdisk(part: Path, version: str) -> None:
 
 
 def _make_tree(path: Path) -> None:
-    """The machine's device tree, with names for its lines and none of them taken for a power
-    button."""
+    """The machine's device tree, with names for its lines, and without its power button on one of
+    them."""
     run(
         "qemu-system-aarch64",
         MACHINE[0],

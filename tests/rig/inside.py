@@ -1,6 +1,5 @@
-"""The means of a test that runs inside the guest: a folder for its second disk, and a bench that
-carries out its requests outside (tests/backends/remote.py).
-"""
+"""Support for tests that run inside the guest: a folder for its second disk, and controls outside
+that such tests can request (tests/backends/remote.py)."""
 
 from __future__ import annotations
 
@@ -14,14 +13,14 @@ from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
 
 RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")
-"""Pure Python, so this machine's installation serves the guest; `packaging` is in the box's
-lock."""
+"""Pure Python packages, so this machine's installation also works in the guest; `packaging` is in
+the box's lock."""
 SETTLE_S = 0.2
 
 
 def pack(folder: Path, tests: Iterable[str]) -> None:
-    """Copy these files and folders of the checkout and the tools that run them into `folder`, at
-    the same paths."""
+    """Copy these files and folders of the checkout, and the packages that run them, into `folder`;
+    each keeps its place in the checkout."""
     for name in tests:
         source, place = ROOT / name, folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -39,29 +38,29 @@ def pack(folder: Path, tests: Iterable[str]) -> None:
 
 
 class GuestControls:
-    """The controls of a Backend, done to a guest from outside."""
+    """The controls of a Backend, applied to a guest from outside."""
 
     def __init__(self, machine: Guest) -> None:
         self._machine, self._clock, self._told = machine, machine.clock, 0
 
     def able(self) -> list[str]:
-        """The abilities, as `can` of a Backend."""
+        """The controls that work here, like `can` of a Backend."""
         return ["skin", "numbered", "plug", "garble", "silence", "lines", "serial", "stall"]
 
     def reset(self) -> None:
-        """See Backend; the same below. The cable stays as it is."""
+        """As Backend.reset; the cable stays as it is. The other methods are described in Backend,
+        too."""
         self.garble(False)
         for line in ("START", "STOP"):
             self.drive(line, False)
         self.hear()
 
     def plug(self, what: Skin) -> None:
-        """Another board on the cable."""
+        """Connect another board to the cable."""
         self._machine.skin.unplug()
         self._machine.skin.plug(skins.board(what, self._clock))
 
     def unplug(self) -> None:
-        """None."""
         self._machine.skin.unplug()
 
     def garble(self, on: bool) -> None:
@@ -74,23 +73,23 @@ class GuestControls:
         cable.do(lambda: setattr(cable.board, "running", False))
 
     def drive(self, line: str, level: bool) -> None:
-        """An input of the box."""
+        """Drive an input of the box."""
         self._machine.lines.set(line, level)
 
     def storm(self, line: str, edges: int) -> None:
-        """As quickly as QEMU takes them."""
+        """Edges as fast as QEMU takes them."""
         self._machine.lines.run_through((line, i % 2 == 0) for i in range(edges))
 
     def level(self, line: str) -> bool:
-        """Of an output, as the robot sees it."""
+        """The level of an output, as the robot sees it."""
         return self._machine.lines.levels[line]
 
     def say(self, data: bytes) -> None:
-        """To the guest's serial port."""
+        """Send to the guest's serial port."""
         self._machine.serial.say(data)
 
     def hear(self) -> bytes:
-        """Bytes since the last call. Between calls nobody reads, so that a port may fill up."""
+        """Bytes since the last call. Between calls nobody reads, so a port may fill up."""
         port = self._machine.serial
         port.deaf = False
         self._clock.sleep(SETTLE_S)

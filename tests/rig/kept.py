@@ -1,11 +1,12 @@
-"""Which sweeps a box must have stored when it is killed. In: the sentences a robot heard, the files
-that were found. Out: the missing sweeps. Also the log of a campaign of kills, which a later run
-continues.
+"""Finds sweeps that a killed box lost: compares the sentences that a robot received with the files
+on the disk.
 
 A kept sweep is written after its answer, in the same turn of the loop, and state sentences come
-after that. So one whose answer was heard, and after it a state sentence of the same run, must be
-there whole. One sweep of a run may be missing: the sweep in progress, whose answer is the last in
-the sentences.
+later. So if the robot received an answer and a later state sentence of the same run, the sweep must
+be stored whole. Each run may lack one sweep: the sweep in progress, whose answer is the last that
+was received.
+
+The module also holds the log of a campaign of kills, which a later run continues.
 """
 
 from __future__ import annotations
@@ -28,25 +29,24 @@ KEPT = "/var/lib/palpate/kept"
 DROP_IN = "/etc/systemd/system/palpate.service.d/arguments.conf"
 PALPATE = "/opt/palpate/bin/palpate"
 ANSWERED = {str(status) for status in Status if status.classified} | {"unknown", "recorded"}
-"""Statuses with a window behind them; a box that records says `recorded`."""
+"""Statuses of answers that follow a window; a box that records answers `recorded`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """An answer with a window behind it: its number, and when the box had all that it needed, in s
-    of its clock."""
+    """An answer to a window: its number, and the time when the box had all that it needed, in s of
+    its clock."""
 
     sweep: int
     complete_s: float
 
     def fits(self, kept: Sweep) -> bool:
-        """True where `kept` is the sweep that was answered."""
+        """Whether `kept` is the sweep that was answered."""
         return kept.id == self.sweep and abs(kept.complete_ns / 1e9 - self.complete_s) < 0.005
 
 
 def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
-    """From the next start on the service runs with these arguments. more: further lines of its
-    drop-in."""
+    """Start the service with these arguments from now on. more: further lines of its drop-in."""
     folder = DROP_IN.rpartition("/")[0]
     machine.run(f"mkdir -p {folder}", check=True)
     machine.put(
@@ -56,8 +56,8 @@ def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
 
 
 def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
-    """Look at a disk that nobody uses, on a copy: e2fsck's exit code after the journal is replayed,
-    and the kept sweeps."""
+    """Examine an unused disk on a copy: the exit code of e2fsck after the journal is replayed, and
+    the kept sweeps."""
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
@@ -70,18 +70,18 @@ def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
 
 
 def sweeps(files: Iterable[Path]) -> list[Sweep]:
-    """All kept sweeps among these. Raises FormatError where one is not whole."""
+    """All kept sweeps among `files`. Raises FormatError if a sweep is not whole."""
     return [load(path)[0] for path in files if path.suffix == ".npy"]
 
 
 def whole(line: str) -> list[str]:
-    """The fields of a sentence, none where the line is damaged."""
+    """The fields of a sentence; none if the sentence is damaged."""
     body, star, given = line.removeprefix("$").partition("*")
     return body.split(",") if star and body.isascii() and checksum(body) == given else []
 
 
 def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
-    """Answers whose sweep must be stored, and those whose sweep may be missing; heard: (ns, line)
+    """Answers whose sweep must be stored, and answers whose sweep may be missing. heard: (ns, line)
     of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
@@ -98,8 +98,8 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
 
 
 def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
-    """Counts: answers with a window, sweeps that must be stored, how many of these are missing, how
-    many others are."""
+    """Counts of answers with a window, of sweeps that must be stored, of those that are missing,
+    and of other missing sweeps."""
     must, may = owed(heard)
     gone = [h for h in must if not any(h.fits(k) for k in kept)]
     unfinished = [h for h in may if not any(h.fits(k) for k in kept)]

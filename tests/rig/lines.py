@@ -1,10 +1,8 @@
-"""The robot's ends of the guest's GPIO lines. In: levels to drive, each at its time. Out: the
-levels that the box drives, with times.
+"""The robot's ends of the guest's GPIO lines: levels to drive, each at its time, and the levels
+that the box drives.
 
-All times are the guest's.
-
-A PL061 of QEMU's `virt` machine: inputs are set and outputs watched through the qtest socket, and
-the guest's stock driver sees interrupts.
+All times are the guest's. The lines are a PL061 of QEMU's machine `virt`: inputs are set and
+outputs watched through the qtest socket, and the guest's stock driver sees interrupts.
 """
 
 from __future__ import annotations
@@ -18,16 +16,15 @@ from tests.rig.guest_clock import GuestClock
 from tests.rig.qtest import Qtest
 
 HOLD_NS = 250_000_000
-"""A level that was planned is held at least so long, however late it came: an emulated processor
-that is busy takes an interrupt long after the edge, and looks at the level only then.
-"""
+"""A planned level lasts at least this long, however late it came. A busy emulated processor handles
+an interrupt long after the edge, and only then reads the level."""
 
 
 class GuestLines:
-    """levels: the level that the box drives, by the name of the line. log: (ns, name, level) of all
-    changes, in order, each with the time that was read last.
+    """levels: the level that the box drives, by line name. log: (ns, name, level) of all changes,
+    in order, with the time that was read last.
 
-    Fits where the rig's robot drives its edges (appliance.sim.rig.EdgeLines).
+    Can be used as the lines of the rig's robot (appliance.sim.rig.EdgeLines).
     """
 
     def __init__(self, qtest: Qtest, clock: GuestClock, place: str, names: Sequence[str]) -> None:
@@ -54,23 +51,23 @@ class GuestLines:
         )
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Drive an input at a time, or at once where that has passed."""
+        """Drive an input at a time, or at once if that has passed."""
         with self._planned:
             heapq.heappush(self._plan, (t_ns, next(self._order), name, level))
             self._planned.notify()
 
     def forget(self, name: str, t_ns: int) -> None:
-        """Take back what `name` was to be set to at `t_ns` and later."""
+        """Cancel the levels of `name` that are planned for `t_ns` and later."""
         with self._planned:
             self._plan = [item for item in self._plan if item[2] != name or item[0] < t_ns]
             heapq.heapify(self._plan)
 
     def wait(self, name: str, level: bool, timeout_s: float) -> bool:
-        """Wait until the box drives an output to `level`; False where it does not in time."""
+        """Wait until the box drives an output to `level`; False if it does not in time."""
         return self._clock.until(lambda: self.levels[name] == level, timeout_s)
 
     def code(self) -> int:
-        """The code on the class bits now."""
+        """The number on the class bits."""
         bits = sorted(name for name in self.levels if name.startswith("CLASS-"))
         return sum(self.levels[name] << i for i, name in enumerate(bits))
 
@@ -92,7 +89,7 @@ class GuestLines:
                         return
                     left_ns = self._plan[0][0] - self._clock.now_ns() if self._plan else None
                     if left_ns is None or left_ns > 0:
-                        # the guest's time is the host's at most, nearly: look again then
+                        # the guest's time is never ahead of the host's: look again at that time
                         self._planned.wait(None if left_ns is None else left_ns / 1e9)
                         continue
                     _, _, name, level = heapq.heappop(self._plan)
@@ -103,4 +100,4 @@ class GuestLines:
                 self.set(name, level)
                 self._driven_ns[name] = self._clock.now_ns()
         except OSError:
-            return  # the guest has gone
+            return  # QEMU has ended

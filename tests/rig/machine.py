@@ -1,9 +1,9 @@
-"""One guest. In: an image. Out: a running machine whose USB, lines and serial port are at hand
-outside.
+"""One running guest, made from an image, with its USB port, lines and serial port within reach of a
+test.
 
-Boots from its disk, or goes on from the snapshot in two seconds. `cut` pulls the plug. Nothing of a
-run is kept: each has a disk of its own on top of the image's, unless it is asked to write into the
-image itself.
+It boots from its disk, or continues from the snapshot in two seconds. `cut` cuts the power. Nothing
+of a run is kept: each run has a disk of its own on top of the image's, unless it is asked to write
+into the image itself.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from tests.rig.usbredir import UsbRedirPeer
 START_S = 60
 """Longest wait for QEMU to open its sockets, or to load a snapshot."""
 CARDS_S = 600
-"""Longest wait for a kernel that boots to set up its cards, by the host's time: no other is known
-yet."""
+"""Longest wait for a booting kernel to set up its cards, in the host's time: the guest's clock
+needs these cards."""
 
 
 class Guest:
-    """A guest that runs until `close`, `cut`, or it powers off.
+    """A guest that runs until `close`, `cut`, or until it powers off.
 
-    image: what it runs. folder: where its sockets and its disk go. snapshot: go on from there,
-    instead of booting. disk: use this disk as it is and write into it. code: a folder that is its
-    second disk, read-only. ssh: port of this machine that leads to the guest's port 22, where it
-    has one; else it has no network. clock: its time. lines, serial, skin: the robot's ends of
-    trigger and result lines, of the serial port, and of the USB cable.
+    image: the box. folder: for its sockets and its disk. snapshot: continue from there instead of
+    booting. disk: use this disk as it is and write into it. code: a folder that becomes its second
+    disk, read-only. ssh: port of this machine that leads to the guest's port 22; 0 gives no
+    network. clock: its time. lines, serial, skin: the robot's ends of trigger and result lines, of
+    the serial port, and of the USB cable.
     """
 
     def __init__(
@@ -87,7 +87,8 @@ class Guest:
             redir.close()
 
     def _code_disk(self, code: Path | None) -> None:
-        # always there and always as large, since a snapshot has to find the hardware that it left
+        # always present and of the same size, because a snapshot needs the hardware with which it
+        # was made
         given = ["-d", code] if code else []
         path = self._folder / "code.img"
         run("mke2fs", "-q", "-t", "ext4", "-O", "^has_journal", *given, path, "48M")
@@ -134,14 +135,14 @@ class Guest:
                 time.sleep(0.02)
 
     def _find(self, kind: str) -> str:
-        """Place of a device of the board in QEMU's tree of objects."""
+        """Path of a device of the board in QEMU's tree of objects."""
         devices = self.qmp("qom-list", path="/machine/unattached")
         return next(
             f"/machine/unattached/{d['name']}" for d in devices if d["type"] == f"child<{kind}>"
         )
 
     def _plug_cable(self, listener: socket.socket) -> UsbRedirPeer:
-        """Put the far end of a USB cable on the guest's port; nothing hangs on it yet."""
+        """Connect the far end of a USB cable to the guest's port, without a device yet."""
         address = {"type": "unix", "data": {"path": str(self._folder / "skin")}}
         self.qmp(
             "chardev-add",
@@ -153,7 +154,8 @@ class Guest:
         return UsbRedirPeer(listener.accept()[0], self.clock)
 
     def qmp(self, execute: str, **arguments: Any) -> Any:
-        """Ask QEMU's monitor; what it returns. Raises GuestFailed where it refuses."""
+        """Send a command to QEMU's monitor; returns its result. Raises GuestFailed if QEMU
+        refuses."""
         self._qmp.write(json.dumps({"execute": execute, "arguments": arguments}) + "\n")
         self._qmp.flush()
         for line in self._qmp:
@@ -165,14 +167,14 @@ class Guest:
         raise GuestFailed(f"qemu has left during {execute}")
 
     def ready(self, timeout_s: float) -> None:
-        """Wait until the guest runs shell lines. Raises GuestFailed where it does not."""
+        """Wait until the guest runs shell commands. Raises GuestFailed if it does not."""
         self.run("true", timeout_s=timeout_s)
 
     def run(
         self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
     ) -> Done:
-        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says
-        nothing, or check asks."""
+        """Run a shell command as root and wait for its end. Raises GuestFailed if the guest does
+        not answer, or if it fails and `check` is set."""
         return self._shell.run(line, timeout_s=timeout_s, check=check, stdin=stdin)
 
     def put(self, path: str, data: bytes) -> None:
@@ -184,8 +186,8 @@ class Guest:
         return base64.b64decode(self.run(f"base64 {path}", check=True).out)
 
     def save(self) -> None:
-        """Keep the running guest in its disk as the snapshot `ready`, without its USB devices, and
-        end."""
+        """Save the running guest in its disk as the snapshot `ready`, without the device on its USB
+        port, and end."""
         self.qmp("device_del", id="cable")
         self.run("udevadm settle")
         text = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
@@ -194,12 +196,12 @@ class Guest:
         self.close()
 
     def bench(self) -> socket.socket:
-        """The other end of the guest's port palpate.bench, over which tests inside request actions
-        outside."""
+        """The other end of the guest's port palpate.bench, through which tests inside request
+        actions outside."""
         return self._connect("bench")
 
     def console(self) -> str:
-        """The output of kernel and systemd on the console."""
+        """The console's output of the kernel and systemd."""
         return (self._folder / "console").read_text(errors="replace")
 
     def cut(self) -> None:
@@ -220,6 +222,7 @@ class Guest:
 
 
 def _network(ssh: int) -> tuple[str, ...]:
-    """Options of QEMU: a network without a way out, where `ssh` of this machine leads to port 22."""
+    """Options of QEMU for a network without a way out; port `ssh` of this machine leads to port
+    22."""
     forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
     return "-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="

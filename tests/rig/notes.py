@@ -1,8 +1,8 @@
-"""What became of each fault. In: a line from each test that made one. Out: the table fault x
-outcome, as Markdown.
+"""The outcome of each injected fault: a line from each test, and the table fault x outcome as
+Markdown.
 
-Lines gather in build/rig/faults.jsonl over all runs; of one fault the run with the most repetitions
-counts, and of such the last.
+Lines of all runs gather in build/rig/faults.jsonl. For each fault the run with the most repetitions
+counts, and of such runs the last.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def write(test: str, fault: str, outcome: str, times: int, file: Path = FILE) ->
 
 
 def table(file: Path = FILE) -> list[str]:
-    """Lines of a Markdown table, the faults of one test file together. Raises OSError where nothing
-    was noted."""
+    """Lines of a Markdown table, with the faults of a test file together. Raises OSError if nothing
+    was recorded."""
     best: dict[tuple[str, str], dict[str, Any]] = {}
     for line in file.read_text().splitlines():
         event = json.loads(line)

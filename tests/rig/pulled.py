@@ -1,5 +1,5 @@
-"""The skin's cable, pulled at a moment of a sweep. In: a cell, the number of the try. Out: the
-status of the only answer."""
+"""The skin's cable, pulled at a moment of a sweep. Each function takes a cell and the number of the
+attempt, and returns the status of the only answer."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def during(cell: Cell, i: int) -> str:
     touch, since = begin(cell)
     until(cell, touch.start_ns + (i * 37 % 25) * SECOND // 10)
     cell.unplug()
-    let_go(cell)  # no stop edge comes to bring the answer about
+    let_go(cell)  # no stop edge comes that could cause the answer
     return not_wrong(touch, only_answer(cell, since))
 
 
 def after(cell: Cell, i: int) -> str:
-    """Pulled within 30 ms of the stop edge: the answer is out, or it is that the skin was lost."""
+    """Pulled within 30 ms of the stop edge: the answer has been sent, or is sensor-lost."""
     touch, since = begin(cell)
     until(cell, touch.stop_ns + i % 4 * SECOND // 100)
     cell.unplug()

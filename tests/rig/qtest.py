@@ -1,5 +1,5 @@
-"""QEMU's qtest socket. In: lines of its protocol. Out: their answers; levels of intercepted outputs
-as they change."""
+"""QEMU's qtest socket: sends commands of its protocol, returns the answers, and reports changes of
+intercepted outputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 
 ANSWER_S = 60
-"""QEMU answers at once; on a machine that is very busy its turn comes later."""
+"""QEMU answers at once, but on a very busy machine it may have to wait for the processor."""
 
 
 class Qtest:
@@ -23,9 +23,9 @@ class Qtest:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def ask(self, *lines: str) -> list[str]:
-        """The text after OK in the answer to each line, all sent in one write.
+        """Send all commands in one write; the text after OK in the answer to each.
 
-        Raises OSError where QEMU has gone or answers nothing, RuntimeError where it refuses.
+        Raises OSError if QEMU has ended or does not answer, RuntimeError if it refuses.
         """
         with self._asking:
             self._socket.sendall("".join(f"{line}\n" for line in lines).encode())
@@ -45,7 +45,7 @@ class Qtest:
         except queue.Empty as e:
             raise TimeoutError(f"qemu did not answer within {ANSWER_S} s") from e
         if not answer:
-            self._answers.put("")  # for whoever asks next
+            self._answers.put("")  # wakes a caller that waits for an answer
             raise ConnectionError("qemu has gone")
         return answer
 
@@ -58,5 +58,5 @@ class Qtest:
                 else:
                     self._answers.put(line.strip())
         except (OSError, ValueError):
-            pass  # closed
+            pass  # the socket was closed
         self._answers.put("")

@@ -1,6 +1,5 @@
-"""Shell lines in the guest, from outside. In: the far end of the port at which its agent listens
-(guest/agent.py). Out: their output.
-"""
+"""Shell commands in the guest, run from outside through the port at which its agent listens
+(guest/agent.py)."""
 
 from __future__ import annotations
 
@@ -13,25 +12,25 @@ from dataclasses import dataclass
 from tests.rig.guest_clock import GuestClock
 
 REPLY_S = 60
-"""What a line's answer may take, by the guest's clock, beyond the time that the line itself may
+"""Longest delay of an answer, by the guest's clock, beyond the time that the command itself may
 take."""
 
 
 class GuestFailed(AssertionError):
-    """The guest did not carry out a command."""
+    """The guest failed to carry out a request."""
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """How a shell line ended: its exit code and its output. rc 124: it ran out of time."""
+    """The end of a shell command: its exit code and its output. rc 124: it ran out of time."""
 
     rc: int
     out: str
 
 
 class Shell:
-    """One line at a time. An answer that comes too late for its line is passed over, not taken for
-    that of the next."""
+    """Runs one command at a time. An answer that comes too late is skipped, and not mistaken for
+    the answer to the next command."""
 
     def __init__(self, port: socket.socket, clock: GuestClock) -> None:
         self._port, self._clock = port, clock
@@ -40,8 +39,8 @@ class Shell:
     def run(
         self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
     ) -> Done:
-        """Run a shell line as root; waits for its end. Raises GuestFailed where the guest says
-        nothing, or check asks."""
+        """Run a shell command as root and wait for its end. Raises GuestFailed if the guest does
+        not answer, or if it fails and `check` is set."""
         request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
         try:
             self._port.sendall(json.dumps(request).encode() + b"\n")
@@ -57,7 +56,7 @@ class Shell:
         return done
 
     def _heard_answer(self, line: str) -> bool:
-        """Whether the answer to the latest line is there whole."""
+        """Whether the answer to the latest command is complete."""
         if b"\n" not in self._rest and select.select([self._port], [], [], 0)[0]:
             more = self._port.recv(1 << 20)
             if not more:

@@ -1,8 +1,7 @@
-"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged. In:
-hours, a seed. Out: one record for each box, a page with four charts, and exit code 1 if a target
-was missed.
+"""`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged.
 
-Each box is recorded by a process of its own. An interrupted soak is continued by the next run.
+The results are a record of each box, a page with four charts, and exit code 1 if a target was
+missed. A process of its own records each box. An interrupted soak is continued by the next run.
 """
 
 from __future__ import annotations
@@ -36,16 +35,17 @@ from train.reports import html, provenance
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
 SILENT_S = 60.0
-"""A box that sends nothing for this long is gone; a working one sends its state each second."""
+"""A box that sends nothing for this long has ended; a working box sends its state each second."""
 GRACE_S = 5.0
-"""While a soak goes on, an answer may take so long after its stop edge; at the end, all are
+"""During a soak, an answer may come this long after its stop edge; at the end, all answers are
 awaited."""
 MARGIN_S = 0.5
-"""A box is stopped this far inside a sweep, so that it is certain that the sweep had begun."""
+"""A box is stopped this far inside a sweep, so that the sweep has certainly begun."""
 SAME = ("box", "commit", "bundle", "format", "machine", "versions")
-"""What records must agree in for their runs to be put together."""
+"""Entries that must be equal in records whose runs are joined."""
 NOTED = 200
-"""Faults of a run that are written out; what goes on failing would fill the disk."""
+"""Largest number of faults of a run that are recorded in full; a permanent fault would fill the
+disk."""
 
 
 class Recorder:
@@ -66,7 +66,7 @@ class Recorder:
         self._begun_s = self._heard_s = self._looked_s = self._clock()
 
     def listen(self, seconds: float, stopped: Callable[[], bool]) -> None:
-        """Judge sentences and sample the process for so long or until `stopped()`. Raises Gone."""
+        """Judge sentences and take samples for this long or until `stopped()`. Raises Gone."""
         end_s = self._clock() + seconds
         while (now_s := self._clock()) < end_s and not stopped():
             for line in self._box.heard(WAIT_S):
@@ -79,7 +79,7 @@ class Recorder:
             self.run.length_s = round(self._clock() - self._begun_s, 1)
 
     def sweeping(self) -> bool:
-        """Whether a sweep is certainly under way."""
+        """Whether a sweep has certainly begun and not ended."""
         now_s = self._clock()
         (_, stops), (starts, _) = (
             self._box.edges(now_s + MARGIN_S),
@@ -88,7 +88,7 @@ class Recorder:
         return starts > stops
 
     def stop(self) -> None:
-        """Tell the box to end: all sweeps that have begun are due. Raises Gone."""
+        """Make the box end; all sweeps that have begun must be answered. Raises Gone."""
         self.run.due = self._box.edges(self._clock())[0]
         for line in self._box.stop():
             self.hear(*line)
@@ -106,7 +106,7 @@ class Recorder:
             self._note(at_s, body.split(",")[2:])
 
     def fault(self, what: str, at_s: float | None = None) -> None:
-        """Note a fault."""
+        """Record a fault."""
         if len(self.run.faults) < NOTED:
             self.run.faults.append([self._since(self._clock() if at_s is None else at_s), what])
 
@@ -122,7 +122,7 @@ class Recorder:
         return round(self.run.began_s + at_s - self._begun_s, 2)
 
     def _answer(self, at_s: float, answer: Answer) -> None:
-        # by time, not by number: an edge that an emulator misses makes one answer of two, or two of
+        # by time, not by number: if an emulator misses an edge, one sweep becomes two or two become
         # one
         fact = self._sweeps[max(self._box.edges(at_s)[1], 1)]
         if wrong := soak_judge.numbering(
@@ -162,8 +162,8 @@ def record(
     stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
 ) -> None:
-    """Have a box sweep for so long; `save` is called each minute and at the end. Faults are noted
-    in the run."""
+    """Let a box sweep for this long; `save` is called each minute and at the end. Faults are in the
+    run."""
     recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
@@ -183,7 +183,7 @@ def record(
 
 
 def progress(run: SoakRun) -> str:
-    """A run in a line."""
+    """The progress of a run as one line of text."""
     results = soak_judge.sums({"runs": [asdict(run)]})
     memory = f"{results['rss_kib'][-1] / 1024:.1f} MiB, " if results["rss_kib"] else ""
     return (
@@ -193,8 +193,8 @@ def progress(run: SoakRun) -> str:
 
 
 def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
-    """The runs of an interrupted soak and when it was started; none and now where there is none, or
-    where it was of other code, another seed or another machine."""
+    """The runs of an interrupted soak and its start time. The list is empty and the time is now if there is
+    no record, or if its code, seed or machine differ."""
     if path.exists():
         held = json.loads(path.read_text())
         if all(held.get(name) == value for name, value in about.items()):
@@ -203,7 +203,7 @@ def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all, a row a line."""
+    """Write JSON whole or not at all, one row on each line."""
     storage.put(path, (_text(content) + "\n").encode(), parents=True)
 
 
@@ -233,7 +233,7 @@ def soak(
     stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
 ) -> Path:
-    """Record one box for the rest of `hours`; its record."""
+    """Record one box for the rest of `hours`; returns its record."""
     path = _record(work, box.name)
     about = {
         "box": box.name,
@@ -260,10 +260,10 @@ def soak(
 
 
 def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One record of soaks that went on side by side, their runs one after the other as if they had
+    """One record made of soaks that ran side by side. Their runs follow each other as if they had
     been interrupted.
 
-    Raises ValueError where they are of different boxes or code, or where two sweep with one seed.
+    Raises ValueError if boxes or code differ, or if two have the same seed.
     """
     first, *others = records
     runs = [SoakRun(**run) for run in first["runs"]]
@@ -293,7 +293,7 @@ def _moved(run: SoakRun, began_s: float) -> SoakRun:
 
 def draw(works: Sequence[Path], out: Path, page: Path) -> bool:
     """Join the records, check them against the targets, and write results and page; False if a
-    target was not reached.
+    target was missed.
 
     out: the file of results. A box without a record in `works` keeps its record in `out`.
     """
@@ -332,7 +332,7 @@ def _record(work: Path, name: str) -> Path:
 
 
 def _drawn(out: Path) -> list[dict[str, Any]]:
-    """The records in a file of results; none if there is no file."""
+    """The records in a file of results; empty if the file does not exist."""
     return list(json.loads(out.read_text())["boxes"].values()) if out.exists() else []
 
 
@@ -398,8 +398,8 @@ def main() -> int:
 
 
 def _together(arguments: list[str]) -> bool:
-    """Run each box that this machine has in a process of its own; a signal to this process is
-    passed on to them. False if one failed."""
+    """Run each box that is available here in a process of its own. Interrupting this process
+    interrupts them. False if a box failed."""
     children = []
     for name, kind in BOXES.items():
         if missing := kind.missing():

@@ -1,9 +1,9 @@
-"""Boxes under test. In: a script of sweeps. Out: a box at work in real time: its sentences, the
-edges that it was given, and the resources of its process.
+"""Boxes under test: each sweeps by a script in real time, and returns its sentences, the edges that
+it received, and the resources of its process.
 
-One is the installed command on this machine with the simulated skin, its serial line a
-pseudo-terminal; the other the virtual box, with its skin, lines and serial port on real buses of
-the guest.
+ThisMachine is the installed command on this machine with the simulated skin and a pseudo-terminal
+as its serial line. soak_guest.py has the virtual box, with its skin, lines and serial port on real
+buses of the guest.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ STOP_S = 30
 """Longest wait for a box to end after SIGTERM."""
 HALF_FRAME_S = 0.5 / skin.FORMAT.rate_hz
 SLOW_ANSWER_S = 0.5
-"""By so much the first answer may be slower than a later one."""
+"""The first answer may be this much slower than later answers."""
 TICKS = os.sysconf("SC_CLK_TCK")
 SMAPS = re.compile(r"^(Rss|Pss): +(\d+) kB", re.M)
 
 
 class Gone(AssertionError):
-    """The box has ended by itself."""
+    """The box ended by itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A sweep of the script: the touched material, the numbers of the frames at its edges, the
-    verdict of the bundle by itself."""
+    """A sweep of the script: the touched material, the numbers of the frames at its edges, and the
+    label of the bundle by itself."""
 
     label: str
     start: int
@@ -60,8 +60,8 @@ class Fact:
 
 
 class Script:
-    """The robot's sweeps in order, as facts; worked out as far as somebody asks. Numbers begin with
-    1, as in sentences."""
+    """The robot's sweeps in order, as facts, computed on demand. Numbers begin with 1, as in
+    sentences."""
 
     def __init__(self, seed: int) -> None:
         self._acts, self._facts, self._next = script.tubes(seed), list[Fact](), 0
@@ -74,7 +74,7 @@ class Script:
         return self._facts[number - 1]
 
     def edges(self, frame: float) -> tuple[int, int]:
-        """Start and stop edges until this frame."""
+        """Start and stop edges up to this frame."""
         while self._next <= frame:
             self._add()
         starts, stops = (
@@ -104,7 +104,7 @@ class BoxUnderTest(Protocol):
     name: str
 
     def clock(self) -> float:
-        """The time by which robot and skin go: this machine's, or the guest's. Raises Gone."""
+        """The clock of robot and skin: this machine's, or the guest's. Raises Gone."""
         ...
 
     def start(self, seed: int, sweeps: Script) -> None:
@@ -112,16 +112,16 @@ class BoxUnderTest(Protocol):
         ...
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """Lines that have come since the last call, each with its time; waits no longer. Raises
+        """Lines since the last call, each with its time; waits at most `wait_s` for more. Raises
         Gone."""
         ...
 
     def edges(self, at_s: float) -> tuple[int, int]:
-        """Start and stop edges that the robot had given by then."""
+        """Numbers of start and stop edges up to that time."""
         ...
 
     def taken(self, at_s: float) -> float:
-        """Frames that the board had taken by then, from any beginning."""
+        """Number of frames that the board had taken up to that time, from any origin."""
         ...
 
     def process(self) -> tuple[int, int, float, int, int]:
@@ -133,17 +133,18 @@ class BoxUnderTest(Protocol):
         ...
 
     def stop(self) -> list[tuple[float, str]]:
-        """End it and wait for that; the last lines. Raises Gone if it does not end with 0."""
+        """End the box and wait for its end; returns the last lines. Raises Gone if its exit code is
+        not 0."""
         ...
 
     def close(self) -> None:
-        """Leave nothing behind, whatever has happened."""
+        """Clean up, whatever has happened."""
         ...
 
 
 def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
-    """A process from the texts of /proc/PID/smaps_rollup and /proc/PID/stat, as
-    `BoxUnderTest.process` returns it."""
+    """The fields of `BoxUnderTest.process` from the texts of /proc/PID/smaps_rollup and
+    /proc/PID/stat."""
     kib = dict(SMAPS.findall(smaps))
     fields = stat.rpartition(")")[2].split()
     cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
@@ -151,11 +152,11 @@ def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, in
 
 
 class Reckoned:
-    """A robot and a board that cannot be asked: their sweeps and frames by the clock, since the
-    script is known.
+    """A robot and a board that cannot be observed: their sweeps and frames are computed from the
+    clock and the known script.
 
-    The quickest answer fixes where the script is, the first frames that were counted where the
-    board is.
+    The quickest answer gives the start of the script, the first frames that were counted give the
+    start of the board.
     """
 
     def __init__(self, sweeps: Script) -> None:
@@ -174,9 +175,8 @@ class Reckoned:
             self._board_s = at_s - int(frames) / skin.FORMAT.rate_hz
 
     def _begin(self, origin_s: float) -> None:
-        """The script began then or earlier. Only a little earlier than was known: a slow first
-        answer is put right, an answer with a wrong number moves nothing.
-        """
+        """The script began at this time or earlier. Only small corrections are accepted: the first
+        answer may be slow, but an answer with a wrong number must not shift the script."""
         if not self._origin_s or 0 < self._origin_s - origin_s < SLOW_ANSWER_S:
             self._origin_s = origin_s
 
@@ -208,7 +208,7 @@ class ThisMachine:
 
     @staticmethod
     def missing() -> str:
-        """Why this box cannot be had here; "" where it can."""
+        """Why this box is not available here; "" if it is."""
         return ""
 
     def start(self, seed: int, sweeps: Script) -> None:
@@ -247,11 +247,11 @@ class ThisMachine:
         return found
 
     def _note(self, at_s: float, line: str) -> None:
-        """What to do with each line before it is passed on."""
+        """A hook for each line before it is returned."""
         self._robot.hear(at_s, line)
 
     def _said(self) -> bytes:
-        """Bytes from the box."""
+        """Sentences that the box has sent."""
         return os.read(self._far, 65536)
 
     def _log_text(self) -> str:
@@ -307,6 +307,6 @@ class ThisMachine:
         while not ended and time.monotonic() < end_s:
             ended = (
                 self._box.poll() is not None
-            )  # before the last look, so that nothing is left in the line
+            )  # closed before the last read, so that no data remain in the line
             with suppress(BlockingIOError):
                 yield from self._read(0.2)

@@ -1,8 +1,8 @@
-"""The virtual box under test. In: a script of sweeps. Out: sentences of the guest, edges given to
-it, resources of its process.
+"""The virtual box under test: its sentences, the edges that it received, and the resources of its
+process.
 
-The skin hangs on the guest's USB port, the robot drives its lines, and sentences come over its
-serial port: the way of a real box. Only its use of memory is read inside.
+The skin is on the guest's USB port, the robot drives its lines, and sentences come over its serial
+port, as on a real box. Only its use of memory is read inside the guest.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from tests.rig.soak_boxes import Gone, Script, process
 READY_S = 180
 LOCKED = re.compile(r"^onnxruntime==(\S+)", re.M)
 SENT = 4096
-"""Packets of which it is remembered when they went: half a minute, longer than any sentence
+"""Number of packets whose time of sending is remembered: half a minute, longer than any sentence
 takes."""
 
 
 class SoakRobot:
-    """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns: of
-    starts, and of stops.
+    """The robot: sweeps without pause as soon as `ready` is set (see sim.rig.Robot). edges_ns:
+    times of start edges, and of stop edges.
 
-    The edges of a sweep are planned during the previous sweep, so they come in time however late
+    The edges of a sweep are planned during the previous sweep, so they are in time however late
     frames are fetched.
     """
 
@@ -73,7 +73,7 @@ class SoakRobot:
 
 
 class VirtualBox:
-    """A guest that goes on from its snapshot, as BoxUnderTest."""
+    """A guest that continues from its snapshot, as a BoxUnderTest."""
 
     name = "virtual box"
 
@@ -85,7 +85,7 @@ class VirtualBox:
 
     @staticmethod
     def missing() -> str:
-        """Why this box cannot be had here; "" where it can."""
+        """Why this box is not available here; "" if it is."""
         return (
             ""
             if image.built()
@@ -136,23 +136,24 @@ class VirtualBox:
         return starts, stops
 
     def taken(self, at_s: float) -> float:
-        """As BoxUnderTest; those that have left the board's FIFO, handed over or dropped."""
+        """As BoxUnderTest; counts frames that have left the board's FIFO, sent or dropped."""
         sent = list(self._sent)
         at = bisect_right(sent, at_s, key=lambda s: s[0])
         return sent[at - 1][1] if at else 0
 
     def _note(self, packet: bytes) -> bytes:
-        """Take note of the last frame of a packet that goes to the guest; the packet as it is."""
+        """Record the last frame of a packet that goes to the guest; returns the packet
+        unchanged."""
         _, _, _, _, _, count, *_, seq, _ = packets.HEADER.unpack_from(packet)
         if self._anew and self._sent:
-            # frames between STOP and START of the box are not to be sent
+            # frames from between the box's STOP and its START were not requested
             self._thrown += seq - self._thrown - self._sent[-1][1]
         self._anew = False
         self._sent.append((self.clock(), seq + count - self._thrown))
         return packet
 
     def _request(self, request: int) -> bytes | None:
-        """Take note of a START; the board's answer."""
+        """Record a START; returns the board's answer."""
         self._anew |= request == packets.Request.START and not self._board.running
         return self._answer(request)
 
@@ -169,7 +170,8 @@ class VirtualBox:
         return process(text, stat, int(files))
 
     def about(self) -> Mapping[str, Any]:
-        """As BoxUnderTest; of the emulated machine alone, since the guest does not run yet."""
+        """As BoxUnderTest; only describes the emulated machine, since the guest does not run
+        yet."""
         return {
             "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines and its serial port",
             "machine": f"QEMU {' '.join(image.MACHINE[1:])}, on {platform.machine()}, {os.cpu_count()} cores",

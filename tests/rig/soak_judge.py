@@ -1,6 +1,7 @@
-"""Judges a soak. In: the record of one box. Out: sums with intervals, and which targets they meet.
+"""Judges a soak: computes sums with intervals from the record of a box, and compares them with the
+targets.
 
-Pure: nothing is read, started or timed here, so that a made-up record is judged like a real one.
+Nothing is read, started or timed here, so an invented record is judged like a real record.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from appliance.core.types import Status
 
 Json = Mapping[str, Any]
 ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "lost")
-"""Columns of an answer: when it came (seconds of the soak), its RES sentence beside what was
-touched. alone: what the same bundle says, in the recorder, of the very frames that the script has
-there (see `said`)."""
+"""Columns of an answer: its time (seconds of the soak), the touched material, and its RES sentence.
+alone: the label of the same bundle for the exact frames of the script, computed by the recorder
+(see `said`)."""
 SAMPLE = (
     "s",
     "rss_kib",
@@ -37,28 +38,28 @@ SAMPLE = (
     "behind",
 )
 """Columns of a sample: the process, then the counters of the last STA. behind: frames that the
-board had taken and the box had not counted yet, received or lost; the least since the sample
-before."""
+board had taken and the box had not yet counted as received or lost; the minimum since the previous
+sample."""
 GROWTH_KIB_H = 256.0
-"""Memory is flat where the upper end of the slope's 95 % interval stays below this; stated before
+"""Memory counts as flat if the upper end of the slope's 95 % interval is below this; fixed before
 the first run."""
 IN_FLIGHT = 12
-"""Two packets: what a board has taken and the box not counted may differ by so much between two
+"""Frames of two packets: the counts of the board and of the box may differ by this much between two
 looks."""
 LOOKS = 6
-"""Samples, a minute of them, of which the least `behind` counts: a box that is late for a while has
-lost nothing."""
+"""Number of samples, one minute, over which the minimum of `behind` counts: a box that is late for
+a while has lost nothing."""
 SECURE_MIN = 10
-"""Minutes that the second half must have before growth or flatness is judged."""
+"""Minutes that the second half must last before growth or flatness is judged."""
 
 
 @dataclass(slots=True)
 class SoakRun:
-    """One unbroken run of one box; a soak that was interrupted has several.
+    """One unbroken run of one box; an interrupted soak has several runs.
 
-    began_s, length_s: in seconds of the soak, interruptions left out. due: sweeps that ought to be
+    began_s, length_s: in seconds of the soak, without interruptions. due: sweeps that should be
     answered by its end. faults: [seconds, description]. silence_s: longest time without a sentence.
-    ended: why, "" while it goes on.
+    ended: the reason, "" while it runs.
     """
 
     seed: int
@@ -78,8 +79,8 @@ def columns(rows: Sequence[Sequence[Any]], names: Sequence[str]) -> dict[str, li
 
 
 def numbering(number: int, last: int, started: int) -> str:
-    """The fault in the number of an answer after the answer `last`, when `started` sweeps had
-    begun; "" if it is right."""
+    """An error message if the number of an answer is wrong after the answer `last`, when `started`
+    sweeps had begun; else ""."""
     if number == last + 1:
         return (
             ""
@@ -92,7 +93,7 @@ def numbering(number: int, last: int, started: int) -> str:
 
 
 def kind(status: str, label: str, touched: str) -> str:
-    """An answer as right, wrong, unsure or refused; cut, where the soak's own end aborted the
+    """An answer as right, wrong, unsure or refused; cut if the end of the soak aborted the
     sweep."""
     if status == Status.OK:
         return "right" if label == touched else "wrong"
@@ -102,7 +103,7 @@ def kind(status: str, label: str, touched: str) -> str:
 
 
 def short_answer(status: str, label: str) -> str:
-    """An answer in a word: the label if the status is ok, else the status."""
+    """An answer as one word: the label if the status is ok, else the status."""
     return label if status == Status.OK else status
 
 
@@ -143,10 +144,10 @@ def share(n: int, total: int) -> dict[str, Any]:
 
 
 def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
-    """Seconds of the answers, and how many wrong ones are to be expected by then: 95 % of a
-    binomial whose rate is that of the same bundle by itself on the script's own frames."""
+    """Seconds of the answers, and the expected number of wrong answers up to each: 95 % of a
+    binomial with the error rate of the same bundle by itself on the script's own frames."""
     rows = [row for row in rows if row[3] != Status.ABORTED]
-    alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, and no refusal
+    alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, but not a refusal
     rate = sum(alone) / len(rows) if rows else 0.0
     n = np.arange(1, len(rows) + 1)
     low, high = stats.binom.ppf([[0.025], [0.975]], n, rate).astype(int)
@@ -165,9 +166,9 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
     """Growth of resident memory over the second half of each run, KiB an hour, by least squares
     with its 95 % interval.
 
-    Runs are separate processes: each has a level of its own, all have one slope. Neighbouring
-    samples are alike, so the interval is that of so many independent ones as their correlation
-    leaves (Bartlett 1946, first order).
+    Runs are separate processes: each has its own level, and all share a slope. Neighbouring samples
+    are correlated, so the interval is computed for the equivalent number of independent samples
+    (Bartlett 1946, first order).
     """
     held = [
         columns(half, SAMPLE)
@@ -197,7 +198,8 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
 
 
 def _counted(runs: Sequence[Json]) -> dict[str, Any]:
-    """Counters of the box, and the frames of the board that it never counted."""
+    """Counters of the box, and the number of frames that the board took and the box never
+    counted."""
     last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
     result: dict[str, Any] = {
         name: sum(c[name][-1] for c in last)
@@ -214,8 +216,10 @@ def _counted(runs: Sequence[Json]) -> dict[str, Any]:
 
 def unaccounted(behind: Sequence[float]) -> int:
     """Frames that the board took and the box counted neither as received nor as lost, from its lag
-    over time. Frames on their way are counted within a minute; frames that were dropped in silence
-    never are. Counting more frames than were taken is a fault as well.
+    over time.
+
+    Frames on their way are counted within a minute; frames dropped in silence are never counted.
+    More frames than were taken count as an error as well.
     """
     if not behind:
         return 0
@@ -224,7 +228,7 @@ def unaccounted(behind: Sequence[float]) -> int:
 
 
 def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
-    """(name, wanted, measured, whether it was reached) of each target; None where the run was too
+    """(name, wanted, measured, whether it was reached) of each target; None if the run was too
     short."""
     for name, key, of in (
         ("sweeps without an answer", "unanswered", f" of {result['due']}"),

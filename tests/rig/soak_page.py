@@ -1,5 +1,4 @@
-"""The page of a soak. In: records with their sums. Out: HTML and its picture of four charts over
-time.
+"""The page of a soak, from records with their sums: HTML and a picture of four charts over time.
 
 Only charts are computed here; every sentence with a number takes it from the sums.
 """
@@ -46,9 +45,9 @@ LOOKS = (
     {"color": ACCENT, "linewidth": 1.8},
     {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5))},
 )
-"""Of the boxes; where both do the same, one shows through the other."""
+"""Styles of the boxes; if two curves coincide, the lower shows through the upper."""
 DOTS = 1500
-"""Dots of a chart; of more sweeps the slowest of each few is drawn."""
+"""Largest number of dots of a chart; of more sweeps, the slowest of each group is drawn."""
 ORIGIN = {
     "what": "what runs",
     "machine": "machine",
@@ -60,7 +59,7 @@ ORIGIN = {
     "started": "started (UTC)",
     "runs": "runs",
 }
-"""What was run: names in the records and on the page."""
+"""Description of the run: names in the records and on the page."""
 
 
 ENDS = {
@@ -105,7 +104,7 @@ def render(records: Json) -> tuple[str, str]:
 
 
 def _targets(boxes: Json) -> list[Json]:
-    """The wanted and measured value of each target on each box."""
+    """The targets and the result of each box, a row for each target."""
     each = zip(*(targets(box["sums"]) for box in boxes.values()), strict=True)
     return [
         {
@@ -119,7 +118,7 @@ def _targets(boxes: Json) -> list[Json]:
 
 
 def _verdict(box: Json) -> str:
-    """How many targets a box has reached, and which it has missed."""
+    """How many targets a box reached, and which it missed."""
     met = {f"{what}, {came}": reached for what, _, came, reached in targets(box["sums"])}
     missed = [text for text, reached in met.items() if reached is False]
     count = f"{sum(map(bool, met.values()))} of {len(met)} targets reached"
@@ -195,7 +194,7 @@ def charts(records: Json) -> str:
         left, top = 0.1 + 0.5 * column, 0.9 - 0.47 * row
         axes = add_axes(
             figure, left, left + 0.375, top, top - 0.3
-        )  # the last tick is centred on the end
+        )  # the last tick is centred on the end of the axis
         axes.set_xlim(0, 60 * hours / by * 1.01)
         for (_, box), look in zip(boxes, LOOKS, strict=False):
             draw(axes, box, look, 60 * by)
@@ -230,7 +229,8 @@ def _memory(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
 
 
 def dots(box: Json) -> tuple[Any, Any]:
-    """Seconds and latencies in ms of the sweeps that are drawn: all, or the slowest of each few."""
+    """Seconds and latencies in ms of the sweeps that are drawn: all, or the slowest of each
+    group."""
     rows = [
         row
         for run in box["runs"]
@@ -245,7 +245,7 @@ def dots(box: Json) -> tuple[Any, Any]:
 
 def _latency(axes: Axes, box: Json, look: Json, unit_s: float) -> None:
     s, ms = dots(box)
-    # dots as strokes without length: one path of them all, and not an element each
+    # dots as strokes without length: a single path for all, instead of an element for each
     x, y = (np.repeat(v, 3).astype(float) for v in (s / unit_s, ms))
     x[2::3] = np.nan
     axes.plot(x, y, color=look["color"], linewidth=2.2, alpha=0.7, solid_capstyle="round")

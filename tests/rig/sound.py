@@ -1,7 +1,7 @@
-"""Checks of a robot around a fault: the box recovers by itself, and no answer names a material that
-was not touched.
+"""Checks around a fault: the box recovers by itself, and no answer names a material that was not
+touched.
 
-In: a cell. Out: right sweeps, state fields, or AssertionError with the journal of the box.
+A failed check raises AssertionError with the log of the box.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FIELDS = (
     "bundle",
     "source",
 )
-"""The first of a state sentence (PROTOCOL.md, part 2)."""
+"""The first fields of a state sentence (PROTOCOL.md, part 2)."""
 LATE = {
     "gap",
     "short",
@@ -45,18 +45,17 @@ LATE = {
     "unsure",
     "unknown",
 }
-"""Answers to sound sweeps while the guest is busy with something else: frames or edges come to the
-box late, and the window lies beside its place. None names a wrong material.
-"""
+"""Answers to good sweeps while the guest is busy with something else: frames or edges reach the box
+late, and the window is shifted. None names a wrong material."""
 OPEN_NS = 1_000_000_000
-"""A sweep is open so long after its start edge, at most."""
+"""Longest delay between a start edge and the open sweep."""
 SHIFTS = -4, 0, 4
 TRIES = 6
 
 
 def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
-    """Those that the default bundle names right by itself, also a few frames beside the middle:
-    what else comes is a fault."""
+    """Acts that the default bundle classifies right, even if shifted by a few frames; any other
+    answer is a fault."""
     model, window = bundle.load(bundle.DEFAULT), skin.FORMAT.window
     alone = Classifier(model, SystemClock())
     for act in acts:
@@ -71,14 +70,15 @@ def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
 
 
 def not_wrong(touch: Touch, answer: Answer) -> str:
-    """The status of an answer. Raises AssertionError where it names another material than was
+    """The status of an answer. Raises AssertionError if it names another material than the
     touched."""
     assert answer.label in ("", touch.act.label), f"{touch.act.label} was answered {answer}"
     return answer.status
 
 
 def check_recovers(cell: Cell) -> None:
-    """READY by itself, then a right sweep. Raises AssertionError where that does not come."""
+    """The box becomes READY by itself, then classifies a sweep right. Raises AssertionError
+    otherwise."""
     received = []
     for _ in range(TRIES):
         cell.until_ready()
@@ -93,13 +93,13 @@ def check_recovers(cell: Cell) -> None:
 
 
 def state(cell: Cell) -> dict[str, str]:
-    """The first fields of a state sentence, as of now."""
+    """The first fields of a state sentence, at present."""
     received = cell.serial.ask("$PPLP,STATE", 30).split("*")[0].split(",")[4:]
     return dict(zip(FIELDS, received[: len(FIELDS)], strict=True))
 
 
 def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
-    """Wait until the skin is in a state. Raises AssertionError where it does not come to it."""
+    """Wait until the skin is in a state. Raises AssertionError if it does not get there."""
     end, seen = cell.clock.now_s() + timeout_s, Counter[str]()
     while (now := state(cell)["state"]) != wanted:
         seen[now] += 1
@@ -110,9 +110,8 @@ def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
 
 
 def begin(cell: Cell) -> tuple[Touch, int]:
-    """A sweep that the box says is open, and the number of lines heard before it. Tried again where
-    the box was doing something else while the start edge came and went. Raises AssertionError where
-    none opens."""
+    """Open a sweep; returns it with the number of lines received before. Repeats the attempt if the
+    box was busy when the start edge came. Raises AssertionError if no sweep opens."""
     for _ in range(TRIES):
         since = len(cell.serial.heard)
         touch = cell.touch()
@@ -127,20 +126,20 @@ def begin(cell: Cell) -> tuple[Touch, int]:
 
 
 def until(cell: Cell, t_ns: int) -> None:
-    """Wait until that time of the guest's."""
+    """Wait until that time of the guest's clock."""
     cell.clock.sleep_until(t_ns)
 
 
 def let_go(cell: Cell) -> None:
-    """The robot ends a sweep that was answered early: its edges do not come any more."""
+    """The robot ends a sweep that was answered early: its remaining edges are cancelled."""
     for name in ("START", "STOP"):
         cell.lines.forget(name, 0)
         cell.lines.set(name, False)
 
 
 def only_answer(cell: Cell, since: int, seconds: float = 0.3) -> Answer:
-    """The one answer since line number `since`. Raises AssertionError where a second comes within
-    `seconds`."""
+    """The only answer since line number `since`. Raises AssertionError if a second answer comes
+    within `seconds`."""
     first = cell.answer(since)
     end = cell.clock.now_s() + seconds
     while cell.clock.now_s() < end:

@@ -91,8 +91,8 @@ class BareBox:
             yield cell
 
     def prepare(self, cell: Cell) -> None:
-        """The preparations for the first install: a card with a network, a key, and the settings of
-        the cell."""
+        """The preparations before the first install: a card with a network, a key, and the settings
+        of the cell."""
         run, put = cell.machine.run, cell.machine.put
         put("/etc/systemd/network/wire.network", NETWORK.encode())
         put("/etc/udev/rules.d/71-rig.rules", ROBOT_PORT.encode())
@@ -127,7 +127,7 @@ class BareBox:
 
 
 def roles(cell: Cell) -> dict[str, dict[str, Any]]:
-    """The status of each bundle in the box, by its sha256."""
+    """The role of each bundle by its sha256, as the box states it."""
     told = cell.machine.run(f"{AS_PALPATE} {PALPATE} bundles --json", timeout_s=90, check=True).out
     return {one["sha"]: one for one in json.loads(told)}
 

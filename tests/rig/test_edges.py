@@ -1,4 +1,5 @@
-"""Edges on the trigger lines that no sound robot makes, on a real kernel: each gets one answer.
+"""Effects of the trigger lines on the box, on a real kernel: edges that no correct robot sends get
+one answer each.
 
 Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
 """
@@ -241,8 +242,8 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
     cell.until_ready(20)
     assert int(cell.state()[LOST_EDGES]) > dropped
     outcomes = [answer.status for answer in cell.answers(since)]
-    # the skin may have gone stale while the program stood still; the only start edge has one answer
-    # either way
+    # the skin may have gone stale while the program stood still; either way the single start edge
+    # has one answer
     assert outcomes in (["edges-lost"], ["not-ready"])
     check_recovers(cell)
     note("event queue overrun", f"{', '.join(outcomes)}; then a right verdict", 1)

@@ -1,5 +1,5 @@
-"""The contract of skin, GPIO lines and port, run inside the guest over its real kernel; it requests
-the actions outside."""
+"""The contract of skin, lines and port, run inside the guest on its real kernel; the test requests
+actions outside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CODE = (
     "tests/backends",
     "tests/appliance/io/test_backends.py",
 )
-"""What the guest needs of this checkout beside the box that is installed there."""
+"""Files of this checkout that the guest needs beside the installed box."""
 
 
 def test_the_contract_holds_on_a_real_kernel(

@@ -1,6 +1,7 @@
-"""Faults of the serial line, on a real kernel. In: a robot that is deaf, noisy or gone, a port that
-goes, another program. Out: sentences again by themselves, and meanwhile sweeps that are answered on
-the lines.
+"""Effects of the serial line on the box, on a real kernel: a robot that does not read, sends noise
+or disappears, a port that disappears, another program on it.
+
+Sentences resume without help, and until then sweeps are answered on the lines.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def robot(shared: Cell) -> None:
 
 
 def shown(cell: Cell) -> Touch:
-    """A sweep that is answered on the lines at least: RESULT VALID rises over the code of the
-    touched material, or of nothing."""
+    """A sweep that is answered at least on the lines: RESULT VALID rises with the code of the
+    touched material, or of none."""
     cell.until_ready()
     before, touch = len(cell.lines.log), cell.touch()
     end = cell.clock.now_s() + 60
@@ -96,7 +97,7 @@ def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
     assert answer
     not_wrong(touch, answer)
     assert all(sound(line) for line in heard[1:])  # the first may have been cut
-    # 200 answers, a result and a state each second were said; all that were not dropped came out
+    # sent: 200 answers, a result and a state each second; sentences that were not dropped arrived
     assert 200 + 1 - dropped < len(heard) < 200 + 1 - dropped + 2 * count(8, 60)
     note(
         f"robot does not read for {count(8, 60)} s",
@@ -153,7 +154,7 @@ def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
 
 
 def tries(cell: Cell, port: str) -> str:
-    """The error of a user of group dialout who opens a port."""
+    """The error message for a user of group dialout who opens a port."""
     return cell.machine.run(f"{AS_NOBODY} sh -c ': < {port}'").out
 
 

@@ -1,10 +1,9 @@
-"""The box is killed at random moments while a robot sweeps: it comes back, and no kept sweep is
-lost.
+"""A box that keeps its sweeps is killed at random moments, and recovers with nothing lost.
 
 `PALPATE_RIG=full python -m tests.campaigns test-rig` kills the program 200 times and cuts the power
-50 times; counts so far are kept in build/rig, so that a campaign that was broken off goes on. A cut
-also loses the data in QEMU's memory: the disk's tables of newly written clusters, which it writes
-when the guest flushes. So a cut loses as much as the cache of a disk does.
+50 times. Counts are kept in build/rig, so an interrupted campaign continues. A power cut also loses
+the contents of QEMU's memory, the disk's tables of newly written clusters, which it writes when the
+guest flushes. A cut therefore loses as much as a real disk's cache would.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class EndlessRobot:
         self.cell, self.touches = cell, list[Touch]()
 
     def for_seconds(self, seconds: float) -> str:
-        """Go on sweeping; the state of the box at the end."""
+        """Sweep for this long; returns the state of the box at the end."""
         clock = self.cell.clock
         end = clock.now_s() + seconds
         while (left := end - clock.now_s()) > 0:
@@ -128,7 +127,7 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
             ledger.add(doing=doing, back=0, at=len(ledger.lines))
         cell.until_ready(BACK_S)
         robot.touches.append(cell.sweep(BACK_S)[0])
-        cell.state()  # what is owed has been written by now
+        cell.state()  # the box has written all sweeps that it must keep
         machine.cut()
     code, files = found(machine.disk, folder)
     parts = sum(path.suffix == ".part" for path in files)
@@ -180,10 +179,11 @@ def cut(
     booting: bool,
     had: int = 0,
 ) -> int:
-    """One life of a box: power on, READY, sweeps, power off at a random moment; or off already
-    while it boots.
+    """One life of a box: power on, READY, sweeps, power off at a random moment, or already during
+    the boot.
 
-    had: sweeps that earlier lives have kept on this disk. Returns the sweeps there now.
+    had: number of sweeps that earlier lives have kept on this disk. Returns the number that is
+    there now.
     """
     with Guest(image, folder, disk=disk) as machine:
         cell = Cell(machine)

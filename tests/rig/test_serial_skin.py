@@ -46,7 +46,7 @@ SWEEPS = "/var/lib/palpate/serial-skin"
 
 
 class SerialCell(Cell):
-    """A cell whose skin is a matrix on a serial line; the adapter is pulled."""
+    """A cell whose skin is a matrix on a serial line; tests pull its adapter."""
 
     def __init__(self, machine: Guest, folder: Path) -> None:
         super().__init__(machine, seed=5)

@@ -1,6 +1,8 @@
-"""The system around the box fails: disk, clock, processor, memory, settings, bundle, permissions.
-In: a guest whose service keeps its sweeps on small file systems. Out: answers as before, the fault
-logged once, recovery without help.
+"""Faults of the system around the box: disk, clock, processor, memory, settings, bundle,
+permissions.
+
+The service of a guest keeps its sweeps on small file systems. Sweeps are answered as before, each
+loss is logged once, and the box recovers without help.
 """
 
 from __future__ import annotations
@@ -149,8 +151,8 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
-    """The capture's disk is full: this is logged once, the capture ends, sweeps go on, and its
-    content can be played."""
+    """The capture's disk is full: this is logged once, the capture ends, sweeps go on, and the
+    partial file can be played."""
     until_logged(
         box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here"
     )
@@ -250,12 +252,12 @@ def swept(cell: Cell) -> str:
 
 
 def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
-    """Four programs that want all of the processor: each sweep is answered, lost frames are
-    counted, no answer is wrong.
+    """Four programs that use all of the processor: each sweep is answered, losses are counted, no
+    answer is wrong.
 
-    The guest has only one meanwhile: before release 8.1, QEMU that counts instructions gives the
-    second a turn when the first leaves time, so that whatever was on it stood still for minutes
-    (QEMU's commit 83ecdb18eb).
+    The guest has only one processor during this test. Before release 8.1, QEMU with counted
+    instructions ran the second only when the first was idle, so processes on it stood still for
+    minutes (QEMU's commit 83ecdb18eb).
     """
     silent = "skin: the skin is there but sent no frame for"
     lost, logged = int(state(box)["lost"]), journal_count(box, silent)
@@ -285,7 +287,7 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
     not kept; given back, both are used again."""
     guest = box.machine
     guest.run("chmod 000 /dev/bus/usb/*/*", check=True)
-    sound(box)  # what is open stays open
+    sound(box)  # open files stay open
     guest.run(f"mv {RULES} /root/rules && udevadm control --reload", check=True)
     try:
         box.unplug()
@@ -353,7 +355,7 @@ def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
     assert box.lines.wait("READY", False, 60)
     until_logged(box, f"{SITE}: classifier.bundel is unknown; did you mean classifier.bundle?")
     recording = guest.get(DROP_IN)
-    runs_with(guest, "run")  # what records needs no bundle
+    runs_with(guest, "run")  # recording needs no bundle
     guest.put(SITE, settings + b'\n[classifier]\nbundle = "/run/bundle"\nallow_unsigned = true\n')
     guest.run(again, check=True)
     until_logged(box, "/run/bundle: model.onnx was altered")

@@ -1,10 +1,9 @@
-"""Trigger and frames on one time line, on a real kernel: is the middle of a window half-way between
-the edges?
+"""Trigger and frames on one time line, on a real kernel: the middle of a window was recorded
+between the edges.
 
-In: a guest that keeps its sweeps. Out: how far each window's middle lies from the truth, which the
-board outside knows. The shortest of many round trips relates the time of the guest's kernel to the
-clock of the board. So edges that the kernel stamped can be compared with the moments at which the
-board took its frames.
+The test measures how far the middle of each window lies from the truth, which the board outside
+knows. The guest's kernel stamps edges with its own clock. The shortest of many round trips relates
+this clock to the board's, so edges can be compared with the times of the frames.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def clock(shared: Cell) -> KernelClock:
     """The service keeps its sweeps; sweeps whose answer is known."""
     shared.acts, shared.packet_frames = known(script.tubes(2)), 12
     runs_with(shared.machine, f"record --out {KEPT}")
-    shared.plug()  # a box that records ends where there is no skin, and is started again
+    shared.plug()  # without a skin, a recording box ends and is started again
     shared.machine.run(
         "systemctl stop palpate; systemctl start --no-block palpate", check=True, timeout_s=60
     )
@@ -130,7 +129,7 @@ def spikes(seed: int) -> Callable[[], int]:
 
 
 def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
-    """The windows of `n` sweeps; no answer to them was wrong. Raises AssertionError where they do not
+    """The windows of `n` sweeps that were not answered wrong. Raises AssertionError if they do not
     come."""
     for _ in range(3 * n):
         touch, answer = cell.sweep()
@@ -147,8 +146,8 @@ def test_windows_lie_in_the_middle(
     cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str
 ):
     """The window's middle is the frame taken half-way between the edges: within one frame at 80
-    ppm; beyond the drift that the box allows for, within the remaining uncertainty. All stamps are
-    late by the same shortest transfer."""
+    ppm; beyond the drift that the box considers possible, within the resulting uncertainty. All
+    stamps are late by the shortest time of a transfer."""
     ppm, seen = CASES[what], []
     for _ in range(ATTEMPTS):
         board = cell.plug(cell.board(ppm=ppm, latency=spikes(abs(ppm))))

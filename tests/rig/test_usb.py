@@ -1,6 +1,7 @@
-"""The skin's cable, pulled and put back at any moment; other boards on it; resets. Nothing may
-hang, no answer may name a material that was not touched, and a sound skin is read again without
-help.
+"""The skin's cable pulled and plugged in at any moment, other boards on it, and resets.
+
+Nothing may hang, no answer may name a material that was not touched, and a working skin is used
+again without help.
 """
 
 from __future__ import annotations

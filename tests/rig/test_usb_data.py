@@ -1,5 +1,7 @@
-"""A skin that sends wrong data, or answers wrong. A damaged sweep says so; a fault that damages no
-sweep leaves its answer right; a sound skin is read again without help.
+"""A skin that sends invalid data, or does not answer as it should, and the outcome of each fault.
+
+The answer to an affected sweep says so; an unaffected sweep is answered right; a working skin is
+used again without help.
 """
 
 from __future__ import annotations
@@ -38,10 +40,10 @@ ALL = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """The fault of some transfers, from `begin_s` after the start edge on, and the allowed answers
-    to the sweep.
+    """A fault of some transfers from `begin_s` after the start edge on, and the answers that the
+    sweep may get.
 
-    make: a new mangle for one sweep. counter: a field of the state sentence that goes up.
+    make: a new mangle for one sweep. counter: a field of the state sentence that increases.
     """
 
     make: Callable[[], Mangle]
@@ -154,8 +156,8 @@ def robot(shared: Cell) -> None:
 
 @pytest.mark.parametrize("what", FAULTS if HOW == "full" else QUICK)
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
-    """Harmed in mid sweep: one answer that says so, none that is wrong; a fault beside the window
-    does no harm."""
+    """Damaged during a sweep: a single answer that says so, none that is wrong; damage beside the
+    window has no effect."""
     n = count(1, 3)
     fault, outcomes = FAULTS[what], Counter[str]()
     for _ in range(n):

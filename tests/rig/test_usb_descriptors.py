@@ -1,7 +1,7 @@
-"""Devices with false descriptors under the skin's ids: none is taken for a skin.
+"""Devices with false descriptors under the skin's ids: none is mistaken for a skin.
 
-The kernel refuses some, libusb or the box others; the service neither dies nor hangs, and the sound
-skin streams after.
+The kernel refuses some, libusb or the box others. The service neither dies nor hangs, and the
+working skin streams afterwards.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Spoken(Descriptors):
     raw: bytes = b""
 
     def reply(self, kind: int, index: int) -> bytes | None:
-        """As the sound skin, except for its strings; the list of languages is right."""
+        """As the right descriptors, except for the strings; the list of languages is right."""
         return self.raw if kind == 3 and index else super().reply(kind, index)
 
 
@@ -93,7 +93,7 @@ HARMLESS = {
     "strings of no bytes",
     "strings that are no UTF-16",
 }
-"""What the kernel or libusb puts right, or nobody asks about: such a device may stream."""
+"""Faults that the kernel or libusb corrects, or that nobody reads: such a device may stream."""
 OPINIONS = {"streaming", "mismatch", "lost", "silent", "busy"}
 QUIET_S, LOOK_S = 1.0, 30
 """The kernel has done with a device when it has asked it nothing for so long; the longest wait for

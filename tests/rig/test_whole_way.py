@@ -41,7 +41,7 @@ def test_sweeps_become_sentences_and_codes(cell: Cell, note: Callable[[str, str,
 
 
 def test_the_golden_sweeps_are_the_same_on_arm64(cell: Cell):
-    """TEST: the network gives the same in the guest as on the desktop."""
+    """TEST: the network gives the same logits in the guest as on the desktop."""
     answer = cell.serial.ask("$PPLP,TEST", 30)
     assert ",TEST,ok," in answer
     assert float(answer.split("differ by ")[1].split("*")[0]) <= bundle.GOLDEN_TOLERANCE

@@ -1,9 +1,9 @@
-"""The far end of a USB cable that leads into the guest. In: a board of the rig. Out: the usbredir
-protocol's messages.
+"""The far end of a USB cable that leads into the guest: speaks the usbredir protocol for a board of
+the rig.
 
-QEMU's usb-redir device sits on the guest's xHCI port and passes on the requests of the guest's
-kernel (messages as in usbredirproto.h of usbredir 0.13). A ReadoutBoard answers, as it does under
-the simulated bus.
+QEMU's usb-redir device is connected to the guest's xHCI port and passes on the requests of the
+guest's kernel to a device (messages as in usbredirproto.h of usbredir 0.13). A ReadoutBoard
+answers, as it does on the simulated bus.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ CANCEL, ACK, CONTROL, BULK = 21, 24, 100, 101
 DONE, CANCELLED, STALL = 0, 1, 4
 IN = 0x81
 CLEAR_HALT = 0x02, 1, 0
-"""Request type, request and value with which a host lets a stalled endpoint go on."""
+"""Request type, request and value with which a host clears a stalled endpoint."""
 FULL_SPEED = 1
 KEPT = 64
-"""Replies that are remembered; a cancellation is on its way for milliseconds."""
+"""Number of replies that are remembered; a cancellation takes milliseconds to arrive."""
 ABLE = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6
-"""connect_device_version, ep_info_max_packet_size, 64bits_ids, 32bits_bulk_length; the guest's side
-agrees."""
+"""connect_device_version, ep_info_max_packet_size, 64bits_ids, 32bits_bulk_length; QEMU supports
+these too."""
 
 
 @dataclass(slots=True)
 class Descriptors:
-    """The answers of the device to the kernel; anything may be put here."""
+    """The descriptors that the device returns to the kernel; a test may put any bytes here."""
 
     device: bytes = struct.pack(
         "<BBHBBBBHHHBBBB",
@@ -64,7 +64,7 @@ class Descriptors:
     strings: list[str] = field(default_factory=lambda: ["\u0409", "Palpate", "tactile skin", ""])
 
     def reply(self, kind: int, index: int) -> bytes | None:
-        """The descriptor of a kind, or None where there is none."""
+        """The descriptor of a kind, or None if there is none."""
         if kind == 3 and index < len(self.strings):
             text = self.strings[index].encode("utf-16-le")
             return bytes([len(text) + 2, 3]) + text
@@ -72,14 +72,14 @@ class Descriptors:
 
 
 class UsbRedirPeer:
-    """A cable. `plug` hangs a board on it, `unplug` takes it off; both may be called from any
+    """A cable. `plug` connects a board to it, `unplug` removes it; both may be called from any
     thread.
 
-    mangle: the change that the cable makes to a transfer; more than was asked for is a babble.
-    silent: transfers never end. deaf: requests are never answered. slow_s: they are answered so
-    late. All times are those of `clock`, the guest's. halted: the endpoint stalls until it is
-    cleared. sent: transfers that the guest took. asked: requests that it made. opened: how often
-    the guest's kernel has set up a device.
+    mangle: changes the data of a transfer; more bytes than requested are a babble. silent:
+    transfers never end. deaf: requests are never answered. slow_s: delay of the answers to
+    requests. All times are those of `clock`, the guest's. halted: the endpoint stalls until it is
+    cleared. sent: number of transfers that the guest took. asked: number of its requests. opened:
+    how often the guest's kernel has set up a device.
     """
 
     def __init__(self, connection: socket.socket, clock: Clock) -> None:
@@ -92,7 +92,7 @@ class UsbRedirPeer:
         self._socket, self._clock, self._wide = connection, clock, False
         self._waiting: deque[tuple[int, int]] = (
             deque()
-        )  # (id, length) of bulk transfers that the guest has asked for
+        )  # (id, length) of bulk transfers that wait for data
         self._replied: dict[int, bytes] = {}
         self._again: deque[bytes] = deque()
         self._later: deque[tuple[int, bytes, int]] = (
@@ -105,7 +105,7 @@ class UsbRedirPeer:
         self._thread.start()
 
     def plug(self, board: rig.ReadoutBoard, descriptors: Descriptors | None = None) -> None:
-        """Hang a board on the cable; an old board has been taken off before."""
+        """Connect a board to the cable; the previous board has been removed before."""
         self._said_hello.wait(10)
         self.do(lambda: self._connect(board, descriptors or Descriptors()))
 
@@ -114,8 +114,8 @@ class UsbRedirPeer:
         self.do(self._disconnect)
 
     def do(self, job: Callable[[], None]) -> None:
-        """Do something between two messages, and return when it is done: a board belongs to one
-        thread."""
+        """Run `job` between two messages, and return when it is done, because a board belongs to
+        one thread."""
         done = threading.Event()
 
         def noted() -> None:
@@ -158,7 +158,7 @@ class UsbRedirPeer:
             self._send(DISCONNECT, 0)
 
     def _forget(self) -> None:
-        """Nothing is on its way any more."""
+        """Forget all transfers and answers that are on their way."""
         for what in (self._waiting, self._again, self._replied, self._later):
             what.clear()
 
@@ -185,7 +185,7 @@ class UsbRedirPeer:
                     data = self._take(data + more)
                 self._deliver()
         except (OSError, ValueError):
-            return  # closed
+            return  # the socket was closed
 
     def _patience_s(self) -> float | None:
         if self._again and self._waiting:
@@ -195,7 +195,7 @@ class UsbRedirPeer:
         return max(0.0, (min(due) - self._clock.now_ns()) / 1e9) if due else None
 
     def _take(self, data: bytes) -> bytes:
-        """Answer all whole messages; the rest."""
+        """Answer all whole messages; returns the remaining bytes."""
         while True:
             head = "<IIQ" if self._wide else "<III"
             size = struct.calcsize(head)
@@ -225,8 +225,8 @@ class UsbRedirPeer:
                     self._waiting.remove(waiting)
                     self._reply(ident, CANCELLED, b"")
                 if ident in self._replied:
-                    # it crossed our reply, which QEMU throws away; a controller on a board would
-                    # have delivered it
+                    # the cancellation crossed our reply, and QEMU discards the data; a real
+                    # controller would have delivered it
                     self._again.append(self._replied.pop(ident))
             case 100:
                 self._control(ident, body)
@@ -256,7 +256,7 @@ class UsbRedirPeer:
         self._later.append((self._clock.now_ns() + round(self.slow_s * 1e9), answer, ident))
 
     def _deliver(self) -> None:
-        """Send the guest the replies that are due."""
+        """Send the guest the data that are due."""
         while self._later and self._later[0][0] <= self._clock.now_ns():
             _, answer, ident = self._later.popleft()
             self._send(CONTROL, ident, answer)
