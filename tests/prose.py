@@ -27,8 +27,8 @@ from tests.factories.paths import ROOT
 CEILINGS = Path(__file__).with_name("prose_ceilings.toml")
 FOLDERS = ("appliance", "train", "systemd", "firmware_config", "tests", "docs")
 PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
-NEW = 1.0
-"""Ceiling of a package that has none yet: % of its clauses."""
+AIM = 1.0
+"""The lowest ceiling, and that of a new package: % of its clauses."""
 SYMPTOMS = re.compile(
     r"\b[Ww]hat (?:is|are|was|were|a|an|the|it|they|one|each|no|of|comes?|goes|has|have|had|holds?"
     r"|does|ends?|needs?|can|may|must|stands?|[a-z]+s)\b"
@@ -100,16 +100,17 @@ def exceeded(counts: Mapping[str, Count], ceilings: Mapping[str, float]) -> list
     """A line for each package that exceeds its ceiling."""
     return [
         f"{package}: {count.percent} % of {count.clauses} clauses have to be read twice;"
-        f" at most {ceilings.get(package, NEW)} % may"
+        f" at most {ceilings.get(package, AIM)} % may"
         for package, count in counts.items()
-        if count.percent > ceilings.get(package, NEW)
+        if count.percent > ceilings.get(package, AIM)
     ]
 
 
 def lowered(counts: Mapping[str, Count], ceilings: Mapping[str, float]) -> dict[str, float]:
-    """The ceilings of the packages that exist, each at the measured share if that is lower."""
+    """The ceilings of the packages that exist, each at the measured share if that is lower, and at
+    least at AIM."""
     return {
-        package: min(count.percent, ceilings.get(package, NEW))
+        package: min(max(AIM, count.percent), ceilings.get(package, AIM))
         for package, count in sorted(counts.items())
     }
 

@@ -1,5 +1,5 @@
-"""What a machine can check of the architecture: imports, the content of the wheel, the form of
-modules, tests and texts."""
+"""Checks of the architecture: imports, the content of the wheel, the form of modules, tests and
+texts."""
 
 from __future__ import annotations
 

@@ -88,13 +88,13 @@ def test_a_package_above_its_ceiling_fails(project: Path, capsys: pytest.Capture
 
 
 def test_ceilings_only_fall(project: Path):
-    """--lower lowers a ceiling to the measured share, keeps a lower ceiling, and forgets a package
-    that has gone."""
+    """--lower lowers a ceiling to the measured share, keeps a lower ceiling, never goes below
+    1 %, and forgets a package that has gone."""
     file = project / "ceilings.toml"
     file.write_text('"appliance/io" = 40.0\n"docs/how-to" = 50.0\n"gone" = 3.0\n')
     assert prose.main(["--lower"], project, file) == 1
     assert tomllib.loads(file.read_text()) == {
-        "README.md": 0.0,
+        "README.md": 1.0,
         "appliance/io": 25.0,
         "docs/how-to": 50.0,
     }

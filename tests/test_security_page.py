@@ -1,5 +1,4 @@
-"""docs/security.md names tests for what it claims: each of them is there, and every way in has
-one."""
+"""docs/security.md names tests for its claims: each test exists, and every way in has a test."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ def test_every_test_that_is_named_exists():
 
 
 def test_every_way_in_is_told_whole():
-    """Who reaches it, what they could do, what stops them, and at least one test that shows it."""
+    """Who reaches it, the possible harm, the defence, and at least one test that shows it."""
     for row in rows():
         assert len(row) == 5, row[0]
         assert all(row), row[0]

@@ -1,5 +1,4 @@
-"""Backends: what can lie below the drivers of the box. In: PALPATE_BACKEND. Out: a Backend, or
-BackendMissing.
+"""Backends: the devices, real or not, below the drivers of the box. PALPATE_BACKEND names one.
 
 tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink; it
 runs over any of them.
@@ -49,13 +48,12 @@ ALL = frozenset(
 
 
 class BackendMissing(Exception):
-    """What a backend needs is not installed; the message says how to get it."""
+    """A tool of a backend is not installed; the message says how to get it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """A skin as it is plugged in: serial number, protocol version, and the form of what it
-    sends."""
+    """A skin as it is plugged in: serial number, protocol version, and the format of its sweeps."""
 
     serial: str = "SIM0001"
     protocol: int = packets.VERSION
@@ -67,13 +65,14 @@ class Skin:
 
 
 class Backend(Protocol):
-    """What lies below the drivers: what they are given, and what a test can do to it from outside.
+    """The devices below the drivers, and the controls that a test has over them.
 
     can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is
     unplugged, plugged in and swapped. "unbind": its driver is taken away. "garble", "silence",
     "hold" (another program has it), "deny" (this user may not open it). "lines": inputs are driven,
     outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends and
-    receives. "stall": what it does not read blocks the line. "pull": the port goes and comes back.
+    receives. "stall": bytes that it does not read block the line. "pull": the port goes and comes
+    back.
 
     slack_s: how much later than asked this machine may be before a wait counts as endless. pulse_s:
     how long a level is held so that the kernel sees it for certain. Controls act at once.
@@ -102,11 +101,11 @@ class Backend(Protocol):
         ...
 
     def after(self, seconds: float, control: Callable[[], None]) -> None:
-        """Do `control` so much later, while the box does what it does."""
+        """Do `control` so much later, while the box works."""
         ...
 
     def plug(self, what: Skin) -> None:
-        """Plug a skin in; unplug the one before."""
+        """Plug a skin in; unplug the previous skin."""
         ...
 
     def unplug(self) -> None:
@@ -114,7 +113,7 @@ class Backend(Protocol):
         ...
 
     def unbind(self, on: bool) -> None:
-        """Take the driver from the skin, or give it back; nobody is told that it was plugged in."""
+        """Unbind the driver from the skin, or bind it again, without an event of plugging in."""
         ...
 
     def garble(self, on: bool) -> None:
@@ -150,7 +149,7 @@ class Backend(Protocol):
         ...
 
     def hear(self) -> bytes:
-        """What has come to the far end since the last call."""
+        """Bytes at the far end since the last call."""
         ...
 
     def pull(self) -> None:

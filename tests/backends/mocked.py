@@ -56,7 +56,7 @@ class Mocked(real.Real):
         self._socket.plug(skins.board(what, self.clock))
 
     def garble(self, on: bool) -> None:
-        """Mangle what the cable brings."""
+        """Mangle the bytes on the cable."""
         assert self._socket.device
         self._socket.device.mangle = skins.garbler() if on else lambda data: data
 
@@ -79,7 +79,7 @@ class Mocked(real.Real):
             self.drive(line, i % 2 == 0)
 
     def level(self, line: str) -> bool:
-        """What the chip drives."""
+        """The levels that the chip drives."""
         return self._chip.level(line)
 
 

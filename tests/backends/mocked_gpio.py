@@ -30,8 +30,8 @@ REQUESTS = 12
 
 @dataclass(slots=True)
 class Held:
-    """One request of lines: offsets in its order, flags and consumer as asked, its file, and what
-    it has counted.
+    """One request of lines: offsets in its order, flags and consumer as asked, its file, and its
+    count of edges.
 
     pipe: the same file, opened here.
     """

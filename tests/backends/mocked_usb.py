@@ -1,5 +1,5 @@
 """A USB socket over umockdev: usbfs ioctls and uevents below unmodified libusb. In: a board. Out:
-what a bus does."""
+the behaviour of a bus."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class Urb:
 
 
 class Device:
-    """One device on the bus, from plugging in to pulling out. mangle: what the cable does to the
-    bytes of a transfer.
+    """One device on the bus, from plugging in to pulling out. mangle: changes the bytes of a
+    transfer on the cable.
 
     All of it runs in the mocks' thread.
     """
@@ -161,7 +161,7 @@ class Device:
 
     @staticmethod
     def _of(client: int, urbs: list[Urb]) -> list[Urb]:
-        """Those of one open file: another one's memory must not be touched."""
+        """The requests of one open file: memory of another must not be touched."""
         return [urb for urb in urbs if urb.client == client]
 
     def _deliver(self, urb: Urb) -> None:
@@ -192,8 +192,7 @@ class Socket:
         return f"bus/usb/001/{self._number:03}"
 
     def plug(self, board: rig.ReadoutBoard) -> None:
-        """Put a board in, in place of the one before; the kernel's word of it is out when this
-        returns."""
+        """Replace the board; the kernel's event is out when this returns."""
         self.unplug()
         self._number += 1
         device = self.device = Device(board)

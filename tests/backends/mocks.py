@@ -26,7 +26,7 @@ NOBODY = 65534
 
 
 def lacking() -> str:
-    """What has to be installed before a process can be run over umockdev; "" where it can."""
+    """The missing packages for a process over umockdev; "" if there are none."""
     if not shutil.which("umockdev-wrapper"):
         return f"no umockdev here; apt-get install {PACKAGES}"
     try:

@@ -1,5 +1,5 @@
-"""What backends in real time share: the machine's clock and libraries. In: a skin's ids. Out: time,
-and a rival."""
+"""Common parts of backends in real time: the machine's clock and libraries, and a rival program
+that holds the skin."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@ are controlled by requests.
 
 In: the guest's own settings, and JSON lines over a character device: one request, one reply.
 Outside, `serve` answers them with an object that has the controls of a Backend that are in
-CONTROLS; `able` gives what it can, as in `can`, and `reset` leaves the cable alone.
+CONTROLS; `able` returns its abilities, as in `can`, and `reset` leaves the cable alone.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ ANSWER_S = 60
 
 
 def serve(stream: IO[bytes], bench: Any) -> None:
-    """Do what comes in over `stream`, until it ends. bench: who does it; its errors are sent back
-    as text."""
+    """Carry out the requests of `stream`, until it ends. bench: the object that carries them out;
+    its errors are sent back as text."""
     for line in stream:
         asked = json.loads(line)
         try:

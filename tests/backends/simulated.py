@@ -66,7 +66,7 @@ class Simulated:
         self.backend.unplug()
 
     def garble(self, on: bool) -> None:
-        """Mangle what the cable brings."""
+        """Mangle the bytes on the cable."""
         self.backend.mangle = skins.garbler() if on else lambda data: data
 
     def silence(self) -> None:
@@ -99,7 +99,7 @@ class Simulated:
             self.drive(line, i % 2 == 0)
 
     def level(self, line: str) -> bool:
-        """What was written last."""
+        """The levels that were written last."""
         return {name: level for _, name, level in self.gpio.written}.get(line, False)
 
 

@@ -32,7 +32,7 @@ class PseudoTerminalEnd:
         self.path.symlink_to(name)
 
     def pull(self) -> None:
-        """The port goes, and with it what it held."""
+        """The port goes, with the bytes that it held."""
         self._port.close()
         self.path.unlink(missing_ok=True)
 

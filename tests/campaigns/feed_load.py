@@ -1,11 +1,11 @@
-"""What readers of the feed cost the box: `python -m tests.campaigns.feed_load --minutes 5 --out
+"""The load of the feed's readers on the box: `python -m tests.campaigns.feed_load --minutes 5 --out
 docs/data/feed.json`. In: minutes for each kind of readers. Out: JSON and a table: share of a core,
 memory, latency and losses, with and without them; exit code 1 if a target was missed.
 
 One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had
 the same machine. Box and listener run with real-time priority where `chrt` may be used: other
-programs of the machine then cost no latency. What the loop spends in the feed is counted by itself,
-too (feed_inside).
+programs of the machine then cost no latency. The time that the loop spends in the feed is counted
+separately, too (feed_inside).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ REAL_TIME = ("chrt", "-f", "10")
 
 @dataclass
 class Kind:
-    """What was measured while there were readers of one kind."""
+    """Measurements while there were readers of one kind."""
 
     wall_s: float = 0.0
     cpu_s: float = 0.0
@@ -71,14 +71,15 @@ class Kind:
 
 
 class LatencyListener:
-    """The robot's end of the line: how late each answer is, and what the box counts as lost."""
+    """The robot's end of the line: the delay of each answer, and the frames that the box counts as
+    lost."""
 
     def __init__(self, box: ThisMachine, sweeps: Script) -> None:
         self._box, self._sweeps = box, sweeps
         self._next, self._counts = 1, (0, 0)
 
     def listen(self, seconds: float, kind: Kind) -> None:
-        """Note for `kind` what comes in so long."""
+        """Note the sentences of so many seconds for `kind`."""
         end_s = time.monotonic() + seconds
         before = self._counts
         while (left_s := end_s - time.monotonic()) > 0:
@@ -249,7 +250,7 @@ NAMES = {
 
 
 def table(content: dict[str, Any]) -> str:
-    """What was measured, in Markdown."""
+    """The measurements in Markdown."""
     figures = content["readers"]
     rows = [
         f"Measured by `python -m tests.campaigns.feed_load`, {figures['0']['seconds']} s of each kind in turns of {SLOT_S:g} s, on "

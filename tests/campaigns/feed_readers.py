@@ -1,8 +1,9 @@
 """Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND`
-until its input ends. In: the socket, one of KINDS. Out: one line of JSON, what they got.
+until its input ends. In: the socket, one of KINDS. Out: one line of JSON with the lines that they
+got.
 
 All are in one process, which pauses between its rounds, so that it takes less than a core. It has
-the usual priority, also where the one that starts it has another.
+the usual priority, also if its parent has another.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ Address = str | tuple[str, int]
 
 
 def connected(address: Address) -> socket.socket | None:
-    """A connection that does not wait, None where there is no room for it now. address: of a local
-    socket or of TCP."""
+    """A connection that does not wait; None if the socket has no room for it now. address: of a
+    local socket or of TCP."""
     family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
     one = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
@@ -64,7 +65,7 @@ def send(one: socket.socket, data: bytes) -> bool:
 
 
 def reader(path: str, seen: Counter[str]) -> Act:
-    """One that asks for all and reads all; what it got is counted by type."""
+    """A reader that asks for everything and reads it; the lines are counted by type."""
     one: socket.socket | None = None
     rest = b""
 
@@ -123,7 +124,8 @@ def sluggish(path: str, seen: Counter[str]) -> Act:
 def talker(
     path: Address, seen: Counter[str], said: Callable[[], bytes], *, reads: bool = False
 ) -> Act:
-    """One that sends without end, and comes again when it is closed. reads: takes what it gets."""
+    """A peer that sends without end, and connects again when it is closed. reads: it reads the
+    replies."""
     held: list[socket.socket] = []
 
     def goes_on() -> bool:

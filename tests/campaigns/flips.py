@@ -64,8 +64,8 @@ def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Cas
 
 
 def swaps(one: Files, other: Files) -> Iterator[Case]:
-    """Each file, and each two of them, in place of another signed bundle's; the manifest with its
-    signature is that one."""
+    """Each file, and each pair of files, replaced by those of another signed bundle; the manifest
+    with its signature is from that bundle."""
     names = sorted(one)
     for i, name in enumerate(names):
         yield "a file swapped", name, one | {name: other[name]}
@@ -78,8 +78,8 @@ def swaps(one: Files, other: Files) -> Iterator[Case]:
 
 
 def another(key: Path) -> Files:
-    """A bundle of which no file is the default's: its golden sweeps and means are packed otherwise,
-    its weights are a bit off."""
+    """A bundle that shares no file with the default: its golden sweeps and means are packed
+    otherwise, its weights differ slightly."""
     held = deliveries.files(4, None)
     model = bytearray(held[bundle.MODEL])
     model[len(model) // 2] ^= 1
@@ -180,7 +180,7 @@ def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]
 
 
 def tried(box: Delivery, case: Case) -> str:
-    """What the box says to one alteration; "" where it accepts it."""
+    """The box's refusal of an alteration; "" if it accepts it."""
     incoming = box.folder / "altered"
     shutil.rmtree(incoming, ignore_errors=True)
     deliveries.put(incoming, case[2])
@@ -204,9 +204,9 @@ def believed(box: Delivery, files: Files) -> bool:
 def campaign(
     folder: Path, manifest_bits: int | None, seed: int, every: int = 0
 ) -> dict[str, dict[str, int]]:
-    """By kind of alteration: how many were tried, how many accepted, how many refusals changed what
-    runs; and how many flipped manifests the signature alone let pass, which the box asks after it
-    has read them.
+    """By kind of alteration: how many were tried, how many accepted, how many refusals changed the
+    running bundle; and how many flipped manifests the signature alone let pass, which the box asks
+    after it has read them.
 
     every: after so many alterations a line on standard output, 0 for none.
     """

@@ -70,7 +70,7 @@ class SkinBox(SharedLine):
     """A box that reads an emulated skin."""
 
     def _note(self, at_s: float, line: str) -> None:
-        """Whoever reads the line notes what comes."""
+        """The reader of the line notes its sentences."""
 
     def send(self, number: signal.Signals) -> None:
         """Send its process a signal."""
@@ -119,7 +119,7 @@ class LoadedSide:
                 self.note(at_s, line)
 
     def look(self) -> None:
-        """Note what the process has used."""
+        """Note the resources that the process has used."""
         kib, _, cpu_s, _, _ = self.box.process()
         self.looks.append((time.monotonic(), cpu_s, kib))
 
@@ -183,8 +183,8 @@ def fill(path: Path) -> None:
 
 
 class FullLoad:
-    """All sides at work, with one thread each that hears them. seen: by skin, what the peers of its
-    full box got."""
+    """All sides at work, with one thread each that hears them. seen: by skin, the counts of the
+    peers of its full box."""
 
     def __init__(
         self, stack: ExitStack, disks: Path, bundles: Mapping[str, Path], before: Sequence[str]
@@ -285,8 +285,8 @@ class FullLoad:
         return peers
 
     def pass_time(self, seconds: float) -> tuple[float, float]:
-        """Let the boxes work; from when until when that was. Raises what a thread that hears them
-        raised."""
+        """Let the boxes work; the begin and end of that. Raises the error of a thread that hears
+        them."""
         begin_s = time.monotonic()
         while (left_s := begin_s + seconds - time.monotonic()) > 0:
             for side in self.sides:

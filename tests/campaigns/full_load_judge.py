@@ -1,5 +1,5 @@
-"""What came of a box under full load. In: the lines of its counts, phases, what its robot heard.
-Out: figures, targets that were missed in words, tables in Markdown."""
+"""The judgement of a box under full load. In: the lines of its counts, phases, its robot's
+sentences. Out: figures, targets that were missed in words, tables in Markdown."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _between(counts: Sequence[Json], begin_s: float, end_s: float) -> Json:
 def _fault(
     counts: Sequence[Json], answers: Sequence[Json], name: str, phases: Sequence[Phase]
 ) -> Json:
-    """What the box did about all faults of a kind."""
+    """The reaction of the box to all faults of a kind."""
     total: Counter[str] = Counter()
     statuses: Counter[str] = Counter()
     times = [(begin_s, end_s) for kind, begin_s, end_s in phases if kind == name]
@@ -142,10 +142,10 @@ def _of_box(box: Json) -> Iterator[str]:
 
 
 def told(box: Json) -> bool:
-    """Whether the box says of all missing frames that they are. A skin without a count, of which
-    the box says that losses cannot be seen, leaves only the time that they take: it may err by a
-    frame in each stop of the processor, and by any number upwards, where a machine that passes
-    bytes on late makes good frames look lost."""
+    """Whether the box reports all missing frames. For a skin without a count the box reports that
+    losses cannot be seen. Then only their duration is left: it may err by a frame in each stop of
+    the processor, and by any number upwards, where a machine that passes bytes on late makes good
+    frames look lost."""
     if box["loss_known"]:
         return bool(box["missing"] == box["counted"])
     return bool(
@@ -154,7 +154,7 @@ def told(box: Json) -> bool:
 
 
 def table(content: Json) -> str:
-    """What was measured, in Markdown."""
+    """The measurements in Markdown."""
     boxes = content["boxes"]
     shown: Mapping[bool, str] = {False: "nothing attached", True: "all attached"}
     rows = [
@@ -195,7 +195,7 @@ def table(content: Json) -> str:
 
 
 def _wholes(content: Json) -> Iterator[str]:
-    """What holds of the whole run, in sentences."""
+    """The results of the whole run, in sentences."""
     boxes = content["boxes"]
     said, heard, dropped = (
         sum(box[name] for box in boxes) for name in ("said", "heard", "dropped")
@@ -215,7 +215,7 @@ def _wholes(content: Json) -> Iterator[str]:
 
 
 def _slower(box: Json) -> str:
-    """What a slower core would make of it: the share in proportion."""
+    """The share on a slower core, in proportion."""
     reading, share = box["reading"], box["calm"]["share"]
     slow = (
         f"{100 * n * share:.0f} % of a core {word} times slower, reading alone {100 * n * reading:.0f} %"

@@ -1,8 +1,8 @@
 """All peers of one box: `python -m tests.campaigns.full_load_peers FEED TCP MODBUS PAGE` until its
-input ends. In: the feed's socket, the ports of the bridges and of the page. Out: one line of JSON,
-what each got.
+input ends. In: the feed's socket, the ports of the bridges and of the page. Out: one line of JSON
+with the counts of each.
 
-Eight readers of the feed, of which one never reads; a robot at each bridge that asks some times a
+Eight readers of the feed, one of them never reads; a robot at each bridge that asks some times a
 second; a browser at the page.
 """
 

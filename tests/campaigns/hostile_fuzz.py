@@ -4,8 +4,8 @@ classifier.
 
 `python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a
 stopped one goes on where it was). Each model is opened in a child that may take 256 MB more than it
-had and ten seconds; what matters is how many hung it, killed it, or went beyond that memory. Seed
-and number identify a model.
+had and ten seconds; the result is how many hung it, killed it, or went beyond that memory. Seed and
+number identify a model.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
 
 
 def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
-    """What becomes of one model in this process: outcome, why, processor milliseconds of the check,
-    seconds, most MB more."""
+    """The outcome of one model in this process: its name, the reason, processor milliseconds of the
+    check, seconds, most MB more."""
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
     begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -96,7 +96,7 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
 
 
 def checked(model: bytes, own: Own) -> Bundle | None:
-    """What the box does with it first; the bundle of an enrolment. Raises BundleError where it is
+    """The box's first check of it; the bundle of an enrolment. Raises BundleError if it is
     refused."""
     if own is ENROLLING:
         return bundle.from_files(
@@ -165,7 +165,7 @@ class Fuzz:
         return mutated(own.model, rng, rng.choice(self.owns).model), own, rng
 
     def results(self, first: int, count: int) -> Iterator[dict[str, Any]]:
-        """What becomes of `count` models from number `first` on, in their order."""
+        """The outcomes of `count` models from number `first` on, in their order."""
         at, end = first, first + count
         while at < end:
             for result in self._child(range(at, min(at + BATCH, end))):
@@ -209,7 +209,7 @@ class Fuzz:
                 os.waitpid(pid, 0)
 
     def _try(self, numbers: range, out: int) -> None:
-        """What the child does; it never returns."""
+        """The program of the child; it never returns."""
         code = 1
         try:
             size = memory("VmSize") * 1024 + MOST_MORE

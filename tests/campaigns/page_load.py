@@ -1,10 +1,10 @@
-"""What the page costs: `python -m tests.campaigns.page_load --seconds 60 --out
-docs/data/page-load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory and
-share of a core of `palpate watch --web`, with none, one and eight browsers.
+"""The load of the page: `python -m tests.campaigns.page_load --seconds 60 --out
+docs/data/page-load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory
+and share of a core of `palpate watch --web`, with none, one and eight browsers.
 
 One box (`palpate run --sim skin`, in real time) and one page; the numbers of browsers take turns. A
 browser here is a connection that reads all events and asks for the picture of each sweep, as the
-page's script does; what a tablet spends is not measured.
+page's script does; the load of a tablet is not measured.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def browse(page: PageAddress, ended: threading.Event, read: list[int]) -> None:
 
 
 def measured(pid: int, page: PageAddress, browsers: int, seconds: float) -> dict[str, Any]:
-    """What the process uses while so many browsers are there."""
+    """The resources of the process with so many browsers."""
     ended, read = threading.Event(), []
     threads = [
         threading.Thread(target=browse, args=(page, ended, read), daemon=True)

@@ -1,5 +1,5 @@
-"""What is left on the disk by a kill, or a loss of power, at any moment: a small part of `python -m
-tests.cuts`, and whether that finds what is wrong on purpose.
+"""The content of the disk after a kill or a loss of power at any moment: a small part of `python -m
+tests.cuts`, and whether that finds programs that are wrong on purpose.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def play(work: Path) -> Makes:
 
 
 def left(play: ScenePlay, call: str | None) -> list[tree.Tree]:
-    """What a loss of power may leave before the first call of this name; None: at the end."""
+    """The folders that a loss of power may leave before the first call of this name; None: at the
+    end."""
     return next(
         list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call
     )
@@ -76,14 +77,14 @@ def test_what_is_not_synced_may_be_there_or_not(play: Makes):
 
 
 def test_a_folder_that_is_synced_holds_its_names(play: Makes):
-    """A new name stays; the content that was never synced may be lost; what was there before stays
-    as it was."""
+    """A new name stays; the content that was never synced may be lost; older files stay as they
+    were."""
     played = play("(f / 'a').write_bytes(b'1'); storage.sync(f)", "(f / 'b').write_bytes(b'2')")
     assert left(played, None) == [{"a": held, "b": b"2"} for held in (b"1", b"", b"\0")]
 
 
 def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
-    """Written over in place, and not synced: what was there may still be there, and half of the
+    """Written over in place, and not synced: the old content may still be there, and half of the
     new."""
     played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
     assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
@@ -142,8 +143,8 @@ def test_a_symlink_is_swapped_in_one_step(play: Makes):
 
 
 def test_a_kill_comes_before_its_call(play: Makes):
-    """What is killed on entry to a renaming has not renamed; the judge gets what was said
-    before."""
+    """A program that is killed on entry to a renaming has not renamed; the judge gets its earlier
+    output."""
     judged = []
     played = play(
         "print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')",
@@ -214,8 +215,8 @@ def test_ways_that_are_wrong_are_found(work: Path, way: str):
 
 
 def test_a_kill_finds_what_is_written_under_its_own_name(work: Path):
-    """No loss of power is needed for that; and the judge sees it in what a killed program has
-    left."""
+    """No loss of power is needed for that; and the judge sees it in the folder of a killed
+    program."""
     played = ScenePlay(recording.scene("under its own name"), work)
     half = next(
         m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy")
@@ -264,8 +265,8 @@ def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
 def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(
     shop: delivery.Shop, work: Path
 ):
-    """As a delivery: and at each moment what the box has of the label is signed, or it runs without
-    it."""
+    """As a delivery: at each moment the box's files of the label are signed, or it runs without the
+    label."""
     played = ScenePlay(shop.learns("right"), work)
     points = cut_at_renames(played)
     assert [point.states for point in points] == [1, 1, 4]

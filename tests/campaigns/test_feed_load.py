@@ -1,5 +1,5 @@
-"""What the feed's campaign finds: each target missed by made-up figures, the packet's phase, and
-readers that do what they say."""
+"""The findings of the feed's campaign: each target missed by made-up figures, the packet's phase,
+and readers that behave as described."""
 
 from __future__ import annotations
 
@@ -137,8 +137,8 @@ def test_readers_read_all_but_one_of_them(tmp_path: Path, name: str) -> None:
 
 
 def test_attackers_attack_and_the_good_ones_are_served(tmp_path: Path) -> None:
-    """Wrong requests, floods and a storm of connections: eight readers get their lines all the
-    same."""
+    """Wrong requests, floods and a storm of connections: eight readers get their lines
+    nevertheless."""
     offered, seen = Offered(tmp_path / "feed.sock"), Counter[str]()
     offered.turns()
     acts = feed_readers.acts("attacked", str(offered.path), seen)

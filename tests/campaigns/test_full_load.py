@@ -1,5 +1,5 @@
-"""What the campaign of full load finds: each target missed by made-up figures; a box that is
-counted from inside; a disk that fills; one box with all that can be attached, for some seconds."""
+"""The findings of the campaign of full load: each target missed by made-up figures; a box that is
+counted from inside; a disk that fills; one box with all clients, for some seconds."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ def test_drops_without_a_fault_late_answers_and_idle_peers_are_found(
 
 
 def test_a_skin_without_a_count_may_err_by_a_frame_in_each_stop(content: dict[str, Any]) -> None:
-    """It was stopped once: one frame too few is within what its times can tell, two are not; of a
-    skin with a count none is."""
+    """It was stopped once: one frame too few is within the error of its times, two are not; with a
+    count of the skin even one is a fault."""
     content["boxes"][0] |= {"loss_known": False, "missing": 151}
     assert missed(content) == []
     content["boxes"][0]["missing"] = 100

@@ -1,9 +1,9 @@
 """Other processors: the same bundle gives the same labels on x86 with and without VNNI, and on
 arm64.
 
-Emulated by qemu, which computes what the processor would, instruction by instruction.
-PALPATE_MACHINES=1 gets what this needs (see tests/factories/emulated_machines.py) and fails without
-it; else what is missing is skipped.
+qemu emulates them, instruction by instruction. PALPATE_MACHINES=1 gets the tools for that (see
+tests/factories/emulated_machines.py) and fails without them; otherwise tests without their tools
+are skipped.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def overflowing(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def here(given: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
-    """What this machine says."""
+    """The outputs of this machine."""
     results_file = tmp_path_factory.mktemp("here") / "results.npz"
     emulated_machines.work(given, results_file)
     with np.load(results_file) as z:
@@ -113,7 +113,7 @@ def here(given: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.
 def there(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, dict[str, np.ndarray]]:
-    """A machine's name, and what it says."""
+    """A machine's name, and its outputs."""
     insist = os.environ.get("PALPATE_MACHINES") == "1"
     results_file = tmp_path_factory.mktemp("there") / "results.npz"
     try:
@@ -166,8 +166,8 @@ def test_what_int8_computes_is_the_same_to_the_bit(
 
 
 def test_an_x86_without_vnni_is_one(there: tuple[str, dict[str, np.ndarray]]):
-    """Eight-bit weights overflow there, and only there: the machine is what it is called, and would
-    show a difference."""
+    """Eight-bit weights overflow there, and only there: the machine has the processor of its name,
+    and would show a difference."""
     name, there_result = there
     exact = round(32 * 5 * 127 * 255 / 2**15)
     assert (there_result[f"{EIGHT_BITS}/shown"] == exact).all() == (

@@ -46,7 +46,7 @@ def unknown(pattern: str, known: set[str]) -> list[str]:
 
 
 def test_make_has_few_targets():
-    """At most 14 targets, each of which is listed and phony."""
+    """At most 14 targets; each is listed and phony."""
     phony = re.search(r"(?m)^\.PHONY: (.*)$", (ROOT / "Makefile").read_text())
     assert phony
     assert sorted(phony[1].split()) == sorted(targets())

@@ -60,7 +60,7 @@ def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
 
 
 def test_the_table_keeps_the_longest_run(tmp_path: Path):
-    """Of several runs of a fault the one with most repetitions counts, and of equal ones the
+    """Of several runs of a fault the run with most repetitions counts, and of equal runs the
     last."""
     file = tmp_path / "faults.jsonl"
     for outcome, times in (("early", 100), ("late", 100), ("short", 6)):
@@ -146,7 +146,7 @@ class BusyHost:
 @pytest.mark.parametrize("share", [1.0, 0.1, 1.7])
 def test_a_wait_is_as_long_as_the_guest_s_time(share: float):
     """A guest that gets a tenth of the host's time is waited for ten times as long; the counter's
-    wrap is no jump."""
+    wrap is not a jump."""
     host = BusyHost(share, at=WRAP - HZ)
     clock = GuestClock(host.ticks, host)
     begun_ns = clock.now_ns()
@@ -229,8 +229,8 @@ class QemuEnd:
 
 
 def test_a_reply_that_crosses_a_cancellation_comes_again():
-    """A reply that QEMU discards is not lost: the next transfer has the same frames, the one after
-    it the next ones."""
+    """A reply that QEMU discards is not lost: the next transfer has the same frames, and the
+    transfer after it the next frames."""
     guest = QemuEnd()
     clock = SystemClock()
     hand = type("Hand", (), {"skipped": None, "next_act": lambda self, first, frame_ns: None})()
@@ -273,8 +273,7 @@ def agent_says(port: socket.socket, *lines: tuple[int, str]) -> None:
 
 
 def test_a_late_answer_is_not_the_next_line_s(shell: tuple[shell_lines.Shell, socket.socket]):
-    """A line that the guest answers too late fails; the next one gets its own answer, not that
-    one."""
+    """A line that the guest answers too late fails; the next line gets its own answer."""
     lines, port = shell
     with pytest.raises(shell_lines.GuestFailed, match="sent nothing for 0 s to: slow"):
         lines.run("slow", timeout_s=0)
@@ -285,8 +284,8 @@ def test_a_late_answer_is_not_the_next_line_s(shell: tuple[shell_lines.Shell, so
 
 
 def test_a_line_that_fails_is_told(shell: tuple[shell_lines.Shell, socket.socket]):
-    """With check, an exit code other than 0 and what the line said are in the error; a guest that
-    has left is told."""
+    """With check, an exit code other than 0 and the output of the line are in the error; a guest
+    that has left is reported."""
     lines, port = shell
     agent_says(port, (2, "no such file"))
     with pytest.raises(shell_lines.GuestFailed, match="rc 2 of: ls\nno such file"):

@@ -77,8 +77,8 @@ def test_the_table_has_both_boxes_and_the_peers():
 
 
 def test_the_shared_line_carries_both_ways():
-    """What the box says is noted and reaches the bridge's end; what that says reaches the box;
-    nobody there is no fault."""
+    """The box's sentences are noted and reach the bridge's end; the bridge's bytes reach the box; a
+    line without a bridge is not a fault."""
     shared = SharedLine()
     with pseudo_terminal.pair() as (far, near), pseudo_terminal.pair() as (here, there):
         shared._far, shared._bridge, shared.line = far, here, there
@@ -103,7 +103,7 @@ def test_the_shared_line_carries_both_ways():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tcp", "modbus"])
 def test_attackers_attack_and_the_good_one_is_served(kind: str, tmp_path: Path):
-    """Floods, noise, endless lines, a storm of connections: a good peer gets answers all the same,
+    """Floods, noise, endless lines, a storm of connections: a good peer gets answers nevertheless,
     and the bridge goes on."""
     seen: Counter[str] = Counter()
     with SpeakingBox(tmp_path / "line") as box, bridge(kind, "--port", box.path) as address:

@@ -1,5 +1,5 @@
-"""The soak: what its judge finds in records with one thing wrong, how it goes on after an
-interruption, what it draws."""
+"""The soak: the findings of its judge in records with one fault, its continuation after an
+interruption, its page."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
 
 
 class FakeBox:
-    """A box without fault on a clock of its own: each call of `heard` takes its wait. change: what
-    becomes of its lines.
+    """A box without fault on a clock of its own: each call of `heard` takes its wait. change:
+    alters its lines.
 
     dropped: frames that it has lost and never says so, a function of its time. runs: how often it
     was started.
@@ -65,7 +65,7 @@ class FakeBox:
         return self.now_s
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """What it says in so long."""
+        """Its sentences in so many seconds."""
         self.now_s += wait_s
         if self.now_s > self.mute_s:
             return []
@@ -202,7 +202,7 @@ def test_a_missed_start_edge_is_found():
 
 
 def test_a_double_answer_is_found():
-    """The same sentence twice is noted; the sweep is answered all the same."""
+    """The same sentence twice is noted; the sweep is answered nevertheless."""
     result = sums(soaked(FakeBox(on(17, lambda line: [line, line]))))
     assert result["unanswered"] == 0
     assert missed(result) == [ORDER]
@@ -218,8 +218,8 @@ def test_a_wrong_number_is_found(number):
 
 
 def test_a_number_too_many_makes_no_answer_wrong(clean):
-    """Where a missed edge made two answers of one sweep, the later ones are held against what was
-    touched then."""
+    """Where a missed edge made two answers of one sweep, the later answers are compared with the
+    material touched then."""
 
     def ahead(line: str) -> list[str]:
         number = int(line.split(",")[2]) if ",RES," in line else 0
@@ -254,8 +254,8 @@ def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
 
 @pytest.mark.slow
 def test_frames_that_nobody_counted_are_found():
-    """Fifty frames that are gone without a word; the same behind for a while and then made up for
-    is no loss."""
+    """Fifty frames that are gone without a word are a loss; a lag of fifty that is made up for is
+    not."""
     box, late = FakeBox(), FakeBox()
     box.dropped = lambda s: 50 * (s > 70)
     late.dropped = lambda s: 50 * (30 < s < 80 or 115 < s < 135)
@@ -325,8 +325,8 @@ def test_the_interval_knows_that_neighbours_are_alike():
 
 
 def test_runs_have_a_level_each_and_one_slope():
-    """A process that was started anew on another level is no growth; two that grow are; two samples
-    decide nothing."""
+    """A process that was started again on another level is not growth; two that grow are; two
+    samples decide nothing."""
     flat = [samples(np.full(120, 70_000.0)), samples(np.full(120, 75_000.0), 1200)]
     grown = [samples(70_000 + np.arange(120)), samples(60_000 + np.arange(120), 1200)]
     assert soak_judge.slope(flat) | {"kib_h": 0.0, "low": 0.0, "high": 0.0} == soak_judge.slope(
@@ -347,8 +347,7 @@ def test_memory_is_judged_once_the_second_half_is_long_enough(clean):
 
 
 def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
-    """After a minute without a word the run ends; what was recorded is saved, and the box
-    closed."""
+    """After a minute without a word the run ends; the record is saved, and the box closed."""
     box, saved = FakeBox(), []
     box.mute_s = box.now_s + 40
     run = soak_judge.SoakRun(seed=1)
@@ -361,8 +360,8 @@ def test_a_box_that_falls_silent_or_ends_is_noted_and_let_go():
 
 @pytest.mark.slow
 def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
-    """The first run is kept as it was, a second one takes what is left with the next seed, a third
-    has nothing to do."""
+    """The first run is kept as it was, a second run takes the rest with the next seed, a third has
+    nothing to do."""
     box, lines = FakeBox(), []
     settings = {"log": lines.append}
     path = soak.soak(box, 7, 0.05, tmp_path, stopped=lambda: box.now_s > 170, **settings)
@@ -507,7 +506,7 @@ def test_the_script_tells_what_is_touched_and_what_the_network_says():
 @pytest.mark.slow
 def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
     """Of twenty sweeps one act and no written line are held; the script has ended, and its end is
-    known all the same."""
+    still known."""
     sim = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
     with ExitStack() as stack:
         settings = config.load(None, [], site=NO_SITE)
@@ -536,7 +535,7 @@ def test_a_process_is_read_from_proc():
 
 
 def heard(box: ThisMachine) -> list[tuple[float, str]]:
-    """What a box says next. Raises AssertionError where it says nothing, although it has used a
+    """The next sentences of a box. Raises AssertionError if none come, although it has used a
     processor for SILENT_CPU_S or done nothing at all for SILENT_S: however busy this machine is, a
     box that gets on is waited for."""
     begun_s, begun_cpu_s = time.monotonic(), box.process()[2]
@@ -639,8 +638,8 @@ def result(clean) -> dict:
 
 
 def test_the_page_needs_nothing_else_and_tells_all(result):
-    """Both boxes, every target, the fault and what was left out; no address, no script; the picture
-    is sound XML."""
+    """Both boxes, every target, the fault and the parts left out; no address, no script; the
+    picture is sound XML."""
     html, svg = soak_page.render(result)
     assert {e.tag.rpartition("}")[2] for e in ET.fromstring(svg).iter()} >= {
         "svg",
@@ -685,7 +684,7 @@ def test_a_day_of_sweeps_stays_a_small_picture(result):
 
 
 def test_records_are_written_a_row_a_line_and_read_again(tmp_path):
-    """What is written reads back the same, and a text with brackets is left alone."""
+    """The written record reads back the same, and a text with brackets is left alone."""
     content = {
         "runs": [{"samples": [[1.5, "a, b", None], [2, "[ c ]", 0]], "empty": [], "n": {"x": 1}}]
     }

@@ -1,5 +1,5 @@
-"""Helpers of tests on terminals: whatever a program does, a wait for it ends, and says what was
-shown."""
+"""Helpers of tests on terminals: a wait for a program always ends, and reports the text shown so
+far."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bridges as processes of their own, as they run beside a box, and what talks to them."""
+"""Bridges as processes of their own, as they run beside a box, and their clients."""
 
 from __future__ import annotations
 

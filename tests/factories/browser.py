@@ -23,8 +23,7 @@ WAIT_S = 10
 
 @contextmanager
 def launched() -> Iterator[Any]:
-    """A browser of this system, else the one that playwright has installed; skips the test where
-    there is none."""
+    """A browser of this system, else that of playwright; skips the test if there is none."""
     api = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (make test installs it)"
     )

@@ -16,7 +16,8 @@ def plain_inputs(
     fixed: int = 0,
     faulty: np.ndarray | None = None,
 ) -> CalibrationInputs:
-    """Features [N, D + 1, F] and what is known of these sweeps; disturbed: None where none is."""
+    """Features [N, D + 1, F] and the labels of these sweeps; disturbed: None without disturbed
+    sweeps."""
     none = AugmentedCopies(prefixes[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
     return CalibrationInputs(
         prefixes,

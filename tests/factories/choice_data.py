@@ -1,5 +1,5 @@
-"""Made-up choices of a model, as choice.json holds them: one that reaches what is wanted, one that
-does not."""
+"""Made-up choices of a model, as choice.json holds them: one reaches the target, the other does
+not."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _curve(kind: str, points: list[Json], kept: str, **more: Any) -> Json:
 
 
 def choice(**more: Any) -> Json:
-    """Four models and all curves; what is wanted is reached."""
+    """Four models and all curves; the target is reached."""
     curves = [
         _curve(
             "window",
@@ -132,8 +132,8 @@ def choice(**more: Any) -> Json:
 
 
 def missed() -> Json:
-    """Only one model could be tried, it is not good enough, nothing was left out, and there is no
-    budget."""
+    """Only one model could be tried, it is not good enough, nothing was left out, and no budget was
+    set."""
     alone = [_model("compact-1k", 0.08, 0.512, 0.0)]
     return choice(
         chosen="compact-1k",

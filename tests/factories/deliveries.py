@@ -110,7 +110,7 @@ class Delivery:
         return self.store.install(self.made(counter))
 
     def start(self) -> str:
-        """A start of the box; the sha256 of what it runs, "" for the packaged bundle."""
+        """A start of the box; the sha256 of the bundle that it runs, "" for the packaged bundle."""
         folder = self.store.choose().folder
         return "" if folder == bundle.DEFAULT else folder.name
 

@@ -27,8 +27,8 @@ def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
 
 
 def figures(**changes: Any) -> dict[str, Any]:
-    """Two cases, three methods, one of which could not take the second case; a learning curve of
-    the first."""
+    """Two cases and three methods, one of them not fit for the second case; a learning curve of the
+    first."""
     results = [
         entry("one", "default", 0.9),
         entry("one", "quick <b>", 0.8),

@@ -3,9 +3,9 @@ outputs there.
 
 `python -m tests.factories.emulated_machines` gets an arm64 userland, once, into
 ~/.cache/palpate/machines: Debian's packages unpacked, the wheels of appliance/requirements.lock
-beside them. qemu's user mode runs it, and x86 processors older than this one; nothing needs root,
-and nothing outside that folder is changed. With two arguments, FROM TO, the module is the program
-that runs on each machine, this one too.
+beside them. qemu's user mode runs it, and older x86 processors; nothing needs root, and nothing
+outside that folder is changed. With two arguments, FROM TO, the module is the program that runs on
+each machine, also here.
 """
 
 from __future__ import annotations
@@ -58,14 +58,13 @@ class Missing(Exception):
 
 
 def folder() -> Path:
-    """Where the arm64 userland lies, or will: another one for another lock or Python."""
+    """The folder of the arm64 userland, which is another for another lock or Python."""
     name = hashlib.sha256(LOCK.read_bytes() + PYTHON.encode()).hexdigest()[:16]
     return HOME / name
 
 
 def qemu(kind: str) -> str:
-    """The emulator of an architecture: this machine's, else the one that `set_up` got. Raises
-    Missing."""
+    """The emulator of an architecture: this machine's, else that of `set_up`. Raises Missing."""
     for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
         if found := shutil.which(
             name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"
@@ -98,10 +97,8 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
 
 
 def whole(target: Path, make: Callable[[Path], None]) -> Path:
-    """The folder `target`, made whole or not at all where it is not there: `make` fills an empty
-    one beside it.
-
-    Raises Missing with what the failed command said.
+    """The folder `target`. If it is missing, it is made whole or not at all: `make` fills an empty
+    folder beside it. Raises Missing with the output of the failed command.
     """
     if target.exists():
         return target
@@ -170,8 +167,8 @@ def _unpack(part: Path) -> None:
 
 
 def apt(part: Path, *known: str) -> tuple[str, str]:
-    """What to put before a command of apt, so that it sees these architectures, knows nothing as
-    installed, and keeps what it fetches in `part`. The lists are fetched here; apt checks their
+    """Words to put before a command of apt, so that it sees these architectures, takes nothing as
+    installed, and keeps its files in `part`. The lists are fetched here; apt checks their
     signatures with this machine's keys.
     """
     for made in ("lists/partial", "archives/partial"):
@@ -193,8 +190,8 @@ def _install(site: Path) -> None:
 
 
 def wheel(out: Path, source: Path) -> None:
-    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put what an
-    older build left behind into the wheel, and leaves its own behind.
+    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put
+    leftovers of an older build into the wheel, and leaves its own behind.
     """
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -210,11 +207,11 @@ def run(*args: str | Path) -> str:
 
 
 def work(given: Path, target: Path) -> None:
-    """Run what lies in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy,
+    """Run the models in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy,
     into one .npz.
 
-    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] is all
-    that it gives for the sweeps, one after another.
+    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] are its
+    outputs for the sweeps, one after another.
     """
     import numpy as np
 

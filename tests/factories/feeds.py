@@ -1,5 +1,4 @@
-"""A feed on a virtual clock, and plain sockets that read it: what a test does to the one is seen at
-the other."""
+"""A feed on a virtual clock, and plain sockets that read it."""
 
 from __future__ import annotations
 
@@ -80,7 +79,7 @@ class FeedPeer:
         self.socket.sendall(text.encode() + b"\n" if isinstance(text, str) else text)
 
     def lines(self) -> list[dict[str, Any]]:
-        """What has come by now; `ended` is set once the box has closed."""
+        """The lines so far; `ended` is set once the box has closed."""
         while select.select([self.socket], [], [], 0)[0]:
             try:
                 data = self.socket.recv(1 << 16)

@@ -160,7 +160,7 @@ class Sprout:
         return True
 
     def model(self) -> bytes:
-        """The finished model: what has grown, and two logits of it."""
+        """The finished model: the grown graph, and two logits of it."""
         ends = [
             name
             for name, value in self.known.items()

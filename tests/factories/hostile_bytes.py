@@ -72,7 +72,8 @@ def declared(name: bytes, kind: int, sizes: Sequence[int]) -> bytes:
 
 
 def misfits() -> Models:
-    """What takes or gives something else than the manifest has, or types that none of ours has."""
+    """Models whose inputs or outputs differ from the manifest, or have types that none of ours
+    has."""
     made = model([node("Relu", ["x"], ["y"])])
     made.graph.input[0].type.tensor_type.shape.dim[0].dim_param = "n"
     yield "named size", made, "a name instead of a number"
@@ -156,7 +157,7 @@ def misfits() -> Models:
 
 
 def broken() -> Models:
-    """Files that are no protobuf, or more than one thing to two readers."""
+    """Files that are not protobuf, or that two readers understand differently."""
     good = model([node("Relu", ["x"], ["y"])]).SerializeToString()
     graph = model([node("Abs", ["x"], ["y"])]).graph.SerializeToString()
     yield "two graphs", good + part(7, graph), "graph is there twice"

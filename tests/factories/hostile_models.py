@@ -1,7 +1,7 @@
 """Harmful models. In: nothing. Out: each by name, as bytes, with a regular expression that its
 refusal must match.
 
-They ask for unlimited memory or time, for files beside the model, for other code, or are no model
+They ask for unlimited memory or time, for files beside the model, for other code, or are not models
 at all (hostile_bytes.py). Some are made with onnx, some byte by byte, since onnx would not write
 them. All declare the sweep of `grown_models.FORM` as their input.
 """
@@ -41,7 +41,7 @@ def tiny() -> bytes:
 
 
 def every() -> dict[str, tuple[bytes, str]]:
-    """All of them by name: bytes, and what the message must say (a regular expression)."""
+    """All of them by name: bytes, and a regular expression for the message."""
     found: dict[str, tuple[bytes, str]] = {
         "152 bytes for 6 GB": (tiny(), "node 0 .*ConstantOfShape")
     }
@@ -158,7 +158,7 @@ def endless() -> Models:
     )
     loop = node("Loop", ["trips", "", "top"], ["y"], body=body)
     held = {"rest": np.float32([254]), "many": [2**60]}
-    # onnxruntime opens this one and runs golden sweeps; the first sweep with a count of 255 never
+    # onnxruntime opens this model and runs golden sweeps; the first sweep with a count of 255 never
     # ends
     yield "loop that waits for a sweep", model([*counted, loop], held), "graph in the graph"
     yield "loop without a body", model([node("Loop", ["", "go"], ["y"])]), "no such operator"

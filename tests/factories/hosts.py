@@ -4,7 +4,7 @@ user.
 In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried
 on, and with `python -m tests.factories.hosts figures` how long both take. Their Debian is made
 once, in ~/.cache/palpate/hosts: bare, with the packages that an install wants in apt's cache as
-from a mirror; and ready, with these installed. What happens on a host is gone with it. The skin is
+from a mirror; and ready, with these installed. Changes on a host are gone with it. The skin is
 simulated there, by a drop-in for the unit.
 """
 

@@ -27,7 +27,7 @@ def run_here(code: str) -> str:
 
 
 def enrolment_key(folder: Path) -> EnrolmentKey:
-    """The box's key for enrolments, as the install makes it, but for this user."""
+    """The box's key for enrolments, as the install makes it, owned by this user."""
     code = f"import enrolment_key, os; print(enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid()))"
     subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
     return EnrolmentKey(folder)

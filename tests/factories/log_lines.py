@@ -1,4 +1,4 @@
-"""What the box logs while a block runs: one text a line, a warning with `<4>` before it as in
+"""The log of the box while a block runs: one text a line, a warning with `<4>` before it as in
 systemd's journal."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""A model that needs no training: two materials, of which one is louder. In: nothing. Out: sweeps,
-a graph, a method."""
+"""A model that needs no training: sweeps of two materials, one louder than the other, a graph, a
+method."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Enrolments that mean harm: those of the default bundle, changed at random, as whoever has a box's
-key might sign them. In: a generator. Out: the bytes of enrolment.npz.
+"""Enrolments that mean harm: those of the default bundle, changed at random, as an attacker with
+the key of a box might sign them. In: a generator. Out: the bytes of enrolment.npz.
 
 Two kinds of change: of bytes, which mostly break the file, and of arrays, which leave a file that
 can be read.

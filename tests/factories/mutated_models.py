@@ -135,7 +135,7 @@ def flip(data: bytes, rng: Random, other: bytes) -> bytes:
 
 
 def splice(data: bytes, rng: Random, other: bytes) -> bytes:
-    """A piece of another model, or of this one, instead of a piece."""
+    """A piece of this or another model instead of a piece."""
     source = rng.choice((data, other))
     at, to = rng.randrange(len(data)), rng.randrange(len(source))
     return data[:at] + source[to : to + rng.randint(1, 64)] + data[at + rng.randint(0, 64) :]
@@ -296,7 +296,7 @@ def exchanged(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def ends(graph: Graph, rng: Random, other: Graph) -> None:
-    """What the model says that it takes or gives."""
+    """The declared inputs or outputs of the model."""
     value = rng.choice((*graph.input, *graph.output))
     held = value.type.tensor_type
     if rng.random() < 0.2:

@@ -3,8 +3,8 @@ board.
 
 `python -m tests.factories.nspawn` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from
 Debian, a virtual environment with the wheels of appliance/requirements.lock. `Machine` boots it in
-half a second; what is changed in it lies in memory and is gone at the end. It has no devices, and
-its limits of memory and processor are not enforced. Needs root.
+half a second; changes in it lie in memory and are gone at the end. It has no devices, and its
+limits of memory and processor are not enforced. Needs root.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ BOOT_S = 60
 
 
 def folder() -> Path:
-    """Where the Debian lies, or will: another one for another lock, suite or processor."""
+    """The folder of the Debian, which is another for another lock, suite or processor."""
     key = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
     return CACHE / hashlib.sha256(LOCK.read_bytes() + key).hexdigest()[:16]
 
@@ -250,7 +250,7 @@ class Machine:
         )
 
     def get(self, *command: str, say: str = "") -> str:
-        """What a command prints; it must succeed."""
+        """The output of a command, which must succeed."""
         done = self.run(*command, say=say)
         assert done.returncode == 0, f"{command} gave {done.returncode}: {done.stdout}{done.stderr}"
         return done.stdout.strip()
@@ -322,8 +322,7 @@ class Service:
         self.machine.get("systemctl", "kill", "--kill-whom=main", f"--signal={signal}", "palpate")
 
     def journal(self, *more: str) -> list[str]:
-        """What the service and systemd about it have written to the journal since the test
-        began."""
+        """The journal of the service, and of systemd about it, since the test began."""
         about = ("-u", "palpate", "-o", "cat", f"--since=@{self._begin:.6f}", *more)
         return self.machine.get("journalctl", "-q", *about).splitlines()
 

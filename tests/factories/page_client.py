@@ -1,4 +1,4 @@
-"""Browsers without a screen: plain connections to a page's server, and what comes over them."""
+"""Browsers without a screen: plain connections to a page's server, and their bytes."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ HIDDEN = {"style", "script"}
 
 
 class PageReader(HTMLParser):
-    """The page `text`; `text` of this object is what a reader sees, with single spaces."""
+    """The page `text`; `text` of this object is the visible text, with single spaces."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -22,13 +22,13 @@ class PageReader(HTMLParser):
         self.text = " ".join(" ".join(self._parts).split())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember what is open, and every address."""
+        """Remember the open elements, and every address."""
         self.links += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "srcset")]
         if tag not in VOID:
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
-        """What closes must be what opened last."""
+        """An end tag must close the element that opened last."""
         if tag not in VOID and (not self.open or self.open.pop() != tag):
             self.wrong.append(tag)
 

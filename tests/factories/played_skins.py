@@ -31,8 +31,8 @@ SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
 
 
 class Numbered:
-    """Frames that are told apart by their content: frame i as whole number i, in steps of 0.25
-    where it is no number."""
+    """Frames that differ in their content: frame i as whole number i, in steps of 0.25 for floating
+    point."""
 
     def __init__(self, name: str) -> None:
         self.shape, dtype, self.rate_hz = SHAPES[name]

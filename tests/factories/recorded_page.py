@@ -1,5 +1,4 @@
-"""A page of a recording whose turns a test takes, or a thread does; and what a browser sends to
-it."""
+"""A page of a recording whose turns a test or a thread takes, and the requests of a browser."""
 
 from __future__ import annotations
 
@@ -101,7 +100,7 @@ class RecordedPage:
         return self.sweeps
 
     def answered(self, status: Status, detail: str = "") -> tuple[Sweep, Verdict]:
-        """The next sweep, with a window if the status has one, and what it is answered."""
+        """The next sweep, with a window if the status has one, and its answer."""
         self.sweeps += 1
         frames = Frames.empty(skin.FORMAT) if status in (Status.SHORT, Status.GAP) else cut().frames
         one = replace(cut(), id=self.sweeps, start_ns=SystemClock().now_ns(), frames=frames)

@@ -1,5 +1,5 @@
-"""A finished page or picture in a browser, and what a reader could not read of it. In: a file, a
-width, light or dark."""
+"""A finished page or picture in a browser, and its illegible parts. In: a file, a width, light or
+dark."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def environment() -> dict[str, str]:
 
 
 class RosPeer:
-    """The other node: what it has heard, by topic, and what its calls gave."""
+    """The other node: its messages by topic, and the results of its calls."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.heard: list[dict[str, Any]] = []

@@ -1,7 +1,7 @@
-"""What a launch file describes, without the package `launch`, of which there is neither a wheel nor
-a Debian package.
+"""The content of a launch file, without the package `launch`, which has neither a wheel nor a
+Debian package.
 
-The four names take what ROS 2's take (github.com/ros2/launch, launch/actions and
+The four names take the arguments of those of ROS 2 (github.com/ros2/launch, launch/actions and
 launch/substitutions); a launch file that uses more fails here.
 """
 

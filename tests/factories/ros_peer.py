@@ -1,5 +1,5 @@
-"""Another ROS 2 node, in a process of its own: prints what it hears as JSON lines, calls what it is
-told on stdin.
+"""Another ROS 2 node, in a process of its own: prints its messages as JSON lines, and makes the
+calls that stdin names.
 
 Runs with a Python that has rclpy; imports nothing of the project.
 """
@@ -50,7 +50,7 @@ def tell(**fields: object) -> None:
 
 
 def status(topic: str, array: DiagnosticArray) -> None:
-    """Print the one status of an array."""
+    """Print the only status of an array."""
     (one,) = array.status
     values = {pair.key: pair.value for pair in one.values}
     stamp = array.header.stamp.sec + array.header.stamp.nanosec / 1e9
@@ -97,7 +97,7 @@ def fields(message: object) -> dict:
 
 
 class Sweeper:
-    """Sends goals to the action, and cancels the one that was accepted last.
+    """Sends goals to the action, and cancels the goal that was accepted last.
 
     Hears feedback on its topic: rclpy's client passes none on once the result is there, and may see
     the result first.
@@ -117,7 +117,7 @@ class Sweeper:
         )
 
     def send(self, **terms: float | bool) -> None:
-        """Send a goal; what comes of it is printed."""
+        """Send a goal; its result is printed."""
         if not self._client.wait_for_server(20):
             tell(topic="result", state="no such action")
             return

@@ -83,7 +83,7 @@ class Rigged:
         return self.until(lambda: self.simulated.clock.now_ns() >= end_ns)
 
     def listen(self, wait_s: float = 0) -> None:
-        """Read the robot's end; the kernel passes on what the near end wrote in its own time."""
+        """Read the robot's end; the kernel passes on the bytes of the near end in its own time."""
         while select.select([self.far_end], [], [], wait_s)[0]:
             *lines, self.rest = (self.rest + os.read(self.far_end, 65536)).split(b"\r\n")
             self.heard += [line.decode("ascii") for line in lines]

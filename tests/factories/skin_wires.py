@@ -1,10 +1,10 @@
-"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: what its frames must hold,
-their bytes as they are described by the makers, and a port that delivers them with a driver's
+"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: the right content of its
+frames, their bytes by the makers' descriptions, and a port that delivers them with a driver's
 buffer and every fault.
 
 The bytes are written a second time here and not taken from `appliance.sim.skins.wires`, on purpose:
-two readings of the same descriptions, with other choices where a skin leaves one (width of offsets,
-order of fields, separators), so that a mistake of one of them is not confirmed by itself.
+two readings of the same descriptions, with other choices where a skin leaves some (width of
+offsets, order of fields, separators), so that a mistake of one of them is not confirmed by itself.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
 
 
 def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
-    """Frame `i` with all that is on the wire [R, C, values]; what is not taken is 99."""
+    """Frame `i` with all values on the wire [R, C, values]; values that are not taken are 99."""
     grid = np.full((p.rows, p.cols, p.values), 99, np.dtype(p.number))
     grid[..., list(p.take)] = taxels(p, i).reshape(p.rows, p.cols, len(p.take))
     return grid
@@ -146,8 +146,8 @@ class WirePort:
     """A serial port with a skin behind it, and the kernel's buffer between.
 
     frames: bytes of frame i. period_ns: time between two. latency: from the end of a frame to the
-    driver. capacity: bytes that the driver keeps; what comes after is thrown away. mangle: changes
-    the bytes of a frame on the cable. chunk: most bytes of one read. sent: what the box wrote.
+    driver. capacity: bytes that the driver keeps; later bytes are thrown away. mangle: changes the
+    bytes of a frame on the cable. chunk: most bytes of one read. sent: bytes from the box.
     """
 
     clock: VirtualClock
@@ -195,7 +195,7 @@ class WirePort:
         self.is_open = False
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """What has come, or b"" after the timeout."""
+        """The bytes so far, or b"" after the timeout."""
         until_ns = self.clock.now_ns() + timeout_ms * 1_000_000
         while True:
             if self.gone:
@@ -273,8 +273,8 @@ class WiredSkin:
         return Frames.joined(parts)
 
     def which(self, frames: Frames) -> NDArray[np.int64]:
-        """Which of the frames on the wire each one is [n], by its content; fails for a frame that
-        was never sent."""
+        """Number on the wire of each frame [n], by its content; fails for a frame that was never
+        sent."""
         sent = {taxels(self.profile, i).tobytes(): i for i in range(199)}
         low = np.array([sent[one.tobytes()] for one in frames.taxels], np.int64)
         # the content repeats after 199 frames; the time tells which of them it is

@@ -1,4 +1,4 @@
-"""The box's end of a serial line, played by a script: for tests of what is at the other end."""
+"""The box's end of a serial line, played by a script: for tests of the other end."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def obeying(heard: Sentence) -> list[bytes]:
 
 
 class SpeakingBox:
-    """Answers each command as the script says, and says what the test wants.
+    """Answers each command as the script says, and sends the sentences of the test.
 
     path: where the robot finds its end; `unplug` takes it away, `plug_in` brings it back. heard:
     the commands.

@@ -1,4 +1,4 @@
-"""What the command stress measures, by hand: six methods and a bundle under three corruptions."""
+"""Made-up results of the command stress: six methods and a bundle under three corruptions."""
 
 from __future__ import annotations
 

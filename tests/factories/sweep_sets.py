@@ -25,7 +25,7 @@ def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> D
 
 
 def held() -> dict[str, np.ndarray]:
-    """What a good file holds."""
+    """The content of a good file."""
     return {
         "samples": np.arange(6 * 8 * 2 * 3).reshape(6, 8, 2, 3).astype(np.int16),
         "labels": np.array([0, 1, 2, 0, 1, 2]),

@@ -2,8 +2,8 @@
 service. In: nothing. Out: these.
 
 A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is
-simulated, in real time. PALPATE_SYSTEMD=1 makes what this needs (see nspawn.py) and fails without
-it; else what is missing is skipped.
+simulated, in real time. PALPATE_SYSTEMD=1 makes the container (see nspawn.py) and fails without it;
+otherwise tests without it are skipped.
 """
 
 from __future__ import annotations

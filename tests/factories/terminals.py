@@ -1,6 +1,6 @@
-"""A program on a terminal, for tests. In: the far end, the process. Out: what it shows, or an
-AssertionError with what it has shown so far; the process never outlives that, so that no test waits
-for it for ever.
+"""A program on a terminal, for tests. In: the far end, the process. Out: the shown text, or an
+AssertionError with the text so far. The process never outlives that, so no test waits for it for
+ever.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def read(
     done: Callable[[bytes], object] = lambda shown: False,
     limit_s: float = LIMIT_S,
 ) -> bytes:
-    """What a program shows until `done`, or until it has closed the terminal."""
+    """The text of a program until `done`, or until it has closed the terminal."""
     shown, end_s = b"", time.monotonic() + limit_s
     while not done(shown):
         if not select.select([far], [], [], max(0.0, end_s - time.monotonic()))[0]:

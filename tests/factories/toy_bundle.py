@@ -1,9 +1,8 @@
-"""A bundle whose answers are known by arithmetic, for tests. In: what it shall hold. Out: a Bundle,
-and windows for it.
+"""A bundle whose answers are known by arithmetic, for tests, and windows for it.
 
 Its embedding is two of the taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its
 materials "a", "b" and "c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it
-looks at the normal one.
+uses the normal axis.
 """
 
 from __future__ import annotations

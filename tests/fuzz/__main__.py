@@ -2,7 +2,7 @@
 each, a seed. Out: a line of figures for each target, the smallest corpus that covers as much, and
 in crashes/ each input that broke a promise.
 
-What it learns lies in build/fuzz/ and is taken up again by the next run, also by one after an
+The inputs that it finds lie in build/fuzz/; the next run begins with them, also after an
 interruption.
 """
 
@@ -64,7 +64,7 @@ def main() -> int:
 
 
 def fuzz(target: str, minutes: float, seed: int) -> int:
-    """Fuzz one target, save what it learned, and print the figures."""
+    """Fuzz one target, save the inputs that it found, and print the figures."""
     place, inputs = WORK / target, WORK / target / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     for data in [*corpus.load(target), *seeds.SEEDS[target]()]:

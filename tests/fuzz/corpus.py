@@ -1,7 +1,7 @@
 """The saved inputs: one text file a target, one input a line, written as Python writes bytes, the
 shortest first.
 
-So a person reads in a change what was added, and no tool is needed to look inside.
+So a change shows the added inputs, and no tool is needed to read them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def save(target: str, inputs: Iterable[bytes]) -> None:
 
 
 def name(data: bytes) -> str:
-    """What a file with these bytes is called until a person names it."""
+    """Name of a file with these bytes until a person gives it one."""
     return sha256(data).hexdigest()[:16]
 
 

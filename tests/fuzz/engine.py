@@ -30,7 +30,7 @@ SLOW_S = 10
 
 
 def main(name: str, seconds: float, *options: str) -> None:
-    """Fuzz a target for so much CPU time; libFuzzer prints what it does on standard error."""
+    """Fuzz a target for so much CPU time; libFuzzer prints its progress on standard error."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     target, mutate = targets.TARGETS[name], MUTATORS[name]
     with TemporaryDirectory(prefix=f"fuzz-{name}-") as folder:

@@ -1,6 +1,5 @@
-"""What must hold of enrolment.npz. In: any bytes, beside a small bundle. Out: nothing, or an error
-where a promise is broken, as in `targets`; also where its fuzzing begins, and changes that leave
-the archive readable.
+"""The promises about enrolment.npz. In: any bytes, beside a small bundle. Out: nothing, or an error
+if a promise is broken, as in `targets`; also seeds, and changes that leave the archive readable.
 """
 
 from __future__ import annotations
@@ -56,8 +55,8 @@ def _check_classes(old: Bundle, got: Bundle) -> None:
 
 
 def target(data: bytes, folder: Path) -> None:
-    """enrolled.applied: labels that can be sent, and nothing else, are added to what was signed; or
-    a BundleError."""
+    """enrolled.applied: only labels that can be sent are added to the signed bundle; or a
+    BundleError."""
     old = small()
     try:
         got = read(data, folder)

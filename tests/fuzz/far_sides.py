@@ -1,6 +1,6 @@
-"""What must hold of what a controller sends over Modbus, and of files that a person imports. In:
-any bytes. Out: nothing, or an error where a promise is broken, as in `targets`; also where their
-fuzzing begins, and what their formats are made of.
+"""The promises about requests of a controller over Modbus, and about files that a person imports.
+In: any bytes. Out: nothing, or an error if a promise is broken, as in `targets`; also seeds, and
+the words of their formats.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What must hold of files: a site file, a bundle's manifest, a recorded sweep (.npy with its
+"""The promises about files: a site file, a bundle's manifest, a recorded sweep (.npy with its
 .json), a capture. In: any bytes, and a folder that they are written to. Out: nothing, or an error
 where a promise is broken, as in `targets`.
 """
@@ -144,8 +144,8 @@ def _usable(read: bundle.Manifest) -> None:
 
 
 def recording(data: bytes, folder: Path) -> None:
-    """sweep.load: a sidecar and what begins with numpy's magic are a Sweep that saves and loads
-    again, or a FormatError."""
+    """sweep.load: a sidecar and bytes that begin with numpy's magic are a Sweep that saves and
+    loads again, or a FormatError."""
     about, magic, table = data.partition(NPY)
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)

@@ -59,8 +59,7 @@ def rearranged(pieces: list[bytes], random: Random) -> bytes:
 
 
 def parts(split: Callable[[bytes], list[bytes]]) -> Mutator:
-    """A mutator that rearranges what follows the first of the pieces that `split` finds, or changes
-    bytes."""
+    """A mutator that rearranges the pieces that `split` finds after the first, or changes bytes."""
 
     def mutate(data: bytes, random: Random, plain: Plain) -> bytes:
         head, *pieces = split(data)

@@ -112,8 +112,8 @@ def command() -> list[bytes]:
 
 
 def feed() -> list[bytes]:
-    """What a reader may ask for, at once and in one line, the document's examples, and lines that
-    are no requests."""
+    """The requests of a reader, at once and in one line, the document's examples, and lines that
+    are not requests."""
     asked = [
         json.dumps(one).encode()
         for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})

@@ -1,10 +1,10 @@
-"""What must hold of skins: of each codec, whatever bytes come, and of the reader of profiles,
-whatever a file holds. In: any bytes, and a folder that a file is written to. Out: nothing, or an
-error where a promise is broken, as in `targets`.
+"""The promises about skins: each codec takes any bytes, and the reader of profiles any file. In:
+any bytes, and a folder that a file is written to. Out: nothing, or an error where a promise is
+broken, as in `targets`.
 
-Promises of a codec: in parts as at once; garbage is counted and what is left over is bounded; no
-frame is invented. For the last, each frame that comes out is looked for in the bytes by a second
-reading that is slow and made from the skins' published layouts, not from the codecs.
+Promises of a codec: in parts as at once; garbage is counted and the rest is bounded; no frame is
+invented. For the last, each frame that comes out is looked for in the bytes by a second reading
+that is slow and made from the skins' published layouts, not from the codecs.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _sound(profile: SkinProfile, got: Decoded, data: bytes) -> None:
 
 
 def _fixed(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """Marker, numbers, trailer: what stands right before the end."""
+    """Marker, numbers, trailer: the bytes right before the end."""
     kind = np.dtype(profile.number)
     size = profile.rows * profile.cols * profile.values * kind.itemsize
     frame = before[-(len(profile.marker) + size + len(profile.trailer)) :]
@@ -230,8 +230,8 @@ ENCLOSED: dict[str, Enclosed] = {
 
 
 def profile(data: bytes, folder: Path) -> None:
-    """skin_profile.load: a profile's file is a profile that reads any bytes and says what it is, or
-    a ConfigError."""
+    """skin_profile.load: a profile's file is a profile that reads any bytes and has a name, or a
+    ConfigError."""
     path = folder / "a-skin.toml"
     path.write_bytes(data)
     try:

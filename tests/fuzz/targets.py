@@ -1,9 +1,8 @@
-"""What must hold of whatever comes in. In: any bytes, and a folder for those that are read as a
-file. Out: nothing, or an error where a promise is broken: an AssertionError from here, or one that
-the box would not have survived.
+"""The promises about any input. In: any bytes, and a folder for bytes that are read as a file. Out:
+nothing, or an error if a promise is broken: an AssertionError from here, or an error that the box
+would not have survived.
 
-Each target is a pure function of its bytes; what is in the folder is only what it wrote there
-itself.
+Each target is a pure function of its bytes; the folder holds only the files that it wrote there.
 """
 
 from __future__ import annotations
@@ -190,7 +189,7 @@ def command(data: bytes, folder: Path) -> None:
 
 
 def _is_command(line: bytes, name: str) -> bool:
-    """Whether a line is a command by PROTOCOL.md, and this one."""
+    """Whether a line is this command by PROTOCOL.md."""
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
     fields = re.split(
         "[, ]", body.decode("ascii", "replace"), maxsplit=2
@@ -200,7 +199,7 @@ def _is_command(line: bytes, name: str) -> bool:
         and name in robot_link.COMMANDS
         and (len(fields) == 3) == (name in robot_link.TEXT_COMMANDS)
     )
-    # what a sentence may not hold (PROTOCOL.md); a command has one field
+    # characters that a sentence may not hold (PROTOCOL.md); a command has one field
     known = known and "," not in "".join(fields[2:]) and not re.search(rb"[^ -~]|[!\\~^]", body)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE

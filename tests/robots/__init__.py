@@ -1,2 +1,2 @@
-"""Measures what each connection to a robot costs: docs/data/robots-latency.json, the table of
+"""Measures the delay of each connection to a robot: docs/data/robots-latency.json, the table of
 docs/robots/README.md."""

@@ -48,8 +48,8 @@ Seen = Callable[[int], None]
 
 
 class Times:
-    """When each sweep was judged, and when each connection had the answer, in ns of the one
-    monotonic clock."""
+    """When each sweep was judged, and when each connection had the answer, in ns of the monotonic
+    clock."""
 
     def __init__(self) -> None:
         self._judged: dict[tuple[str, int], int] = {}
@@ -60,7 +60,7 @@ class Times:
         self._judged[box, line["sweep"]] = line["time_ns"]
 
     def seen(self, connection: str, box: str) -> Seen:
-        """For a connection to note what it has."""
+        """For a connection to note its answers."""
         self._there[connection, box] = {}
         return lambda sweep: self.note(connection, box, sweep, time.monotonic_ns())
 
@@ -144,8 +144,8 @@ def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
 
 
 def lines_ms(sweeps: int) -> list[float]:
-    """From a verdict to RESULT VALID, in this process, on simulated lines: what the program adds to
-    a real line."""
+    """From a verdict to RESULT VALID, in this process, on simulated GPIO lines: the delay that the
+    program adds to a real line."""
     current = bundle.load(bundle.DEFAULT)
     simulated = devices.build(current.format, script.tubes(3, sweeps), SystemClock(), "sim")
     settings = config.load(None, site=NO_SITE)

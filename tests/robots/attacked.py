@@ -1,6 +1,6 @@
-"""What bridges cost the box, and bridges under attack: `python -m tests.robots.attacked --minutes
-2`. In: minutes for each case. Out: a table, docs/data/robots-attacked.json; exit code 1 if a frame, a
-sentence or an answer was lost.
+"""The load of bridges on the box, and bridges under attack: `python -m tests.robots.attacked
+--minutes 2`. In: minutes for each case. Out: a table, docs/data/robots-attacked.json; exit code 1
+if a frame, a sentence or an answer was lost.
 
 One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had
 the same machine: no bridge; Modbus and ROS 2 on its feed and TCP on its line; the same with peers
@@ -37,7 +37,7 @@ CASES = {
 
 
 def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
-    """Peers that mean it ill; they end with their input, and say what they did."""
+    """Hostile peers; they end with their input, and report their counts."""
     command, pipe = (
         [sys.executable, "-m", "tests.robots.attackers", kind, str(port)],
         subprocess.PIPE,

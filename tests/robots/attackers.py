@@ -1,6 +1,6 @@
-"""Peers that mean a bridge or the page ill: `python -m tests.robots.attackers KIND PORT` until its
-input ends. In: modbus, tcp or page, and where it listens on loopback. Out: one line of JSON, how
-many connections it had to bear, and what a good peer got.
+"""Hostile peers of a bridge or of the page: `python -m tests.robots.attackers KIND PORT` until its
+input ends. In: modbus, tcp or page, and where it listens on loopback. Out: one line of JSON with
+the number of connections and the answers of a good peer.
 
 All are in one process of low priority, which pauses between its rounds, so that it takes less than
 a core.

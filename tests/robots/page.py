@@ -21,7 +21,7 @@ NAMES = {
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """The table with what was measured, in Markdown."""
+    """The table of the measurements in Markdown."""
     rows = ["| connection | median | longest | answers |", "|---|---|---|---|"]
     for name, text in NAMES.items():
         one = found["connections"][name]

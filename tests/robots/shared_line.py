@@ -2,8 +2,7 @@
 ThisMachine, and the bridge's end.
 
 The box's sentences are noted here first, in a process of real-time priority where that is allowed,
-and then passed on: what is measured of the box with a bridge on its line is measured as without
-one.
+and then passed on. So a box with a bridge on its line is measured like a box without.
 """
 
 from __future__ import annotations

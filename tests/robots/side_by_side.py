@@ -1,11 +1,11 @@
-"""A box with everything attached and attacked, beside one with nothing: `python -m
+"""A box with everything attached and attacked, beside a box with nothing: `python -m
 tests.robots.side_by_side --minutes 5`. In: minutes. Out: docs/data/robots-side-by-side.json and the
-table of docs/robots/README.md; exit code 1 if the one was worse off.
+table of docs/robots/README.md; exit code 1 if the attacked box was worse off.
 
 Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this
-machine. At the one are the page, the TCP bridge (on its line), the Modbus bridge and readers (on
-its feed), and at each of these four peers that mean it ill. Boxes and listeners run with real-time
-priority where that is allowed, all else does not.
+machine. The page, the TCP bridge (on its serial line), the Modbus bridge and readers (on its feed)
+are attached to the first; each of these four has hostile peers. Boxes and listeners run with
+real-time priority where that is allowed, all else does not.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ MIB = 2.0
 
 @dataclass
 class BoxSide:
-    """One of the two boxes, and what was measured of it. looks: (seconds, processor seconds, KiB
+    """One of the two boxes, and its measurements. looks: (seconds, processor seconds, KiB
     resident)."""
 
     box: ThisMachine
@@ -63,7 +63,7 @@ class BoxSide:
     before_kib: int = 0
 
     def look(self) -> None:
-        """Note what the process has used."""
+        """Note the resources that the process has used."""
         used = self.box.process()
         self.looks.append((time.monotonic(), used[2], used[0]))
 
@@ -186,7 +186,7 @@ def readers(feed: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
-    """Both boxes' figures, what the peers did, and what box and machine these are."""
+    """Figures of both boxes, counts of the peers, and the names of box and machine."""
     with ExitStack() as stack:
         feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
         both = sides(stack, feed, seed, round((START_S + COME_S + 60 * minutes) / SWEEP_S), before)
@@ -215,7 +215,7 @@ def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
 
 
 def worse(boxes: dict[str, Any]) -> list[str]:
-    """In what the attacked box was worse off, in words."""
+    """The targets that the attacked box missed, in words."""
     alone, one = boxes["alone"], boxes["attacked"]
     checks = {
         f"{one['frames_lost']} frames lost, alone {alone['frames_lost']}": one["frames_lost"]
@@ -241,7 +241,7 @@ NAMES = {"alone": "nothing attached", "attacked": "page, TCP, Modbus and feed, a
 
 
 def table(content: dict[str, Any]) -> str:
-    """What was measured, in Markdown."""
+    """The measurements in Markdown."""
     boxes, peers = content["boxes"], content["peers"]
     rows = [
         f"Measured by `python -m tests.robots.side_by_side`, both boxes at the same time for {boxes['alone']['seconds']} s, on "

@@ -1,2 +1,2 @@
-"""Measured on emulated skins: how often a bad cable makes a wrong frame, what each skin costs the
-box, the whole way."""
+"""Measured on emulated skins: how often a bad cable makes a wrong frame, the load of each skin on
+the box, the whole way from recording to answers."""

@@ -51,7 +51,7 @@ PARTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
 
 
 def main() -> int:
-    """Run the parts, and write what they gave beside what others gave before."""
+    """Run the parts, and write their results beside earlier results of the others."""
     parser = argparse.ArgumentParser(prog="python -m tests.skins", description=__doc__)
     parser.add_argument("part", nargs="?", choices=[*PARTS, "page"], help="all by default")
     parser.add_argument(

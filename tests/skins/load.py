@@ -1,10 +1,10 @@
-"""What a skin costs the box at its full rate, in real time. In: the name of a profile, its bundle,
-seconds. Out: figures.
+"""The load of a skin on the box at its full rate, in real time. In: the name of a profile, its
+bundle, seconds. Out: figures.
 
 The emulator plays in a process of its own, and each frame carries its number in two taxels, so that
-lost ones are seen whatever the skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box
-classifies one sweep after the other. Both run under real-time scheduling where that is allowed:
-what is measured is the box, and not what else the machine does.
+lost frames are seen with every skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box
+classifies one sweep after the other. Both run under real-time scheduling where that is allowed: so
+other programs of the machine are not measured.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class FrameCheck(Observer):
         self._last = numbers[-1:]
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """The sentence is out before observers of sweeps are told."""
+        """The sentence is out before observers get the sweep."""
         self.answer_ms.append((self._clock.now_ns() - sweep.stop_ns) / 1e6)
         self.statuses.append(str(verdict.status))
 
@@ -121,7 +121,7 @@ class PromptClock(SystemClock):
 
 
 def hurry(priority: int) -> bool:
-    """Schedule this process before all usual ones; False where that is not allowed."""
+    """Schedule this process before all usual processes; False if that is not allowed."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:

@@ -1,8 +1,8 @@
 """How often a bad cable makes a wrong frame. In: the bytes of each skin, faults. Out: counts.
 
 A frame is wrong if the box takes it and no such frame was sent. A skin with a checksum has none of
-them. One without cannot tell a changed number from a felt one; what can be asked of it is that lost
-and added bytes invent no frame.
+them. A skin without a checksum cannot distinguish a changed number from a measured number. Its
+promise is that lost and added bytes invent no frame.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def lost(data: bytes, rng: Generator) -> bytes:
 
 
 def changed(data: bytes, rng: Generator) -> bytes:
-    """One byte arrives as another one."""
+    """One byte arrives changed."""
     at = int(rng.integers(len(data)))
     return data[:at] + bytes([data[at] ^ int(rng.integers(1, 256))]) + data[at + 1 :]
 
@@ -62,8 +62,8 @@ class NoiseCount:
 
 
 def count(subject: Subject, fault: Fault, faults: int, seed: int = 1) -> NoiseCount:
-    """Play a stream in which one frame of APART is damaged, and compare what comes out with what
-    was sent."""
+    """Play a stream with one damaged frame in APART, and compare the frames received with those
+    sent."""
     known = {frame.tobytes() for frame in subject.frames}
     read, rest = codec(subject.profile), Rest()
     taken = wrong = 0

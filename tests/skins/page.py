@@ -54,8 +54,7 @@ def _noise(found: dict[str, Json]) -> Iterator[str]:
 
 
 def _rate(wrong: int, faults: int) -> str:
-    """Wrong frames in so many faults; without any, the rule of three gives what they can be at
-    most."""
+    """Wrong frames in so many faults; without any, the rule of three gives their highest rate."""
     if not wrong:
         return f"0 of {faults:,} (below {3 / faults:.2%})"
     return f"{wrong:,} of {faults:,} ({wrong / faults:.2%})"

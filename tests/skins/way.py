@@ -1,8 +1,8 @@
 """The whole way with a skin, by the commands that a person types: record, describe, fit, export,
 run.
 
-In: the name of a profile, a folder. Out: what the last command answered to sweeps at positions that
-no recording has.
+In: the name of a profile, a folder. Out: the answers of the last command to sweeps at positions
+that no recording has.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
-    """Two bare hosts, the second of which stays bare, and a desktop that may log in there."""
+    """Two bare hosts, and a desktop that may log in there; the second host stays bare."""
     if os.environ.get("PALPATE_SYSTEMD") != "1":
         pytest.skip("installs on real hosts take minutes; run python -m tests.campaigns systemd")
     with hosts.Hosts(2, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:

@@ -34,7 +34,7 @@ import os, signal, sys, time
 from appliance.__main__ import main
 from appliance.sim import usb
 class Cursed(usb.RigBackend):
-    # a second and a half after it has begun, while the current bundle is the one in /run/cursed: do
+    # a second and a half after it has begun, while the current bundle is that in /run/cursed: do
     # what stands there
     begin = time.monotonic()
     def _touch(self, what=""):
