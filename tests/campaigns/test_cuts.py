@@ -187,6 +187,7 @@ def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
     assert len(points) > 60
 
 
+@pytest.mark.thorough  # kills a command at every call
 def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work: Path):
     """`palpate record` itself, killed and without power before some of its last calls."""
     played = ScenePlay(recording.palpate(), work)

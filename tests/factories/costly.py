@@ -1,4 +1,5 @@
-"""Methods whose training takes seconds, though a test lets them take few steps.
+"""Methods whose training takes seconds, though a test lets them take few steps; and a skin that
+sends 1,000 frames a second.
 
 `make test` tries the others; `make test-all` tries these as well.
 """
@@ -22,6 +23,7 @@ COSTLY = {
     "compact-20k",
     "compact-50k",
     "compact-100k",
+    "papillarray",
 }
 
 

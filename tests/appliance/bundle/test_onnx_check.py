@@ -261,6 +261,7 @@ def test_grown_models_pass_and_run():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a sample of the campaign hostile
 def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
     """150 of the campaign's kind, in children of limited memory and time; enough of them get as far
     as onnxruntime."""
@@ -273,6 +274,7 @@ def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a sample of the campaign hostile
 def test_fuzzed_enrolments_are_refused_or_answer(
     owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
 ):

@@ -551,6 +551,7 @@ def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # hundreds of altered bundles
 def test_no_altered_bundle_is_accepted(tmp_path: Path):
     """A sample of `python -m tests.campaigns flips`: bits of each file, files swapped with another signed bundle's, cut,
     unsigned, older; the same of a bundle with an enrolled label."""

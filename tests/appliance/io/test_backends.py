@@ -703,6 +703,7 @@ def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # the whole contract again, in real time
 def test_over_umockdev():
     """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its
     own."""

@@ -52,6 +52,7 @@ def on_a_terminal(out_too: bool) -> tuple[str, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # trains on a terminal
 def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
     """How much is done, the line as it was written, what is printed above; at the end the cursor is
     back."""

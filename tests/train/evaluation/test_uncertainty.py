@@ -288,6 +288,7 @@ def sweeps(materials: int = 3) -> Dataset:
     return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
 
 
+@pytest.mark.thorough  # a whole study
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):
     """The whole way with a few iterations: results, pictures and page are there; a second run
     trains nothing."""

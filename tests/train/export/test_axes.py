@@ -23,7 +23,13 @@ from train.export import bundle_score
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [(), ("--size", "10k", "--steps", "60")], ids=["chosen", "stages"])
+@pytest.mark.parametrize(
+    "size",
+    [
+        pytest.param((), id="chosen", marks=pytest.mark.thorough),
+        pytest.param(("--size", "10k", "--steps", "60"), id="stages"),
+    ],
+)
 def test_from_a_set_to_the_answers_of_the_box(
     rigged: Callable[..., Rigged],
     size: tuple[str, ...],

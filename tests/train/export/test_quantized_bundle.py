@@ -460,6 +460,7 @@ def test_the_default_bundle_is_what_the_box_needs():
     assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
 
 
+@pytest.mark.thorough  # exports every reference
 @pytest.mark.filterwarnings("error")
 def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give

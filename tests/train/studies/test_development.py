@@ -193,6 +193,7 @@ def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole study
 def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
     """Each case with all sweeps, one also with fewer; again from the cache alone; a method that
     cannot take a case is named."""

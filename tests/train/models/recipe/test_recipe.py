@@ -91,6 +91,7 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits twice
 def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
     """The fit keeps and reports --mains. Its spectrum then responds to 60 Hz as little as that of
     the usual fit to 50 Hz, and the usual fit responds to 60 Hz."""
@@ -142,6 +143,8 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
         Fit.load(tmp_path / "fit.npz")
 
 
+@pytest.mark.slow
+@pytest.mark.thorough  # fits twice; test_stages has a quick form
 def test_the_same_seed_gives_the_same_fit(fitted: Fit):
     """Another seed gives other filters. If no stages can follow, the choice is the second part of
     two."""
@@ -186,6 +189,7 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits for seconds
 @pytest.mark.parametrize("better", [True, False])
 def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     monkeypatch: pytest.MonkeyPatch, better: bool
@@ -215,6 +219,7 @@ def uncalibrated(given: object) -> NoReturn:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # fits three times
 def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """After an interruption of its training, the command continues after the last kept step and
     gives the bits of an uninterrupted fit. Another seed begins anew, and nothing is left in the
@@ -269,6 +274,8 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not np.array_equal(other.weights["convs.0.weight"], whole.weights["convs.0.weight"])
 
 
+@pytest.mark.slow
+@pytest.mark.thorough  # fits in a process of its own
 def test_filters_need_no_pytorch(tmp_path: Path):
     """A process that cannot import PyTorch fits and exports; the command prints its choice."""
     easy().save(tmp_path / "easy.npz")
