@@ -1,7 +1,7 @@
-"""Backends: the devices, real or not, below the drivers of the box. PALPATE_BACKEND names one.
+"""Backends: the layer below the drivers of the box. PALPATE_BACKEND selects one by name.
 
-tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink; it
-runs over any of them.
+tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink. It
+runs over every backend.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ ALL = frozenset(
         "pull",
     )
 )
-"""All that a backend may be able to do; `Backend` explains each."""
+"""All capabilities of backends. `Backend` explains each."""
 
 
 class BackendMissing(Exception):
-    """A tool of a backend is not installed; the message says how to get it."""
+    """A requirement of a backend is not installed. The message says how to install it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """A skin as it is plugged in: serial number, protocol version, and the format of its sweeps."""
+    """A skin when it is plugged in: serial number, protocol version and sweep format."""
 
     serial: str = "SIM0001"
     protocol: int = packets.VERSION
@@ -65,17 +65,27 @@ class Skin:
 
 
 class Backend(Protocol):
-    """The devices below the drivers, and the controls that a test has over them.
+    """The layer below the drivers: the drivers' inputs, and the controls that a test has over them.
 
-    can: "skin": one is there. "numbered": its raw counts are known (`skins.counts`). "plug": it is
-    unplugged, plugged in and swapped. "unbind": its driver is taken away. "garble", "silence",
-    "hold" (another program has it), "deny" (this user may not open it). "lines": inputs are driven,
-    outputs seen. "overrun": a storm brings each edge to the kernel. "serial": the far end sends and
-    receives. "stall": bytes that it does not read block the line. "pull": the port goes and comes
-    back.
+    `can` is a set of capabilities:
 
-    slack_s: how much later than asked this machine may be before a wait counts as endless. pulse_s:
-    how long a level is held so that the kernel sees it for certain. Controls act at once.
+        "skin"      a skin is there
+        "numbered"  its raw counts are known (`skins.counts`)
+        "plug"      it can be unplugged, plugged in and swapped
+        "unbind"    its kernel driver can be removed
+        "garble"    its transfers can be damaged
+        "silence"   it can stop sending
+        "hold"      another program can claim it
+        "deny"      this user can lose the permission to open it
+        "lines"     a test can drive the inputs and see the outputs
+        "overrun"   the kernel sees each edge of a storm
+        "serial"    the far end sends and receives
+        "stall"     the serial line blocks when the far end does not read
+        "pull"      the serial port can disappear and come back
+
+    slack_s: delay beyond the requested time after which a wait on this machine counts as endless.
+    pulse_s: shortest time to hold a level so that the kernel certainly sees it. Controls act at
+    once.
     """
 
     name: str
@@ -92,20 +102,17 @@ class Backend(Protocol):
     serial: SerialConfig
 
     def reset(self) -> None:
-        """A plain `Skin()` in its socket, inputs low, nothing on the serial line; nothing is in the
-        way."""
+        """Plug in a default `Skin()`, set inputs low, empty the serial line, clear all faults."""
         ...
 
-    def wait(self, seconds: float) -> None:
-        """Let time pass."""
-        ...
+    def wait(self, seconds: float) -> None: ...
 
     def after(self, seconds: float, control: Callable[[], None]) -> None:
-        """Do `control` so much later, while the box works."""
+        """Call `control` after this many seconds, while the box goes on."""
         ...
 
     def plug(self, what: Skin) -> None:
-        """Plug a skin in; unplug the previous skin."""
+        """Plug a skin in, after unplugging the previous skin."""
         ...
 
     def unplug(self) -> None:
@@ -113,11 +120,11 @@ class Backend(Protocol):
         ...
 
     def unbind(self, on: bool) -> None:
-        """Unbind the driver from the skin, or bind it again, without an event of plugging in."""
+        """Remove the skin's kernel driver, or restore it, without an event for the box."""
         ...
 
     def garble(self, on: bool) -> None:
-        """Let every fifth transfer come as zeros."""
+        """Replace every fifth transfer by zeros."""
         ...
 
     def silence(self) -> None:
@@ -125,45 +132,44 @@ class Backend(Protocol):
         ...
 
     def hold(self, on: bool) -> None:
-        """Another program claims the skin, or lets it go."""
+        """Let another program claim the skin, or release it."""
         ...
 
     def deny(self, on: bool) -> None:
-        """Take the permission to open the skin from this process, or give it back."""
+        """Withdraw this process's permission to open the skin, or restore it."""
         ...
 
-    def drive(self, line: str, level: bool) -> None:
-        """Set an input of the box."""
-        ...
+    def drive(self, line: str, level: bool) -> None: ...
 
     def storm(self, line: str, edges: int) -> None:
-        """Toggle an input so often, as quickly as can be; an even number ends where it began."""
+        """Toggle an input `edges` times, as fast as possible. An even number restores its level."""
         ...
 
     def level(self, line: str) -> bool:
-        """An output of the box, as it is seen outside."""
+        """Level of an output of the box, as seen from outside."""
         ...
 
     def say(self, data: bytes) -> None:
-        """Send from the serial line's far end."""
+        """Send from the far end of the serial line."""
         ...
 
     def hear(self) -> bytes:
-        """Bytes at the far end since the last call."""
+        """Bytes that arrived at the far end since the last call."""
         ...
 
     def pull(self) -> None:
-        """Take the serial port away, as an adapter is pulled out."""
+        """Remove the serial port, as if its USB adapter was pulled out."""
         ...
 
     def put(self) -> None:
-        """Bring the serial port back under its old name."""
+        """Bring the serial port back under the same name."""
         ...
 
 
 def chosen() -> str:
-    """The name in PALPATE_BACKEND; the simulator where it is not set. Raises BackendMissing for an
-    unknown one."""
+    """The name in PALPATE_BACKEND, by default the simulator. Raises BackendMissing if it is
+    unknown.
+    """
     name = os.environ.get(VARIABLE) or "simulated"
     if name not in NAMES:
         raise BackendMissing(f"{VARIABLE} = {name!r} is unknown; known are {', '.join(NAMES)}")
@@ -171,7 +177,6 @@ def chosen() -> str:
 
 
 def opened(name: str) -> AbstractContextManager[Backend]:
-    """The backend of that name, to be used in a `with`. Raises BackendMissing where this machine
-    has not got it."""
+    """Open the backend of that name. Raises BackendMissing if this machine does not have it."""
     made: AbstractContextManager[Backend] = import_module(f"{__name__}.{name}").opened()
     return made

@@ -1,7 +1,7 @@
-"""umockdev as a backend: unmodified libusb, pyusb, libgpiod and gpiod over mocked device nodes, in
-real time.
+"""umockdev as a backend: mocked device nodes below the real libusb, pyusb, libgpiod and gpiod.
 
-In: a process under umockdev-wrapper. Out: the skins of `skins`, a GPIO chip, and a pseudo-terminal.
+It needs a process under umockdev-wrapper, and runs in real time. It offers the skins of `skins`, a
+GPIO chip and a pseudo-terminal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ BOARD = "rpi5"
 
 
 class Mocked(real.Real):
-    """The lines are called as on a Raspberry Pi 5."""
+    """The GPIO lines have the names of a Raspberry Pi 5."""
 
     name = "mocked"
     can = backends.ALL
@@ -42,7 +42,6 @@ class Mocked(real.Real):
         self.drive, self.unplug = self._chip.drive, self._socket.unplug
 
     def reset(self) -> None:
-        """See Backend; the same below."""
         self.settle()
         self.deny(False)
         self.plug(Skin())
@@ -52,41 +51,35 @@ class Mocked(real.Real):
         self.put()
 
     def plug(self, what: Skin) -> None:
-        """Another device on the bus."""
         self._socket.plug(skins.board(what, self.clock))
 
     def garble(self, on: bool) -> None:
-        """Mangle the bytes on the cable."""
         assert self._socket.device
         self._socket.device.mangle = skins.garbler() if on else lambda data: data
 
     def silence(self) -> None:
-        """The board stops."""
         assert self._socket.device
         self._socket.device.board.running = False
 
     def unbind(self, on: bool) -> None:
-        """See Socket."""
         self._socket.unbind(on)
 
     def deny(self, on: bool) -> None:
-        """Close the device node."""
         self._bench.close_to_all(self._socket.name, on)
 
     def storm(self, line: str, edges: int) -> None:
-        """One edge after the other."""
         for i in range(edges):
             self.drive(line, i % 2 == 0)
 
     def level(self, line: str) -> bool:
-        """The levels that the chip drives."""
         return self._chip.level(line)
 
 
 @contextmanager
 def opened() -> Iterator[Mocked]:
-    """A mocked machine. Raises BackendMissing where umockdev is not there, or not below this
-    process."""
+    """A mocked machine. Raises BackendMissing if umockdev is not installed or does not wrap this
+    process.
+    """
     with ExitStack() as stack:
         bench = mocks.MockedDevices()
         stack.callback(bench.close)

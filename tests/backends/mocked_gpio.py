@@ -1,9 +1,8 @@
-"""A GPIO chip over umockdev: the kernel's v2 ioctls below unmodified libgpiod. In: levels. Out:
-edge events, levels.
+"""A GPIO chip over umockdev: the kernel's v2 ioctls below an unmodified libgpiod.
 
-Each request's file is a named pipe with an answer to ioctls: libgpiod polls and reads events from
-it, as from the kernel, and a pipe that is full drops its oldest event, as the kernel's queue does
-(at 1360 events, not at 1024).
+The file of each request is a named pipe that answers ioctls. libgpiod polls it and reads events
+from it, as it does with the kernel. A full pipe drops its oldest event, as the kernel's queue does,
+but after 1360 events instead of 1024.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ REQUESTS = 12
 
 @dataclass(slots=True)
 class Held:
-    """One request of lines: offsets in its order, flags and consumer as asked, its file, and its
-    count of edges.
+    """One request of GPIO lines: offsets in the requested order, flags, consumer, file and
+    counters.
 
-    pipe: the same file, opened here.
+    pipe: the same file, opened by the mock.
     """
 
     file: int
@@ -46,7 +45,7 @@ class Held:
 
 
 class Chip:
-    """A chip with these lines, at /dev/gpiochip0."""
+    """A chip with these lines at /dev/gpiochip0."""
 
     def __init__(self, bench: mocks.MockedDevices, names: Sequence[str]) -> None:
         self._levels = dict.fromkeys(names, False)
@@ -54,13 +53,15 @@ class Chip:
         self._held: dict[int, Held] = {}
         testbed = bench.testbed
         testbed.add_from_string(
-            "P: /devices/platform/rig-gpio/gpiochip0\nN: gpiochip0\nE: SUBSYSTEM=gpio\nE: DEVNAME=/dev/gpiochip0\n"
+            "P: /devices/platform/rig-gpio/gpiochip0\nN: gpiochip0\n"
+            "E: SUBSYSTEM=gpio\nE: DEVNAME=/dev/gpiochip0\n"
             "E: MAJOR=254\nE: MINOR=0\nA: dev=254:0\n\n"
         )
         bench.attach("gpiochip0", self._answer)
         for i in range(REQUESTS):
             testbed.add_from_string(
-                f"P: /devices/virtual/rig/lines{i}\nN: lines{i}\nE: SUBSYSTEM=misc\nE: DEVNAME=/dev/lines{i}\n"
+                f"P: /devices/virtual/rig/lines{i}\nN: lines{i}\n"
+                f"E: SUBSYSTEM=misc\nE: DEVNAME=/dev/lines{i}\n"
                 f"E: MAJOR=10\nE: MINOR={i}\n\n"
             )
             os.unlink(bench.node(f"lines{i}"))
@@ -68,12 +69,12 @@ class Chip:
             bench.attach(f"lines{i}", partial(self._of_request, i))
 
     def level(self, name: str) -> bool:
-        """A line, as it is seen outside."""
+        """Level of a GPIO line, as seen from outside."""
         self._look()
         return self._levels[name]
 
     def drive(self, name: str, level: bool) -> None:
-        """Set an input; an event, if that is an edge that was asked for."""
+        """Set an input. If a request watches for this edge, it gets an event."""
         t_ns = time.monotonic_ns()
         if self._levels[name] == level:
             return
@@ -90,7 +91,7 @@ class Chip:
                 )
 
     def _answer(self, number: int, argument: Any, _: int) -> None:
-        """An ioctl of the chip."""
+        """Answer an ioctl of the chip."""
         self._look()
         if number == CHIP_INFO:
             info = struct.pack("<32s32sI", b"gpiochip0", b"palpate-mock", len(self._names))
@@ -103,7 +104,7 @@ class Chip:
             raise OSError(errno.ENOTTY, "unknown")
 
     def _line_info(self, info: Any) -> None:
-        """struct gpio_v2_line_info."""
+        """Fill struct gpio_v2_line_info."""
         (offset,) = struct.unpack_from("<I", bytes(info.retrieve()), 64)
         holder = next((held for held in self._held.values() if offset in held.offsets), None)
         consumer, flags = (holder.consumer, holder.flags | USED) if holder else (b"", 0)
@@ -112,7 +113,7 @@ class Chip:
         )
 
     def _request(self, asked: Any) -> None:
-        """struct gpio_v2_line_request."""
+        """Answer struct gpio_v2_line_request."""
         raw = bytes(asked.retrieve())
         (n,) = struct.unpack_from("<I", raw, 560)
         offsets = struct.unpack_from(f"<{n}I", raw)
@@ -131,7 +132,7 @@ class Chip:
         asked.update(588, struct.pack("<i", file))
 
     def _of_request(self, slot: int, number: int, argument: Any, _: int) -> None:
-        """An ioctl of a request's file: struct gpio_v2_line_values."""
+        """Answer an ioctl of a request's file: struct gpio_v2_line_values."""
         held = self._held[slot]
         values = argument.resolve(0, 16)
         bits, mask = struct.unpack("<QQ", bytes(values.retrieve()))
@@ -150,8 +151,9 @@ class Chip:
                 self._levels[self._names[offset]] = bool(bits >> i & 1) != bool(flags & ACTIVE_LOW)
 
     def _look(self) -> None:
-        """See which requests were closed. Outputs stay as they were driven, as on chips whose
-        driver resets nothing."""
+        """Forget closed requests. Outputs keep their level, as on chips whose driver does not reset
+        them.
+        """
         for slot, held in list(self._held.items()):
             with suppress(OSError):
                 if os.path.sameopenfile(held.file, held.pipe):
@@ -161,7 +163,7 @@ class Chip:
 
 
 def put(pipe: int, event: bytes) -> None:
-    """Write an event; the oldest makes place for it."""
+    """Write an event. If the pipe is full, drop the oldest event first."""
     while True:
         try:
             os.write(pipe, event)

@@ -1,5 +1,4 @@
-"""A USB socket over umockdev: usbfs ioctls and uevents below unmodified libusb. In: a board. Out:
-the behaviour of a bus."""
+"""A USB socket over umockdev: usbfs ioctls and uevents of a simulated board, below real libusb."""
 
 from __future__ import annotations
 
@@ -18,8 +17,8 @@ CLAIM, RELEASE, DRIVER, CAPABILITIES = 0x550F, 0x5510, 0x5508, 0x551A
 PLAIN = {0x5504, 0x5505, 0x5514, 0x5515}
 URB_CONTROL = 2
 PACE_S = 0.0005
-"""libusb asks again and again, since a mocked file is always ready to be asked: pause that long
-before `not yet`."""
+"""Pause before the answer `not yet`. A mocked file is always readable, so libusb polls without end.
+"""
 
 DEVICE = struct.pack(
     "<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, 64, usb.VENDOR_ID, usb.PRODUCT_ID, 0x0100, 1, 2, 3, 1
@@ -50,8 +49,7 @@ H: descriptors={descriptors}
 
 @dataclass(slots=True, eq=False)
 class Urb:
-    """A request on its way: the kernel's struct usbdevfs_urb [56 bytes], and its buffer, and the
-    open file."""
+    """A pending request: the kernel's struct usbdevfs_urb [56 bytes], its buffer and its file."""
 
     head: Any
     buffer: Any
@@ -60,15 +58,14 @@ class Urb:
 
     @property
     def address(self) -> int:
-        """Where it lies in the caller's memory."""
+        """Its address in the caller's memory."""
         return int(self.head.client_addr)
 
 
 class Device:
-    """One device on the bus, from plugging in to pulling out. mangle: changes the bytes of a
-    transfer on the cable.
+    """One device on the bus, from plugging in to pulling out.
 
-    All of it runs in the mocks' thread.
+    mangle: change of the bytes of each transfer by the cable. All methods run in the mocks' thread.
     """
 
     def __init__(self, board: rig.ReadoutBoard) -> None:
@@ -77,10 +74,10 @@ class Device:
         self.gone = False
         self._waiting: list[Urb] = []
         self._done: list[Urb] = []
-        self._claimed = 0  # by which open file
+        self._claimed = 0  # the open file that claimed it
 
     def answer(self, number: int, argument: Any, client: int) -> None:
-        """One ioctl of usbfs."""
+        """Answer one ioctl of usbfs."""
         if number == REAP:
             self._reap(argument, client)
         elif number == DISCARD:
@@ -98,7 +95,7 @@ class Device:
         elif number == CAPABILITIES:
             argument.resolve(0, 4).update(
                 0, bytes(4)
-            )  # the first that libusb asks of a file: nothing is under way
+            )  # libusb's first ioctl on a file: nothing is pending
             self._waiting = [urb for urb in self._waiting if urb.client != client]
             self._done = [urb for urb in self._done if urb.client != client]
         elif number == DRIVER:
@@ -107,7 +104,7 @@ class Device:
             raise OSError(errno.ENOTTY, "unknown")
 
     def unbind(self, on: bool) -> None:
-        """Fail from now on, claimed by nobody, or work again."""
+        """Fail all requests and drop the claim, or work again."""
         self.gone, self._claimed = on, 0
 
     def _submit(self, argument: Any, client: int) -> None:
@@ -161,7 +158,7 @@ class Device:
 
     @staticmethod
     def _of(client: int, urbs: list[Urb]) -> list[Urb]:
-        """The requests of one open file: memory of another must not be touched."""
+        """The requests of one open file. The memory of other files must not be touched."""
         return [urb for urb in urbs if urb.client == client]
 
     def _deliver(self, urb: Urb) -> None:
@@ -180,7 +177,7 @@ class Device:
 
 
 class Socket:
-    """Where skins are plugged in; each gets the next number on the bus, as Linux does it."""
+    """A socket for skins. Each skin gets the next number on the bus, as on Linux."""
 
     def __init__(self, bench: mocks.MockedDevices) -> None:
         self.device: Device | None = None
@@ -188,11 +185,11 @@ class Socket:
 
     @property
     def name(self) -> str:
-        """The device node of the skin that was plugged in last, below /dev."""
+        """Device node below /dev of the last skin that was plugged in."""
         return f"bus/usb/001/{self._number:03}"
 
     def plug(self, board: rig.ReadoutBoard) -> None:
-        """Replace the board; the kernel's event is out when this returns."""
+        """Replace the previous board by this board, and send the kernel's uevent."""
         self.unplug()
         self._number += 1
         device = self.device = Device(board)
@@ -203,7 +200,9 @@ class Socket:
         self._bench.attach(self.name, device.answer)
 
     def unplug(self) -> None:
-        """Pull it out: requests fail from now on, the kernel sends a uevent, and its node goes."""
+        """Pull the board out: pending requests fail, the kernel sends a uevent and the node
+        disappears.
+        """
         if not self.device:
             return
         self.device.gone, self.device = True, None
@@ -212,10 +211,10 @@ class Socket:
         self._bench.testbed.remove_device(where)
 
     def unbind(self, on: bool) -> None:
-        """Let requests fail and the node be away without a uevent, or bring both back.
+        """Fail requests and remove the node without a uevent, or restore both.
 
-        Linux keeps the node and ends its open files with POLLERR, which umockdev cannot; libusb
-        takes either for unplugged.
+        Linux keeps the node and ends its open files with POLLERR. umockdev cannot do that. libusb
+        takes both for an unplugged device.
         """
         assert self.device
         self.device.unbind(on)

@@ -1,8 +1,7 @@
-"""umockdev for backends: devices that open, read and ioctl of this process meet, answered by
-handlers in one thread.
+"""umockdev for backends: mocked devices, whose handlers run in one thread.
 
-In: `umockdev-wrapper` around the process, and Debian's python3-gi. Out: MockedDevices with a
-testbed and its thread.
+They answer open, read and ioctl of this process. It needs `umockdev-wrapper` around the process,
+and Debian's python3-gi.
 """
 
 from __future__ import annotations
@@ -26,23 +25,26 @@ NOBODY = 65534
 
 
 def lacking() -> str:
-    """The missing packages for a process over umockdev; "" if there are none."""
+    """Packages that umockdev needs and that are not installed; "" if nothing is missing."""
     if not shutil.which("umockdev-wrapper"):
         return f"no umockdev here; apt-get install {PACKAGES}"
     try:
         introspection()
     except (ImportError, ValueError) as e:
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        return f"Python {version} cannot load umockdev ({e}); use Debian's Python, apt-get install {PACKAGES}"
+        return (
+            f"Python {version} cannot load umockdev ({e}); "
+            f"use Debian's Python, apt-get install {PACKAGES}"
+        )
     return ""
 
 
 def introspection() -> tuple[Any, Any]:
-    """The modules (UMockdev, GLib). Raises ImportError or ValueError where they are not there."""
+    """The modules (UMockdev, GLib). Raises ImportError or ValueError if they are not installed."""
     if DEBIAN not in sys.path:
-        sys.path.append(
-            DEBIAN
-        )  # PyGObject is in no wheel; behind the environment's own packages it shadows none
+        # PyGObject has no wheel. At the end of the path Debian's packages do not shadow the
+        # environment's.
+        sys.path.append(DEBIAN)
     import gi
 
     gi.require_version("UMockdev", "1.0")
@@ -52,7 +54,7 @@ def introspection() -> tuple[Any, Any]:
 
 
 class MockedDevices:
-    """A testbed, and the thread in which all handlers of its devices run."""
+    """A testbed and the thread that runs all handlers of its devices."""
 
     def __init__(self) -> None:
         if missing := lacking():
@@ -65,8 +67,8 @@ class MockedDevices:
         self._base = umockdev.IoctlBase
         self.testbed = umockdev.Testbed.new()
         self._root = Path(self.testbed.get_root_dir())
-        self._root.chmod(0o755)  # the nodes say who may open them
-        self._handlers: list[Any] = []  # umockdev does not keep them
+        self._root.chmod(0o755)  # the nodes' own modes decide who may open them
+        self._handlers: list[Any] = []  # umockdev does not keep a reference to them
         self._context = self._glib.MainContext.new()
         self._loop = self._glib.MainLoop.new(self._context, False)
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -77,7 +79,7 @@ class MockedDevices:
         self._loop.run()
 
     def do(self, action: Callable[[], None]) -> None:
-        """Let the thread do something, and wait for it."""
+        """Run `action` in the thread and wait for it."""
         done, failed = threading.Event(), list[BaseException]()
 
         def once(*_: object) -> bool:
@@ -94,34 +96,36 @@ class MockedDevices:
             raise failed[0]
 
     def node(self, name: str) -> Path:
-        """Where the device node /dev/NAME really lies."""
+        """Path of the device node /dev/NAME in the testbed."""
         return self._root / "dev" / name
 
     def take_away(self, name: str, on: bool) -> None:
-        """Let /dev/NAME not be there, or be there again; nobody is told. umockdev keeps a socket
-        open for each look at it."""
+        """Hide /dev/NAME, or show it again, without a uevent. umockdev keeps a socket open for each
+        lookup.
+        """
         node, away = self.node(name), self.node(f"{name}.away")
         (node if on else away).rename(away if on else node)
 
     def close_to_all(self, name: str, on: bool) -> None:
-        """Let nobody open /dev/NAME, root neither: this thread is not root where files are
-        opened."""
+        """Forbid everybody to open /dev/NAME, root included: the opening thread is not root."""
         be_to_files = ctypes.CDLL(None).setfsuid
         be_to_files(os.geteuid())
         if (node := self.node(name)).exists():
             node.chmod(0 if on else 0o644)
-            # umockdev asks for its own sake, too, and must not be refused
+            # umockdev itself opens it, too, and must not be refused.
             (self._root / "ioctl").chmod(0o755)
             (self._root / "ioctl" / "dev" / name).chmod(0o777)
         if on:
             be_to_files(os.geteuid() or NOBODY)
 
     def attach(self, name: str, answer: Callable[[int, Any, int], None]) -> None:
-        """Answer the ioctls of /dev/NAME: answer(number, argument, number of the open file);
-        OSError is its errno."""
+        """Answer the ioctls of /dev/NAME with answer(number, argument, number of the open file).
+
+        An OSError of `answer` becomes the ioctl's errno.
+        """
 
         class Handler(self._base):  # type: ignore[misc,name-defined]
-            """umockdev's way of asking."""
+            """umockdev's interface for handlers of ioctls."""
 
             def do_handle_ioctl(self, client: Any) -> bool:
                 try:
@@ -139,6 +143,5 @@ class MockedDevices:
         self.do(lambda: self.testbed.attach_ioctl(f"/dev/{name}", handler))
 
     def close(self) -> None:
-        """End the thread."""
         self._loop.quit()
         self._thread.join(ANSWER_S)

@@ -1,5 +1,4 @@
-"""Common parts of backends in real time: the machine's clock and libraries, and a rival program
-that holds the skin."""
+"""The shared part of backends in real time: the machine's clock and libraries."""
 
 from __future__ import annotations
 
@@ -21,8 +20,8 @@ class Real:
     """libusb and libgpiod of this machine, and its monotonic clock."""
 
     gpio = gpiod
-    backend = None  # pyusb takes libusb
-    slack_s = 2.0  # a shared machine may stop for a second
+    backend = None  # None: pyusb picks libusb
+    slack_s = 2.0  # a shared machine may stall for a second
     pulse_s = 0.02
     sensor: SkinConfig
     format: SweepFormat = skin.FORMAT
@@ -34,7 +33,7 @@ class Real:
         stack.callback(self.settle)
 
     def settle(self) -> None:
-        """Nothing is planned, and no other program has the skin."""
+        """Cancel all planned controls and release the skin that another program claimed."""
         for timer in self._later:
             timer.cancel()
             timer.join()
@@ -42,16 +41,15 @@ class Real:
         self.hold(False)
 
     def wait(self, seconds: float) -> None:
-        """Sleep."""
         self.clock.sleep_until(self.clock.now_ns() + round(seconds * 1e9))
 
     def after(self, seconds: float, control: Callable[[], None]) -> None:
-        """In a thread of its own."""
+        """Run it in a thread of its own."""
         self._later.append(threading.Timer(seconds, control))
         self._later[-1].start()
 
     def hold(self, on: bool) -> None:
-        """Claim the skin through a file of its own, as another program would."""
+        """Claim the skin through a separate file, as another program would."""
         if self._rival:
             usb.util.dispose_resources(self._rival)
             self._rival = None

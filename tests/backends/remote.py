@@ -1,9 +1,8 @@
-"""The virtual box as a backend: the drivers run in the guest, over its kernel; the devices outside
-are controlled by requests.
+"""The virtual box as a backend: the drivers run in the guest, the devices are outside.
 
-In: the guest's own settings, and JSON lines over a character device: one request, one reply.
-Outside, `serve` answers them with an object that has the controls of a Backend that are in
-CONTROLS; `able` returns its abilities, as in `can`, and `reset` leaves the cable alone.
+Requests over a character device control the devices: JSON lines, one request, one reply. Outside,
+`serve` answers them with an object that has the controls in CONTROLS. `able` returns its
+capabilities, as in `can`. `reset` does not touch the cable.
 """
 
 from __future__ import annotations
@@ -42,13 +41,14 @@ ANSWER_S = 60
 
 
 def serve(stream: IO[bytes], bench: Any) -> None:
-    """Carry out the requests of `stream`, until it ends. bench: the object that carries them out;
-    its errors are sent back as text."""
+    """Carry out the requests of `stream` on `bench` until it ends. Errors go back as text."""
     for line in stream:
         asked = json.loads(line)
         try:
             if asked["do"] not in CONTROLS:
-                raise ValueError(f"{asked['do']!r} is no control; known are {', '.join(CONTROLS)}")
+                raise ValueError(
+                    f"{asked['do']!r} is not a control; known are {', '.join(CONTROLS)}"
+                )
             reply = {"did": _pack(getattr(bench, asked["do"])(*map(_unpack, asked["with"])))}
         except Exception as e:
             reply = {"failed": f"{type(e).__name__}: {e}"}
@@ -57,28 +57,30 @@ def serve(stream: IO[bytes], bench: Any) -> None:
 
 
 def _pack(value: Any) -> Any:
-    """Bytes and skins as JSON has them."""
+    """A value with bytes and skins in JSON types."""
     if isinstance(value, bytes):
         return {"bytes": value.hex()}
     return {"skin": asdict(value)} if isinstance(value, Skin) else value
 
 
 def _unpack(value: Any) -> Any:
-    """The reverse."""
+    """The inverse of `_pack`."""
     if isinstance(value, dict) and "bytes" in value:
         return bytes.fromhex(value["bytes"])
     return Skin(**value["skin"]) if isinstance(value, dict) else value
 
 
 class Asker:
-    """The guest's end of the wire. Raises TimeoutError where nobody answers, AssertionError where
-    it went wrong."""
+    """The guest's end of the connection.
+
+    Raises TimeoutError without an answer, AssertionError if the control failed outside.
+    """
 
     def __init__(self, file: int) -> None:
         self._file, self._one, self._rest = file, threading.Lock(), b""
 
     def ask(self, control: str, *given: Any) -> Any:
-        """Have a control done outside; what it returned."""
+        """Have a control carried out outside; returns its result."""
         request = (
             json.dumps({"do": control, "with": [_pack(value) for value in given]}).encode() + b"\n"
         )
@@ -88,7 +90,8 @@ class Asker:
             while b"\n" not in self._rest:
                 if not select.select([self._file], [], [], ANSWER_S)[0]:
                     raise TimeoutError(
-                        f"nobody outside has done {control} within {ANSWER_S} s; is `serve` running?"
+                        f"no answer to {control} from outside within {ANSWER_S} s; "
+                        "is `serve` running?"
                     )
                 self._rest += os.read(self._file, 65536)
             line, _, self._rest = self._rest.partition(b"\n")
@@ -98,8 +101,7 @@ class Asker:
 
 
 class Remote(real.Real):
-    """The guest's kernel. An emulated processor may take its time, and looks at a line long after
-    its interrupt."""
+    """The guest's kernel. An emulated processor reads a line long after its interrupt."""
 
     name = "remote"
     slack_s = 20.0
@@ -114,19 +116,18 @@ class Remote(real.Real):
         self.can = frozenset(self._ask("able")) | {"hold"}
 
     def reset(self) -> None:
-        """See Backend; the same below."""
         self.settle()
         self._ask("reset")
         self.plug(Skin())
 
     def plug(self, what: Skin) -> None:
-        """Asked for, and found by the guest's kernel and udev."""
+        """Plug in outside, and wait until the guest's kernel and udev have found the skin."""
         self.unplug()
         self._ask("plug", what)
         self._until_there(True)
 
     def unplug(self) -> None:
-        """Asked for, and noticed."""
+        """Unplug outside, and wait until the guest has noticed it."""
         self._ask("unplug")
         self._until_there(False)
 
@@ -138,50 +139,42 @@ class Remote(real.Real):
             self.wait(0.01)
 
     def garble(self, on: bool) -> None:
-        """Asked for."""
         self._ask("garble", on)
 
     def silence(self) -> None:
-        """Asked for."""
         self._ask("silence")
 
     def drive(self, line: str, level: bool) -> None:
-        """Asked for."""
         self._ask("drive", line, level)
 
     def storm(self, line: str, edges: int) -> None:
-        """Asked for."""
         self._ask("storm", line, edges)
 
     def level(self, line: str) -> bool:
-        """Asked for."""
         return bool(self._ask("level", line))
 
     def say(self, data: bytes) -> None:
-        """Asked for."""
         self._ask("say", data)
 
     def hear(self) -> bytes:
-        """Asked for."""
         return bytes(self._ask("hear"))
 
     def pull(self) -> None:
-        """Asked for."""
         self._ask("pull")
 
     def put(self) -> None:
-        """Asked for."""
         self._ask("put")
 
 
 @contextmanager
 def opened() -> Iterator[Remote]:
-    """The machine that this runs in. Raises BackendMissing where it has no bench outside."""
+    """The machine of this process. Raises BackendMissing if it has no bench outside."""
     try:
         file = os.open(PORT, os.O_RDWR)
     except OSError as e:
         raise BackendMissing(
-            f"no bench at {PORT} ({e.strerror}); this runs in the virtual box: python -m tests.campaigns test-rig"
+            f"no bench at {PORT} ({e.strerror}); "
+            "this runs in the virtual box: python -m tests.campaigns test-rig"
         ) from e
     with ExitStack() as stack:
         stack.callback(os.close, file)

@@ -1,5 +1,7 @@
-"""The simulator as a backend: appliance.sim below the drivers, a pseudo-terminal, and a clock that
-skips all waits."""
+"""The simulator as a backend: appliance.sim below the drivers, a clock that skips all waits.
+
+Its serial line is a pseudo-terminal.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from tests.factories.paths import NO_SITE
 
 
 class Simulated:
-    """All that there is can be done to it, and it is done at once."""
+    """It has all capabilities, and its controls act at once."""
 
     name = "simulated"
     can = backends.ALL
@@ -40,7 +42,6 @@ class Simulated:
         )
 
     def reset(self) -> None:
-        """See Backend; the same below."""
         self.backend.errors.clear()
         self.garble(False)
         self.plug(Skin())
@@ -50,61 +51,54 @@ class Simulated:
         self.put()
 
     def wait(self, seconds: float) -> None:
-        """Skip."""
         self.clock.sleep_until(self.clock.now_ns() + round(seconds * 1e9))
 
     def after(self, seconds: float, control: Callable[[], None]) -> None:
-        """The bus looks at the agenda whenever it is asked for anything."""
+        """Plan it: the bus looks at the agenda at each request."""
         self.backend.at(self.clock.now_ns() + round(seconds * 1e9), control)
 
     def plug(self, what: Skin) -> None:
-        """Another board on the bus."""
         self.backend.board = skins.board(what, self.clock)
 
     def unplug(self) -> None:
-        """The board loses its power."""
         self.backend.unplug()
 
     def garble(self, on: bool) -> None:
-        """Mangle the bytes on the cable."""
         self.backend.mangle = skins.garbler() if on else lambda data: data
 
     def silence(self) -> None:
-        """The board stops."""
         self.backend.board.running = False
 
     def unbind(self, on: bool) -> None:
-        """All fails, as if it had gone."""
+        """Fail all requests, as if the skin was unplugged."""
         self.backend.errors = dict.fromkeys(("open", "read", "control"), errno.ENODEV) if on else {}
 
     def hold(self, on: bool) -> None:
-        """Claiming fails."""
+        """Let claiming fail."""
         self._fail("claim", errno.EBUSY, on)
 
     def deny(self, on: bool) -> None:
-        """Opening fails."""
+        """Let opening fail."""
         self._fail("open", errno.EACCES, on)
 
     def _fail(self, call: str, code: int, on: bool) -> None:
         self.backend.errors = {call: code} if on else {}
 
     def drive(self, line: str, level: bool) -> None:
-        """An edge now."""
         self.gpio.drive(line, level, self.clock.now_ns())
 
     def storm(self, line: str, edges: int) -> None:
-        """One edge a microsecond."""
+        """One edge each microsecond."""
         for i in range(edges):
             self.wait(1e-6)
             self.drive(line, i % 2 == 0)
 
     def level(self, line: str) -> bool:
-        """The levels that were written last."""
+        """The level that the box wrote last."""
         return {name: level for _, name, level in self.gpio.written}.get(line, False)
 
 
 @contextmanager
 def opened() -> Iterator[Simulated]:
-    """Simulated devices."""
     with ExitStack() as stack:
         yield Simulated(stack)

@@ -1,5 +1,4 @@
-"""The skins that tests plug in. In: a Skin. Out: a board of the rig that numbers its frames, and
-the raw counts of each frame."""
+"""The skins that tests plug in: boards of the rig that number their frames in the raw counts."""
 
 from __future__ import annotations
 
@@ -18,24 +17,23 @@ from tests.backends import Skin
 from tests.factories.simulated_box import numbered
 
 _PERIOD = 97
-_LENGTH = 30 * _PERIOD  # the script is one act for ever; frame i looks as frame i + 97
+_LENGTH = 30 * _PERIOD  # the script is one endless act; frame i equals frame i + 97
 _FIFO_S = 10
-"""Real boards have 0.25 s to 1 s. So deep a FIFO loses nothing however late a busy machine
-reads."""
+"""Depth of the FIFO. Real boards have 0.25 s to 1 s; this depth loses nothing on a busy machine."""
 
 
 class Nowhere:
-    """Where the edges of a robot go that only slides."""
+    """A sink for the edges of a robot that only slides."""
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Nothing is wired."""
+        """Ignore the edge."""
 
     def forget(self, name: str, t_ns: int) -> None:
-        """Nothing was planned."""
+        """Ignore it: no edge was planned."""
 
 
 def board(what: Skin, clock: Clock) -> rig.ReadoutBoard:
-    """A board that answers as `what` and sends numbered frames of that form."""
+    """A board that identifies itself as `what` and sends numbered frames of its format."""
     format = SweepFormat(
         what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes
     )
@@ -49,11 +47,11 @@ def board(what: Skin, clock: Clock) -> rig.ReadoutBoard:
 
 
 def counts(seq: NDArray[np.int64], format: SweepFormat) -> NDArray[Any]:
-    """Raw counts that frames of these unwrapped numbers [n] must hold: [n, R, C]."""
+    """Raw counts of the frames with these unwrapped numbers [n]: [n, R, C]."""
     return numbered(_PERIOD, format)[(seq & ((1 << EPOCH_BITS) - 1)) % _PERIOD]
 
 
 def garbler() -> Callable[[bytes], bytes]:
-    """A cable that brings every fifth transfer as zeros."""
+    """A cable that replaces every fifth transfer by zeros."""
     number: Iterator[int] = count(1)
     return lambda data: data if next(number) % 5 else bytes(len(data))

@@ -1,5 +1,4 @@
-"""The serial line of backends without one: a pseudo-terminal under a name that stays. In: bytes.
-Out: bytes."""
+"""The serial line of backends without a serial port: a pseudo-terminal with a stable name."""
 
 from __future__ import annotations
 
@@ -12,12 +11,11 @@ from pathlib import Path
 from appliance.tools import pseudo_terminal
 
 DELIVERY_S = 0.02
-"""The kernel passes on what one end wrote in its own time; under a virtual clock that has to be
-waited for."""
+"""Time in which the kernel delivers bytes. A virtual clock cannot skip this wait."""
 
 
 class PseudoTerminalEnd:
-    """The robot's end. path: the name that the box opens, there while the port is put in."""
+    """The robot's end. path: the name that the box opens; it exists while the port is there."""
 
     def __init__(self, stack: ExitStack) -> None:
         self.path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "ttyPalpate"
@@ -25,14 +23,14 @@ class PseudoTerminalEnd:
         self._far = self._near = -1
 
     def put(self) -> None:
-        """A new port under the old name."""
+        """Add a new port under the old name."""
         self._far, name = self._port.enter_context(pseudo_terminal.pair())
         self._near = os.open(name, os.O_RDWR | os.O_NOCTTY)
         self._port.callback(os.close, self._near)
         self.path.symlink_to(name)
 
     def pull(self) -> None:
-        """The port goes, with the bytes that it held."""
+        """Remove the port and all bytes that it holds."""
         self._port.close()
         self.path.unlink(missing_ok=True)
 
@@ -42,7 +40,7 @@ class PseudoTerminalEnd:
         assert select.select([self._near], [], [], 1)[0], "the pseudo-terminal does not deliver"
 
     def hear(self) -> bytes:
-        """What has come."""
+        """Bytes that have arrived."""
         heard = b""
         while select.select([self._far], [], [], DELIVERY_S)[0]:
             heard += os.read(self._far, 65536)

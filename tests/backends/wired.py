@@ -1,12 +1,11 @@
-"""A real board as a backend, wired to itself: the box's inputs are driven, and its outputs seen, by
-spare pins.
+"""A real board as a backend, wired to itself: spare pins drive its inputs and watch its outputs.
 
-In: a Raspberry Pi with these loops, and a skin on its USB where there is one. Run on it, as root or
-in the groups gpio, dialout and plugdev, with the service stopped: `systemctl stop palpate; make
-test-hw`.
+It needs a Raspberry Pi with the loops below, and a skin on USB for the sensor's tests. Run it on
+that board, as root or in the groups gpio, dialout and plugdev, with the service stopped: `systemctl
+stop palpate; make test-hw`.
 
-Ten loops of 1 kohm each (two outputs that fight cost 3 mA then, no pin), pins of the 40-pin header
-in brackets:
+There are ten loops of 1 kohm each; the resistor limits the current to 3 mA if two outputs fight.
+Pins of the 40-pin header are in brackets:
 
     driver            the box's input             the box's output              watcher
     GPIO18 (12) --1k-- GPIO17 (11) start          GPIO23 (16) ready        --1k-- GPIO8  (24)
@@ -17,11 +16,11 @@ in brackets:
     GPIO14 (8)  TXD0 --1k-- GPIO5 (29) RXD2       GPIO16 (36) class_bits 0 --1k-- GPIO26 (37)
     GPIO15 (10) RXD0 --1k-- GPIO4 (7)  TXD2       GPIO20 (38) class_bits 1 --1k-- GPIO21 (40)
 
-Class bits 2 and 3 are not driven here: their pins (40, 37) watch. SPI must be off, it would hold
-pins 19 to 26. The far end is the header's second serial port: `dtoverlay=uart2-pi5` in
-/boot/firmware/config.txt makes it /dev/ttyAMA2; on a Raspberry Pi 4 it is `dtoverlay=uart3`,
-PALPATE_BOARD=rpi4 and PALPATE_FAR_END=/dev/ttyAMA3. Without it the serial part is skipped, without
-a skin the sensor's part.
+Class bits 2 and 3 are not driven here, because their pins (40, 37) are watchers. SPI must be off,
+because it would hold pins 19 to 26. The far end is the header's second serial port:
+`dtoverlay=uart2-pi5` in /boot/firmware/config.txt makes it /dev/ttyAMA2. On a Raspberry Pi 4 use
+`dtoverlay=uart3`, PALPATE_BOARD=rpi4 and PALPATE_FAR_END=/dev/ttyAMA3. Without the second port the
+serial tests are skipped, without a skin those of the sensor.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ WATCHERS = {
     "GPIO16": "GPIO26",
     "GPIO20": "GPIO21",
 }
-"""Line of the box: the spare line that is wired to it."""
+"""The spare line that is wired to each line of the box."""
 
 
 class Wired(real.Real):
@@ -82,7 +81,6 @@ class Wired(real.Real):
         self.can = frozenset(can)
 
     def reset(self) -> None:
-        """See Backend; the same below."""
         self.settle()
         for line in DRIVERS:
             self.drive(line, False)
@@ -91,30 +89,29 @@ class Wired(real.Real):
             self.hear()
 
     def drive(self, line: str, level: bool) -> None:
-        """By the spare pin."""
+        """Drive it with the spare pin."""
         self._drivers.set_value(DRIVERS[line], Value.ACTIVE if level else Value.INACTIVE)
 
     def storm(self, line: str, edges: int) -> None:
-        """As quickly as Python drives a pin, some ten microseconds from edge to edge."""
+        """Toggle it as fast as Python drives a pin: about ten microseconds from edge to edge."""
         for i in range(edges):
             self.drive(line, i % 2 == 0)
 
     def level(self, line: str) -> bool:
-        """By the spare pin."""
+        """Read it with the spare pin."""
         return self._watchers.get_value(WATCHERS[line]) is Value.ACTIVE
 
     def say(self, data: bytes) -> None:
-        """By the second serial port."""
+        """Send from the second serial port."""
         self._far.write(data)
 
     def hear(self) -> bytes:
-        """By the second serial port."""
+        """Read from the second serial port."""
         return bytes(self._far.read(65536))
 
 
 def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
-    """These spare lines, all on one chip. Raises BackendMissing where no chip has them, or somebody
-    holds them."""
+    """The spare lines, all on one chip. Raises BackendMissing if they are missing or in use."""
     names = tuple(names)
     for path in sorted(map(str, Path("/dev").glob("gpiochip*"))):
         try:
@@ -128,12 +125,13 @@ def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
                     f"{path}: {e.strerror}; join group gpio, stop the service and turn SPI off"
                 ) from e
     raise BackendMissing(
-        f"no gpio chip has {', '.join(names)}; run this on a board wired as tests/backends/wired.py draws"
+        f"no gpio chip has {', '.join(names)}; "
+        "run this on a board wired as tests/backends/wired.py draws"
     )
 
 
 @contextmanager
 def opened() -> Iterator[Wired]:
-    """This board. Raises BackendMissing where it is none, or not wired."""
+    """This board. Raises BackendMissing if it is not a Raspberry Pi or not wired."""
     with ExitStack() as stack:
         yield Wired(stack)

@@ -663,7 +663,7 @@ def test_controls_over_a_wire():
         assert ask("hear") == b"\x00\xff"
         with pytest.raises(AssertionError, match="put failed outside: OSError"):
             ask("put")
-        with pytest.raises(AssertionError, match="'close' is no control"):
+        with pytest.raises(AssertionError, match="'close' is not a control"):
             ask("close")
         here.shutdown(socket.SHUT_RDWR)
         outside.join(10)
