@@ -290,11 +290,11 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
             ]
         )
     materials = [one.sweep.material for one in kept]
-    samples, unloaded, moved = align_tare(
+    samples, unloaded, remark = align_tare(
         np.stack([one.sweep.frames.taxels for one in kept]),
         np.stack([one.unloaded for one in kept]),
     )
-    source += moved
+    source += remark
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
     if np.isfinite(unloaded).any():
@@ -322,7 +322,7 @@ def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
     away = np.abs(levels - np.median(levels, axis=0)).sum(axis=tuple(range(1, levels.ndim)))
     # a level that occurred: the median of two equal halves would be the level of no skin
     usual = levels[away.argmin()]
-    samples, unloaded, moved = samples.copy(), unloaded.copy(), 0
+    samples, unloaded, shifted = samples.copy(), unloaded.copy(), 0
     for i in np.flatnonzero(known):
         level, noise = unloaded[i]
         change = usual - level
@@ -334,12 +334,12 @@ def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:
             change, limits = np.rint(change), np.iinfo(samples.dtype)
             samples[i] = np.clip(samples[i] + change, limits.min, limits.max).astype(samples.dtype)
         unloaded[i, 0] += change
-        moved += 1
+        shifted += 1
     remark = (
-        f" ({moved} of {len(samples)} brought to the unloaded skin of the others: "
+        f" ({shifted} of {len(samples)} brought to the unloaded skin of the others: "
         "it was tared between)"
     )
-    return samples, unloaded, remark if moved else ""
+    return samples, unloaded, remark if shifted else ""
 
 
 def counted(reasons: Counter[str]) -> str:

@@ -250,8 +250,8 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     )
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
     if unloaded is not None:  # each set is consistent, but levels may differ between sets
-        samples, unloaded, moved = readers.align_tare(samples, unloaded)
-        source += moved
+        samples, unloaded, remark = readers.align_tare(samples, unloaded)
+        source += remark
     return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded)
 
 

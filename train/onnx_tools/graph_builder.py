@@ -156,8 +156,8 @@ def zero_sum_taps(taps: Array) -> Array:
     taps = taps - taps.mean(axis=2, keepdims=True)
     rounded = np.rint(taps)
     surplus = rounded.sum(axis=2, keepdims=True)
-    moved = (rounded - taps) * np.sign(surplus)  # how far each tap was rounded towards the surplus
-    rank = np.argsort(np.argsort(-moved, axis=2, kind="stable"), axis=2, kind="stable")
+    shift = (rounded - taps) * np.sign(surplus)  # how far each tap was rounded towards the surplus
+    rank = np.argsort(np.argsort(-shift, axis=2, kind="stable"), axis=2, kind="stable")
     zero_sum: Array = rounded - np.sign(surplus) * (rank < np.abs(surplus))
     return zero_sum
 
@@ -243,21 +243,23 @@ def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
     model.CopyFrom(first)
     graph, suffix = model.graph, second.graph.output[0].name
     # the content of a node or constant -> the names of its outputs in `model`
-    there: dict[bytes, list[str]] = {}
+    known: dict[bytes, list[str]] = {}
     # names in the graph that is being added -> the first name of this value in `model`
-    same: dict[str, str] = {}
+    renamed: dict[str, str] = {}
     taken: set[str] = set()
     for item in (*graph.initializer, *graph.node):
-        names = there.setdefault(_content(item, same), _given(item))
-        same |= zip(_given(item), names, strict=True)
-        taken.update(_given(item))
-    same = {}
+        names = known.setdefault(_content(item, renamed), _outputs_of(item))
+        renamed |= zip(_outputs_of(item), names, strict=True)
+        taken.update(_outputs_of(item))
+    renamed = {}
     for item in (*second.graph.initializer, *second.graph.node):
-        key = _content(item, same)
-        if key not in there:
-            there[key] = [f"{name}.{suffix}" if name in taken else name for name in _given(item)]
-            _append(graph, key, item, there[key])
-        same |= zip(_given(item), there[key], strict=True)
+        key = _content(item, renamed)
+        if key not in known:
+            known[key] = [
+                f"{name}.{suffix}" if name in taken else name for name in _outputs_of(item)
+            ]
+            _append(graph, key, item, known[key])
+        renamed |= zip(_outputs_of(item), known[key], strict=True)
     graph.output.extend(second.graph.output)
     onnx.checker.check_model(model, full_check=True)
     return model
@@ -273,13 +275,13 @@ def slim(model: onnx.ModelProto) -> onnx.ModelProto:
     kept |= {name for node in graph.node if node.op_type in MULTIPLYING for name in node.output}
     fresh = (name for name in (np.base_repr(i, 36).lower() for i in count()) if name not in kept)
     renamed: dict[str, str] = {}
-    there: dict[bytes, onnx.TensorProto] = {}
+    known: dict[bytes, onnx.TensorProto] = {}
     for constant in graph.initializer:
         key = _content(constant, {})
-        if key not in there:
-            there[key] = onnx.TensorProto.FromString(key)
-            there[key].name = next(fresh)
-        renamed[constant.name] = there[key].name
+        if key not in known:
+            known[key] = onnx.TensorProto.FromString(key)
+            known[key].name = next(fresh)
+        renamed[constant.name] = known[key].name
     for node in graph.node:
         renamed |= {name: next(fresh) for name in node.output if name and name not in kept}
         inputs, outputs = (
@@ -291,7 +293,7 @@ def slim(model: onnx.ModelProto) -> onnx.ModelProto:
         node.ClearField("name")
     for field in ("initializer", "value_info"):
         graph.ClearField(field)
-    graph.initializer.extend(there.values())
+    graph.initializer.extend(known.values())
     onnx.checker.check_model(small, full_check=True)
     return small
 
@@ -312,7 +314,7 @@ def _append(
         graph.initializer.append(new)
 
 
-def _given(item: onnx.NodeProto | onnx.TensorProto) -> list[str]:
+def _outputs_of(item: onnx.NodeProto | onnx.TensorProto) -> list[str]:
     """The names that a node or a constant defines."""
     return list(item.output) if isinstance(item, onnx.NodeProto) else [item.name]
 

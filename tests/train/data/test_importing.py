@@ -39,7 +39,7 @@ def taken(folder: Path, **changes: object) -> Imported:
 def reasons(folder: Path, **changes: object) -> dict[str, str]:
     """Why files were left out, by name."""
     left_out: list[LeftOut] = []
-    with suppress(FormatError):  # where none could be taken
+    with suppress(FormatError):  # if no file could be imported
         import_folder(folder, plan(**changes), lambda line: None, left_out)
     return {one.name: one.why for one in left_out}
 
@@ -54,7 +54,7 @@ def text(path: Path, counts: np.ndarray = COUNTS, delimiter: str = ",", head: st
 
 
 def zipped(path: Path, name: str, data: bytes) -> None:
-    """An archive of one member."""
+    """An archive with one member."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(name, data)
 
@@ -88,7 +88,7 @@ def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
 
 
 def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
-    """MATLAB writes columns first; HDF5 shows them as [taxels, frames]."""
+    """MATLAB stores columns first; HDF5 shows the arrays as [taxels, frames]."""
     for name in ("cork_1", "felt_1"):
         with h5py.File(tmp_path / f"{name}.mat", "w") as file:
             file["frames"] = COUNTS.T
@@ -98,7 +98,7 @@ def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
 
 
 def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
-    """By name, by number from 1 on, by range, by a pattern; in the order given."""
+    """By name, by number from 1 on, by range, by a pattern; in the given order."""
     for name in ("cork_1", "felt_1"):
         write(tmp_path / f"{name}.csv", COUNTS, 100.0)
     whole = COUNTS[15:25].reshape(10, 2, 2)
@@ -128,8 +128,8 @@ def test_windows_are_cut_as_asked(tmp_path: Path):
 
 
 def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
-    """Times rounded to milliseconds at 300 Hz: the counts are as recorded, the rate is that of the
-    set."""
+    """Times rounded to milliseconds at 300 Hz: the counts stay as recorded, and the set has the
+    right rate."""
     for name in ("cork_1", "felt_1"):
         write(tmp_path / f"{name}.csv", COUNTS, 300.0, np.round(1000 * np.arange(40) / 300))
     made = taken(tmp_path, time="time:ms", rate_hz=None)
@@ -139,9 +139,9 @@ def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
 
 
 def test_times_that_wander_are_interpolated(tmp_path: Path):
-    """A ramp sampled at wandering times is a ramp again, in whole counts, and the report says
+    """A ramp sampled at irregular times becomes a ramp again, in whole counts, and the report says
     so."""
-    late = 25 * np.sin(np.arange(400) / 20)  # ms, of periods of 10 ms
+    late = 25 * np.sin(np.arange(400) / 20)  # ms, for periods of 10 ms
     times = 10 * np.arange(400) + late
     ramp = np.repeat(np.rint(times)[:, None] + 100, 4, axis=1)
     for name in ("cork_1", "felt_1"):
@@ -154,7 +154,7 @@ def test_times_that_wander_are_interpolated(tmp_path: Path):
 
 
 def test_no_window_goes_over_a_gap(tmp_path: Path):
-    """Half a second without frames: windows lie before and after it, none across."""
+    """Half a second without frames: windows lie before and after the gap, none across it."""
     times = 10.0 * np.arange(40)
     times[25:] += 500
     for name in ("cork_1", "felt_1"):
@@ -184,7 +184,8 @@ def test_no_window_goes_over_a_gap(tmp_path: Path):
 def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
     tmp_path: Path, dtype: str, recorded: type, expected: str
 ):
-    """Types of the box stay; others become the first that holds every count; --dtype decides."""
+    """Types that the box knows stay; others become the first type that holds every count; --dtype
+    overrides."""
     for name in ("cork_1", "felt_1"):
         np.save(tmp_path / f"{name}.npy", COUNTS.astype(recorded))
     assert taken(tmp_path, dtype=dtype).sweeps.samples.dtype == expected

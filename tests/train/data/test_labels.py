@@ -1,4 +1,5 @@
-"""Names of materials: all that the box cannot send are listed at once; others can be given."""
+"""Names of materials: all names that the box cannot send are listed at once, and can be
+replaced."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from train.data import labels, summary
 
 
 def test_all_names_that_cannot_be_sent_are_listed():
-    """Each with its length and the remedy; good ones are not."""
+    """Each with its length and the remedy; valid names are not listed."""
     s = replace(easy(4), materials=("x" * 25, "good one", ""))
     with pytest.raises(
         FormatError,
@@ -27,7 +28,7 @@ def test_all_names_that_cannot_be_sent_are_listed():
 
 
 def test_materials_that_get_one_name_become_one():
-    """Labels follow; the order of the others stays; a set without the name is not changed."""
+    """Labels follow; the order of the others stays; a set without the name is unchanged."""
     s = easy(2)
     joined = labels.renamed(s, {"high": "low", "other": "x"})
     assert (joined.materials, joined.labels.tolist()) == (("low", "middle"), [0, 0, 1, 1, 0, 0])

@@ -34,8 +34,8 @@ def test_progress_shows_how_much_is_left():
 
 
 def test_a_task_that_begins_is_not_done():
-    """It counts as done when the next task begins; before the first is done there is no
-    estimate."""
+    """It counts as done when the next task begins; an estimate needs a finished
+    task."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(3, lines.append, clock)

@@ -18,8 +18,8 @@ from train.data.splitters import Protocol
 @pytest.mark.slow
 @pytest.mark.parametrize("name", published.SETS)
 def test_a_set_has_the_published_split_and_what_the_list_says(name: str):
-    """Counts of sweeps, classes, frames and channels; each sweep a recording of its own; the
-    training part is split 0."""
+    """Numbers of sweeps, classes, frames and channels; each sweep is a recording; the training part
+    is split 0."""
     pytest.importorskip("aeon")
     s = sets.load(f"aeon:{name}")
     first, second, classes, frames = map(
@@ -40,7 +40,7 @@ def test_a_set_has_the_published_split_and_what_the_list_says(name: str):
 
 @pytest.mark.slow
 def test_the_series_are_aeons():
-    """Frame by frame and channel by channel, with the class of each."""
+    """Equal frame by frame and channel by channel, with the class of each series."""
     datasets = pytest.importorskip("aeon.datasets")
     series, classes = datasets.load_classification("BasicMotions", split="test")
     s = sets.load("aeon:BasicMotions")
@@ -50,7 +50,7 @@ def test_the_series_are_aeons():
 
 
 def test_an_unknown_name_is_told_those_that_exist():
-    """Before aeon is looked for."""
+    """The error comes before aeon is imported."""
     with pytest.raises(
         FormatError,
         match=r"set 'aeon:GunPiont' is unknown; use aeon:NAME, NAME one of ACSF1, ArrowHead",
@@ -59,7 +59,7 @@ def test_an_unknown_name_is_told_those_that_exist():
 
 
 def test_without_aeon_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
-    """As for MiniRocket."""
+    """The same extra as for MiniRocket."""
     monkeypatch.setitem(sys.modules, "aeon.datasets", None)
     with pytest.raises(
         FormatError, match=r"'aeon:GunPoint' needs aeon .*pip install 'palpate-train\[minirocket\]'"
@@ -68,7 +68,7 @@ def test_without_aeon_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """A version of aeon that lacks the set ends with a message, and its loader is not asked."""
+    """If aeon's version lacks the set, there is a message, and its loader is not called."""
     datasets = pytest.importorskip("aeon.datasets")
     monkeypatch.setattr(datasets, "__file__", str(tmp_path / "__init__.py"))
     monkeypatch.setattr(

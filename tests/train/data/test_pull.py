@@ -1,5 +1,5 @@
 """Fetching recordings: only new ones, whole pairs whenever a connection breaks, nothing
-overwritten, no other file accepted.
+overwritten, and nothing else accepted.
 
 The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and
 tar. One test uses a real sshd if openssh-server is installed.
@@ -55,14 +55,14 @@ class Ground:
         (self.bin / name).chmod(0o755)
 
     def pull(self, *more: str) -> None:
-        """The command's exit code and output."""
+        """Run the command."""
         args = parser("pull").parse_args(
             ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
         )
         args.run(args)
 
     def fetch(self) -> PullReport:
-        """The same as a call, without the command."""
+        """Call the function behind the command."""
         tally = PullReport()
         pull.pull(RecordingHost("user@box", str(self.box)), self.here, tally, lambda line: None)
         return tally
@@ -112,8 +112,8 @@ def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.Captur
 
 
 def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
-    """Spaces, quotes, dollars, a dash in front, more dots, letters of other languages, and long
-    ones."""
+    """Spaces, quotes, dollars, a leading dash, several dots, letters of other languages, and long
+    names."""
     for name in (
         "a b",
         "it's $HOME",
@@ -153,7 +153,7 @@ def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
 
 
 def test_an_interrupted_call_goes_on(ground: Ground):
-    """Control-C after two recordings: these stay, the next call fetches two."""
+    """Ctrl-C after two recordings: these stay, and the next call fetches the other two."""
     tally = PullReport()
 
     def stop(line: str) -> None:
@@ -182,8 +182,8 @@ def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
 
 
 def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Without its sidecar, or the sidecar of a sweep in progress: reported and not fetched; the
-    others are."""
+    """A missing sidecar, or the sidecar of a sweep in progress: reported and not fetched; the
+    others are fetched."""
     (ground.box / "run 0" / "sweep-000000.json").unlink()
     (ground.box / "run 1" / "sweep-000003.npy").unlink()
     (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
@@ -202,8 +202,7 @@ def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFi
 def test_another_sweep_of_the_same_name_is_never_written_over(
     ground: Ground, capsys: pytest.CaptureFixture[str]
 ):
-    """A box that counts from the start again: both sweeps stay where they are, and the call
-    fails."""
+    """A box that counts from 1 again: both sweeps stay where they are, and the call fails."""
     ground.fetch()
     before = files(ground.here)
     record(ground.box / "run 0" / "sweep-000000.npy", "b", id=77)
@@ -310,7 +309,7 @@ def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
 
 
 def test_a_member_beyond_all_size_is_refused(ground: Ground):
-    """Before its bytes are read: the header alone is sent."""
+    """Refused before its bytes are read: the archive holds only its header."""
     info = tarfile.TarInfo("run 0/sweep-000000.json")
     info.size = 1 << 40
     (ground.bin / "archive").write_bytes(info.tobuf())
@@ -350,7 +349,7 @@ def test_a_shell_that_talks_is_named(ground: Ground):
 
 
 def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
-    """Only where it cannot be read without; what sudo is asked for is the same script."""
+    """Only if it cannot be read without sudo; sudo runs the same script."""
     ground.program("sudo", f'#!/bin/sh\ntouch "{ground.bin}/asked"\nshift\nexec "$@"\n')
     ground.fetch()
     assert not (ground.bin / "asked").exists()
@@ -364,7 +363,8 @@ def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
 
 
 def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """Not there, and sudo wants a password: both in one message, after the words of the box."""
+    """It does not exist for this user, and sudo asks for a password: one message, after the box's
+    messages."""
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
     with pytest.raises(
         ApplianceError,
@@ -377,7 +377,7 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
 
 
 def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
-    """The folder does not exist, and sudo may look."""
+    """The folder does not exist, as sudo confirms."""
     ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
     with pytest.raises(
         ApplianceError, match=r"^user@box: there is no /nowhere; record something first"
@@ -388,8 +388,8 @@ def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
 
 
 def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
-    """Tools that fail or are not there, however their connection ends, never look like a box
-    without recordings."""
+    """Failing or missing tools never look like a box without recordings, however the connection
+    ends."""
     ground.ssh("tar", "exit 0")
     with pytest.raises(
         ApplianceError, match="only 0 of 4 recordings came; run the same command again"
@@ -401,7 +401,7 @@ def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
 
 
 def test_an_npy_takes_its_name_last(ground: Ground, monkeypatch: pytest.MonkeyPatch):
-    """As when the box records: none is ever without its sidecar, whenever the power goes."""
+    """As on a recording box: no .npy is ever without its sidecar, whenever the power fails."""
     taken = []
     monkeypatch.setattr(
         pull.storage, "put_all", lambda held: taken.extend(path.suffix for path in held)
@@ -411,8 +411,8 @@ def test_an_npy_takes_its_name_last(ground: Ground, monkeypatch: pytest.MonkeyPa
 
 
 def test_ssh_is_asked_without_questions(ground: Ground):
-    """The user's options go first, so they hold; no password is asked for; a host is never an
-    option."""
+    """The user's options come first, so they take effect; no password is asked for; a host is never
+    read as an option."""
     ground.program("ssh", f'#!/bin/sh\nprintf "%s\\n" "$@" > "{ground.bin}/asked"\nexit 255\n')
     with pytest.raises(ApplianceError, match="no connection"):
         ground.pull("--port", "2222", "--ssh-option", "BatchMode=no")
@@ -435,7 +435,7 @@ def sshd(tmp_path: Path) -> list[str]:
     if not SSHD.exists():
         pytest.skip("no sshd: apt-get install openssh-server")
     if os.getuid() == 0:
-        Path("/run/sshd").mkdir(exist_ok=True)  # its service makes it
+        Path("/run/sshd").mkdir(exist_ok=True)  # normally made by its service
     for name in ("host", "mine"):
         subprocess.run(
             ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name], check=True

@@ -20,7 +20,7 @@ from train.data import readers, sets
 
 
 def hdf5(path: Path, **changes: object) -> str:
-    """A good HDF5 set with some arrays changed, or left out where the change is None."""
+    """A valid HDF5 set with some arrays changed, or left out if the change is None."""
     with h5py.File(path, "w") as file:
         for name, values in (held() | {"materials": ["a", "b", "ç"]} | changes).items():
             if values is not None:
@@ -69,7 +69,7 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.hdf5"])
 def test_every_form_is_read_back(tmp_path: Path, name: str):
-    """What save writes is what load reads; the suffix selects the format."""
+    """load reads a saved file back; the suffix selects the format."""
     whole = sets.load(hdf5(tmp_path / "whole.h5"))
     whole.save(tmp_path / name)
     assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(whole)
@@ -162,7 +162,7 @@ def _ragged(file: h5py.File) -> None:
     ],
 )
 def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Callable, message: str):
-    """HDF5 would show zeros, another file, or nothing that ends."""
+    """HDF5 would show zeros, another file, or a name that refers to itself."""
     path = hdf5(tmp_path / "odd.h5", samples=None)
     with h5py.File(path, "a") as file:
         make(file)
@@ -171,7 +171,7 @@ def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Call
 
 
 def test_what_is_no_hdf5_is_refused(tmp_path: Path):
-    """Cut anywhere, text, nothing, or not there."""
+    """Files cut anywhere, text, an empty file, a missing file."""
     whole = Path(hdf5(tmp_path / "whole.h5")).read_bytes()
     for name, data in {
         "half.h5": whole[: len(whole) // 2],
@@ -188,8 +188,7 @@ def test_what_is_no_hdf5_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("signature", [b"SNOD", b"HEAP", b"TREE", b"GCOL", b"labels"])
 def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
-    """Whatever table of the file is overwritten, the header of an array (at its address) among
-    them."""
+    """Any table of the file is overwritten, such as the header of an array (at its address)."""
     path = tmp_path / "a.h5"
     hdf5(path)
     data = bytearray(path.read_bytes())
@@ -205,8 +204,8 @@ def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
 
 @pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "float64"])
 def test_tactmat_is_read(tmp_path: Path, dtype: str):
-    """Labels from the first axis, repetitions from the second, counts of a byte in whatever type
-    they are stored."""
+    """Labels from the first axis, repetitions from the second; counts of one byte, whatever type
+    they are stored in."""
     samples = tactmat(tmp_path / "t.h5", dtype)
     s = sets.load(str(tmp_path / "t.h5"))
     assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
@@ -225,7 +224,7 @@ def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
 
 
 def test_a_broken_tactmat_is_refused(tmp_path: Path):
-    """Names that do not fit, none, counts beyond a byte, unexpected labels."""
+    """Missing names or a wrong number of names, counts beyond a byte, unexpected labels."""
     for more, message in (
         ({"materials": ["cork", "felt"]}, "are of 3 materials, 2 are named"),
         ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
@@ -278,8 +277,8 @@ def test_recordings_are_a_set(tmp_path: Path):
 
 
 def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
-    """Where all names are whole numbers a group has these, so that --only position=12 selects the
-    position named 12."""
+    """If all names are whole numbers, they are the group's numbers, so --only position=12 selects
+    the position named 12."""
     for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups
@@ -288,7 +287,7 @@ def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
 
 
 def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
-    """Recordings of the box, with device, clock, tare and verdict, beside those of before."""
+    """Recordings with device, clock, tare and verdict, beside older recordings without them."""
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, position="tip")
     before = sets.digest(sets.load(str(tmp_path)))
@@ -331,7 +330,7 @@ def test_the_unloaded_skin_is_kept(tmp_path: Path):
     ],
 )
 def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object):
-    """The file, the shape that is wanted and what to do."""
+    """The message gives the file, the expected shape and the remedy."""
     for i in range(2):
         record(tmp_path / f"{i}.npy", "ab"[i], id=i)
     save(tmp_path / "1.npy", *load(tmp_path / "1.npy"), {"unloaded": known})
@@ -343,8 +342,8 @@ def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object
 
 
 def test_what_the_box_refused_is_left_out(tmp_path: Path):
-    """A skin that did not touch, or was broken, whatever its label; an early answer's part of a
-    window."""
+    """A skin that was not touched, or was broken, whatever the label; a window cut short by an
+    early answer."""
     for i in range(8):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     for i, status in enumerate(readers.REFUSED):
@@ -370,7 +369,7 @@ def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
 
 
 def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
-    """Nothing is known, nothing is grouped but the recording."""
+    """Without names, the recording is the only group."""
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2])
     assert list(sets.load(str(tmp_path)).groups) == ["recording"]
@@ -392,7 +391,7 @@ def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
     ],
 )
 def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, message: str):
-    """The file that lacks something or is of another form."""
+    """The message gives the file that lacks something or has another format."""
     record(tmp_path / "0.npy", "a")
     record(tmp_path / "1.npy", "b")
     record(tmp_path / "2.npy", **more)
@@ -401,8 +400,8 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
 
 
 def test_broken_recordings_are_named(tmp_path: Path):
-    """A table cut in two, a sidecar that is missing or empty, nothing that is ok, nothing at all,
-    one material."""
+    """A truncated table, a missing or empty sidecar, no ok sweep, an empty folder, a single
+    material."""
     with pytest.raises(
         FormatError, match="no sweep of `palpate record` is in it; record some, or name another"
     ):
@@ -430,7 +429,7 @@ def test_broken_recordings_are_named(tmp_path: Path):
 
 
 def test_a_recording_is_never_unpickled(tmp_path: Path):
-    """Objects in an .npy are refused where they stand."""
+    """Object arrays in an .npy are refused before they are loaded."""
     record(tmp_path / "1.npy", "a")
     np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
     before_crc(tmp_path / "1.json")
@@ -440,7 +439,8 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", [".csv", ".CSV", ".txt", ".tsv", ".dat", ".mat", ".npy"])
 def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
-    """A single file, or a folder of them: no set, and the command that makes one."""
+    """A single file of frames, or a folder of them, is not a set; the message gives the command
+    that makes one."""
     np.save(tmp_path / "x.npy", np.zeros((9, 4)))
     path = (tmp_path / "x.npy").rename(tmp_path / f"x{suffix}")
     with pytest.raises(
@@ -456,14 +456,14 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
 
 
 def test_a_folder_of_sets_names_them(tmp_path: Path):
-    """The user meant one of the files in it."""
+    """The message names the sets: the user probably meant one of them."""
     write(tmp_path / "a.npz")
     with pytest.raises(FormatError, match=r"1 \.npz or HDF5 files are: name one of them"):
         sets.load(str(tmp_path))
 
 
 def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The cause, not that nothing is in it."""
+    """The message gives the cause, instead of claiming that the folder is empty."""
 
     def denied(self: Path) -> None:
         raise PermissionError(13, "Permission denied", str(self))
@@ -477,7 +477,7 @@ def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
 def test_a_file_that_may_not_be_read_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ):
-    """The cause, before any library looks into it with words of its own."""
+    """The message gives the cause, before a library fails on the file with its own words."""
     file = Path(write(tmp_path / "a.npz")).rename(tmp_path / name)
 
     def denied(self: Path, mode: str = "r") -> None:
@@ -538,8 +538,8 @@ def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path:
 
 
 def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
-    """And where one half was tared, the other is moved to a skin that there was; counts end where
-    their type does."""
+    """If half of them were tared, the other half is shifted to an existing level; counts are
+    limited to the range of their type."""
     pressed = tared(tmp_path, {"a0": 300.0, "b0": 301.0, "b1": 300.5})
     s = sets.load(str(tmp_path))
     assert s.source == str(tmp_path)

@@ -19,8 +19,8 @@ from train.data import sets
 
 
 def test_a_file_is_read_as_it_is_described(tmp_path: Path):
-    """Format, materials, groups and raw counts come out as they were put in; save writes the same
-    form."""
+    """Format, materials, groups and raw counts are read as they were written; save writes the same
+    arrays."""
     s = sets.load(write(tmp_path / "good.npz"))
     assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
     assert s.materials == ("a", "b", "c")
@@ -33,7 +33,7 @@ def test_a_file_is_read_as_it_is_described(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["s.npz", "s.h5"])
 def test_a_set_with_axes_is_read_as_it_was_written(tmp_path: Path, name: str):
-    """Counts and format, from either kind of file; parts of it keep the axes."""
+    """Counts and format, from both file formats; parts of the set keep the axes."""
     samples = np.arange(6 * 8 * 2 * 3 * 3, dtype=np.int16).reshape(6, 8, 2, 3, 3)
     s = sets.load(write(tmp_path / "good.npz", samples=samples))
     assert str(s.format) == "2x3x3 int16 at 50 Hz, window 8"
@@ -119,7 +119,7 @@ def test_a_broken_file_is_refused_by_name(tmp_path: Path, changes: dict, message
 
 
 def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
-    """Text, a single array, a cut archive and nothing."""
+    """Text, a single array, a truncated archive, an empty file."""
     (tmp_path / "text.npz").write_text("samples")
     (tmp_path / "empty.npz").write_bytes(b"")
     np.save(tmp_path / "array.npy", np.zeros(3))
@@ -132,8 +132,8 @@ def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_simulated_sets_have_their_worlds():
-    """Sizes of the paper's sets, the seed's place, and positions of joined worlds that stay
-    apart."""
+    """Sizes of the paper's sets, the position of the seed in the name, and separate positions of
+    joined scenes."""
     real = sets.load("sim:T-REAL:5-6:1")
     assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
     assert len(np.unique(real.groups["position"])) == 18
@@ -158,7 +158,7 @@ def test_an_unknown_simulated_set_is_refused(spec: str):
 
 
 def test_select_keeps_what_fulfils_every_condition():
-    """All of = <= >=, and materials that are left over go, with the labels numbered anew."""
+    """All of = <= >=; materials that no longer occur are removed, and labels are renumbered."""
     s = easy(8)
     part = s.select(["speed>=1", "speed<=2"])
     assert set(part.groups["speed"]) == {1, 2}
@@ -198,7 +198,7 @@ def test_select_takes_any_of_several_values():
     ],
 )
 def test_select_names_what_is_wrong(condition: str, message: str):
-    """A typing error never passes for an empty filter."""
+    """A typing error is never treated as an empty filter."""
     with pytest.raises(FormatError, match=message):
         easy(8).select([condition])
 
@@ -207,8 +207,8 @@ def test_select_names_what_is_wrong(condition: str, message: str):
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
 def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
-    """No recording is on both sides, nothing is lost or doubled, and both sides have each material
-    near the share."""
+    """No recording is on both sides, no sweep is lost or doubled, and both sides have each material
+    close to the share."""
     s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
     first, second = s.split("recording", share, seed)
     assert not set(first.groups["recording"]) & set(second.groups["recording"])
@@ -220,7 +220,7 @@ def test_split_never_separates_a_recording(pieces: int, share: float, seed: int)
 
 
 def test_split_is_the_seed_s_alone():
-    """The same seed gives the same parts, another seed others."""
+    """The same seed gives the same parts, another seed gives others."""
     s = easy(20)
     parts = [s.split("recording", 0.5, seed)[0].groups["recording"] for seed in (1, 1, 2)]
     np.testing.assert_array_equal(parts[0], parts[1])
@@ -228,7 +228,7 @@ def test_split_is_the_seed_s_alone():
 
 
 def test_split_refuses_what_would_flatter():
-    """Groups that cut recordings, a part without a material, a share that is none."""
+    """Groups that cut recordings, a part without a material, an invalid share."""
     s = easy(8, pieces=2)
     s.groups["half"] = np.arange(len(s)) % 2
     with pytest.raises(FormatError, match="'half' cut recordings in two"):
@@ -244,7 +244,7 @@ def test_split_refuses_what_would_flatter():
 
 
 def test_split_never_trains_without_a_material():
-    """Where one group alone has a material it is in the first part, or the split is refused."""
+    """If only one group has a material, it is in the first part, or the split is refused."""
     s = easy(8).take(np.arange(19))  # 8 low, 8 middle, 3 high
     s.groups["box"] = np.array([0] * 8 + [1] * 4 + [2] * 7)
     outcomes = set()
@@ -260,8 +260,8 @@ def test_split_never_trains_without_a_material():
 
 
 def test_join_keeps_recordings_apart_and_forces_together():
-    """Number 0 of two sets is two recordings, also where one set counts none; a speed of 2 is the
-    same speed."""
+    """Number 0 of two sets becomes two recordings, also if one set has no numbers; a speed of 2
+    stays 2."""
     a, b = easy(4, pieces=2), easy(4, seed=1)
     both = sets.join([a, b])
     assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
@@ -288,11 +288,11 @@ def test_joined_sets_are_told_apart():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
 def test_without_means_leaves_the_texture(dtype: str):
-    """Float32, mean zero, a constant taxel exactly zero, differences in time, labels and groups as
-    they were."""
+    """Float32, mean zero, a constant taxel exactly zero; differences in time, labels and groups are
+    unchanged."""
     s = easy(4, dtype=dtype)
     s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
-    s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of so many 3.3 is not 3.3
+    s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of this many 3.3 is not 3.3
     bare = s.without_means()
     assert bare.samples.dtype == np.float32
     assert np.abs(bare.samples.mean(axis=1, dtype=np.float64)).max() < 1e-6
@@ -305,9 +305,9 @@ def test_without_means_leaves_the_texture(dtype: str):
 
 @pytest.mark.parametrize("name", ["s.npz", "s.h5"])
 def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
-    """Into files of either kind, parts and joined sets, where it is unknown for the sweeps of a set
-    that lacks it; it changes the digest. Counts without their means have none."""
-    known = 0.1 * np.random.default_rng(1).random((12, 2, 2, 2))  # less apart than a load
+    """It is in files of both formats, in parts and in joined sets, where it is unknown for the
+    sweeps of a set without it; it changes the digest. A set without means has none."""
+    known = 0.1 * np.random.default_rng(1).random((12, 2, 2, 2))  # differences smaller than a load
     s = replace(easy(4), unloaded=known)
     s.save(tmp_path / name)
     again = sets.load(str(tmp_path / name))
@@ -324,8 +324,8 @@ def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
 
 
 def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
-    """The same for a file read back, whatever its form; another for each thing that could change a
-    result."""
+    """Equal for a set that was read back from any file; different after each change that could
+    alter a result."""
     s = easy(4)
     for name in ("a.npz", "b.h5"):
         s.save(tmp_path / name)
@@ -359,7 +359,7 @@ def test_a_set_goes_to_another_process():
 
 
 def test_labels_may_be_names(tmp_path: Path):
-    """With materials or without; a name that is not among them is refused."""
+    """With or without materials; a name that is not among them is refused."""
     texts = np.array(["b", "a", "b", "a", "c", "c"])
     bare = sets.load(write(tmp_path / "bare.npz", labels=texts, materials=None))
     assert (bare.materials, bare.labels.tolist()) == (("a", "b", "c"), [1, 0, 1, 0, 2, 2])

@@ -1,4 +1,4 @@
-"""Protocols: who is trained on and who is tested on, and never a recording on both sides."""
+"""Protocols: which sweeps train and which test, and never a recording on both sides."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from train.data.splitters import Protocol, draw
 
 
 def a_set(labels: list[int], **groups: list[int]) -> Dataset:
-    """Sweeps of one frame whose digit is their number."""
+    """Sweeps of one frame whose count is their number."""
     n = len(labels)
     samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
     names = tuple("abcdef"[: max(labels) + 1])
@@ -57,7 +57,7 @@ def test_leave_is_scikit_learns_leave_one_group_out():
 
 
 def test_split_trains_on_a_and_tests_on_b():
-    """Values before the arrow on one side, after it on the other, the rest on none."""
+    """Values before the arrow on one side, after it on the other; the rest on neither."""
     ((train, test),) = Protocol("split:position=2->0").folds(GRID, 1)
     assert set(GRID.groups["position"][train]) == {2}
     assert set(GRID.groups["position"][test]) == {0}
@@ -78,7 +78,7 @@ def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed:
 
 
 def test_random_folds_follow_their_seed():
-    """The same seed, the same folds; another seed, others."""
+    """The same seed gives the same folds, another seed gives others."""
     sweeps = a_set([0, 1] * 20)
     one, same, other = (
         [t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2)
@@ -99,7 +99,7 @@ def test_scikit_learn_takes_them_as_splitters(text: str):
 
 
 def test_a_material_of_one_recording_needs_more():
-    """No number of folds would help; the message does not name one."""
+    """No number of folds would help, so the message does not suggest a number."""
     with pytest.raises(
         FormatError, match=r"^material 'b' has one recording; record two of each or more"
     ):
@@ -120,7 +120,7 @@ def test_a_material_of_one_recording_needs_more():
     ],
 )
 def test_what_cannot_be_split_is_named(text: str, why: str):
-    """Unknown forms, groups and values, and folds that cannot be filled."""
+    """Unknown protocols, groups and values, and folds that cannot be filled."""
     sweeps = a_set(GRID.labels.tolist(), **GRID.groups, one=[7] * 12)
     with pytest.raises(FormatError, match=why):
         Protocol(text).folds(sweeps, 1)
@@ -137,30 +137,30 @@ def test_a_group_that_cuts_recordings_is_refused(text: str):
 
 
 def test_a_recording_of_several_materials_is_refused():
-    """Numbers that start anew for each material would fuse sweeps of all of them."""
+    """If numbers start anew for each material, sweeps of different materials would be fused."""
     sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
     with pytest.raises(FormatError, match="recording 5 holds sweeps of several materials, as 2 do"):
         Protocol("leave:day").folds(sweeps, 1)
 
 
 def test_nothing_left_to_train_on_is_refused():
-    """Where a group is the material, leaving one of two out leaves one."""
+    """If a group is the material, leaving out one of two leaves only one."""
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
     with pytest.raises(FormatError, match="2 sweeps of less than two materials are left"):
         Protocol("leave:session").folds(sweeps, 1)
 
 
 def test_clusters_are_what_was_left_out_or_recordings():
-    """Left-out groups for leave, recordings of several windows else, nothing where each sweep
-    stands alone."""
+    """The left-out groups for leave, else recordings of several windows; None if each sweep is
+    independent."""
     assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
     assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
     assert Protocol("random:3").clusters(a_set([0, 1])) is None
 
 
 def test_a_learning_curve_adds_to_what_was_there():
-    """So many of each material, from the training side alone, the same for the same seed; all where
-    there are fewer."""
+    """At most this many sweeps of each material, from the training side only, equal for equal
+    seeds; all sweeps if there are fewer."""
     labels = np.repeat([0, 1, 2], [20, 8, 3])
     train = np.flatnonzero(np.arange(31) % 5)
     few, more = (draw(train, labels, each, 1) for each in (2, 6))

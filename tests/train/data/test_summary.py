@@ -31,8 +31,8 @@ def command(*words: str) -> None:
 
 
 def test_a_set_is_described():
-    """Sweeps, form, materials with their counts, recordings, groups with their values, long lists
-    shortened."""
+    """Sweeps, format, materials with their counts, recordings, groups with their values; long lists
+    are shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
     first, *more = lines(s)
@@ -73,8 +73,8 @@ def test_what_is_confounded_is_told():
 
 
 def test_positions_and_sessions_are_counted_in_tables():
-    """Materials down, positions across, totals at both ends, a dot for a hole; one of many
-    positions has no table."""
+    """Materials down, positions across, totals at both ends, a dot for none; with many positions
+    there is no table."""
     s = easy(4)
     s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
     assert lines(s)[3:] == [
@@ -137,8 +137,8 @@ def test_recordings_are_described_by_name(tmp_path: Path):
 
 
 def test_recordings_without_a_tare_are_told(tmp_path: Path):
-    """Where some recordings know the unloaded skin and others do not, both are counted; else there
-    is nothing to say."""
+    """If only some recordings know the unloaded skin, both kinds are counted; else nothing is
+    printed."""
     for i in range(5):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     assert "warning" not in summary.describe(str(tmp_path))
@@ -157,8 +157,8 @@ def test_recordings_without_a_tare_are_told(tmp_path: Path):
 
 
 def test_recordings_are_described_while_they_grow(tmp_path: Path):
-    """One material alone, names that are still missing: counted, and the reason why it cannot be
-    trained on is given."""
+    """A single material, missing names: both are counted, with the reason why the set cannot be
+    trained on."""
     record(tmp_path / "0.npy", "a", position="2")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 1: a 1" in text
@@ -183,8 +183,8 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
 
 @pytest.mark.slow
 def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
-    """A taxel that no sweep changes is named by row and column from 1, a material without sweeps by
-    its name; a sound set gives no such line."""
+    """A taxel that never changes is named by row and column from 1, a material without sweeps by
+    its name; a good set has no such line."""
     sound = easy()
     assert summary.warnings_of(sound) == []
     still = sound.samples.copy()
@@ -199,8 +199,8 @@ def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
 
 
 def test_what_is_known_can_be_loaded():
-    """Every simulated set in the list has as many sweeps as it states (the large one: sixty for
-    each of its scenes)."""
+    """Every simulated set in the list has the stated number of sweeps (for the large set: sixty for
+    each scene)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
     assert stated == {
         "sim:T-LAB": "240",
@@ -214,7 +214,8 @@ def test_what_is_known_can_be_loaded():
 
 @pytest.mark.slow
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`sets` lists, `describe` describes several, `view` writes a picture and prints its path."""
+    """`sets` lists sets, `describe` describes several, `view` writes a picture and prints its
+    path."""
     command()
     assert capsys.readouterr().out == summary.known() + "\n"
     one = write(tmp_path / "a.npz")

@@ -1,4 +1,4 @@
-"""Reductions: the sweeps that are left are those that a sensor set so would give, and the
+"""Reductions: the remaining sweeps are those that a sensor with such settings would give, and
 informative taxels stay."""
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from train.data.transforms import WHOLE, Change
 
 
 def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dataset:
-    """Raw counts that name sweep, frame and taxel: 1000 i + 10 t + m."""
+    """Raw counts that identify sweep, frame and taxel: 1000 i + 10 t + m."""
     n, frames, rows, cols = shape
     taxel = np.arange(rows * cols).reshape(rows, cols)
     x = 1000 * np.arange(n)[:, None, None, None] + 10 * np.arange(frames)[:, None, None] + taxel
@@ -25,14 +25,14 @@ def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dat
 
 
 def test_nothing_left_out_is_the_set_itself():
-    """Not even copied."""
+    """It is not even copied."""
     sweeps = counting()
     assert WHOLE.of(sweeps) is sweeps
     assert str(WHOLE) == "all"
 
 
 def test_the_window_is_the_middle():
-    """Of twelve frames the inner six; rate and all else stay."""
+    """The inner six of twelve frames; rate and everything else stay."""
     part = Change(window=0.5).of(counting())
     assert part.samples[0, :, 0, 0].tolist() == [30, 40, 50, 60, 70, 80]
     assert (part.rate_hz, part.format.rows, part.format.cols, part.samples.dtype) == (
@@ -47,7 +47,8 @@ def test_the_window_is_the_middle():
 
 @pytest.mark.parametrize(("kind", "mean"), [("int16", [20, 70]), ("float32", [20, 70])])
 def test_frames_are_averaged(kind: str, mean: list[int]):
-    """Five into one, an incomplete group is left out; the data type stays, the rate is a fifth."""
+    """Five frames become one, an incomplete group is left out; the data type stays, the rate is a
+    fifth."""
     part = Change(rate=5).of(counting(kind=kind))
     assert part.samples[0, :, 0, 0].tolist() == mean
     assert (part.rate_hz, part.samples.dtype.name) == (12, kind)
@@ -57,18 +58,19 @@ def test_frames_are_averaged(kind: str, mean: list[int]):
 
 
 def test_low_bits_are_cut_off():
-    """Of integer counts, negative ones too; a float set is taken as eight bits over its range."""
+    """For integer counts, also negative; a float set counts as eight bits over its range."""
     x = np.array([-5, -1, 0, 3, 4, 127], np.int16).reshape(1, 6, 1, 1).repeat(2, 0)
     cut = Change(bits=2).of(Dataset(x, np.array([0, 1]), ("a", "b"), 1.0))
     assert cut.samples[0].ravel().tolist() == [-8, -4, 0, 0, 4, 124]
     ramp = np.linspace(-1, 1, 4096, dtype=np.float32).reshape(1, -1, 1, 1).repeat(2, 0)
     coarse = Change(bits=4).of(Dataset(ramp, np.array([0, 1]), ("a", "b"), 1.0)).samples
-    assert len(np.unique(coarse)) == 17  # sixteen steps and the very top
+    assert len(np.unique(coarse)) == 17  # sixteen steps and the maximum
     assert np.abs(coarse - ramp).max() <= 2 / 16
 
 
 def test_rows_and_columns_stay_a_grid():
-    """Whole ones left: a smaller grid; else one column, in the order of their numbers."""
+    """If whole rows and columns are left: a smaller grid; otherwise one column, in the order of
+    their numbers."""
     grid = Change(taxels=(5, 3, 0, 2)).of(counting()).samples
     assert grid.shape == (2, 12, 2, 2)
     assert grid[0, 0].tolist() == [[0, 2], [3, 5]]
@@ -78,15 +80,15 @@ def test_rows_and_columns_stay_a_grid():
 
 
 def test_the_unloaded_skin_is_known_of_all_taxels_or_none():
-    """Fewer frames do not change it."""
+    """A change of frames leaves it unchanged."""
     known = replace(counting(), unloaded=np.zeros((2, 2, *counting().format.shape)))
     assert Change(window=0.5, rate=2).of(known).unloaded is known.unloaded
     assert Change(taxels=(5, 3, 0, 2)).of(known).unloaded is None
 
 
 def test_a_taxel_goes_with_all_its_axes():
-    """The grid that is left has the axes that it had; a taxel whose shear alone tells materials
-    apart comes first."""
+    """The remaining grid keeps its axes; a taxel whose shear alone distinguishes materials comes
+    first."""
     flat = counting()
     sheared = replace(flat, samples=np.stack([flat.samples, -flat.samples], axis=-1))
     grid = Change(taxels=(5, 3, 0, 2)).of(sheared)
@@ -103,7 +105,7 @@ def test_a_taxel_goes_with_all_its_axes():
 
 
 def test_changes_add_up():
-    """Each takes something else away."""
+    """Each removes something else."""
     both = Change(window=0.5).and_then(Change(rate=2)).and_then(Change(taxels=(1,)))
     assert both == Change(0.5, 2, (1,))
     assert both.of(counting()).samples[0].ravel().tolist() == [26, 46, 66]
@@ -111,8 +113,8 @@ def test_changes_add_up():
 
 
 def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
-    """White noise of strength 3 on every taxel; `factors_of`: by taxel, how much stronger it is
-    with each material."""
+    """White noise of strength 3 on every taxel; `factors_of`: by taxel, the factor of the strength
+    for each material."""
     kinds = len(next(iter(factors_of.values())))
     labels = np.tile(np.arange(kinds), each)
     rng = np.random.default_rng(5)
@@ -130,8 +132,8 @@ def test_the_informative_taxels_come_first():
 
 
 def test_one_of_two_that_tell_the_same_stays():
-    """Neither is missed when it alone is left out; that must not cost both of them, nor put a
-    weaker one before both."""
+    """Each is dispensable while the other is there; but one of them must stay, before any weaker
+    taxel."""
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]
@@ -142,7 +144,7 @@ def test_one_of_two_that_tell_the_same_stays():
 
 @pytest.mark.parametrize("kind", ["silent", "one taxel", "one frame"])
 def test_any_sweeps_have_an_order(kind: str):
-    """Silent ones, one taxel, one frame: every taxel once."""
+    """Silent sweeps, one taxel, one frame: every taxel occurs once."""
     shape = {"silent": (4, 20, 2, 2), "one taxel": (4, 20, 1, 1), "one frame": (4, 1, 2, 2)}[kind]
     x = (
         np.zeros(shape, np.uint8)

@@ -1,5 +1,5 @@
-"""The features of related work against scipy and formulas written out, and exploration until the
-posterior is sure."""
+"""The features of prior work against scipy and against formulas written out, and exploration until
+the posterior is certain."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RATE = 750.0
 
 
 def noise(frames: int = 300, rows: int = 2, cols: int = 3) -> np.ndarray:
-    """Taxels that share a part of their noise, float32, another mean on each."""
+    """Taxels that share a part of their noise, float32, each with another mean."""
     rng = np.random.default_rng(4)
     x = (
         rng.normal(0, 5, (frames, rows, cols))
@@ -51,8 +51,8 @@ def test_static_features_do_not_know_time():
 
 
 def test_a_spectrogram_is_its_formula():
-    """One part written out: Hann, Fourier sum without DC, mean over a band's six bins, taxels by
-    eq. 4, logarithm."""
+    """One part by formula: Hann window, Fourier sum without DC, mean over a band's six bins, taxels
+    by eq. 4, logarithm."""
     x = noise(1500)
     part = x.reshape(1500, -1).T.astype(float)[:, 300:600]
     n = np.arange(300)
@@ -65,8 +65,8 @@ def test_a_spectrogram_is_its_formula():
 
 
 def test_load_and_place_are_those_of_the_normal_axis():
-    """However large the shear is; it only adds its own means and deviations, and power by its
-    taxel's load."""
+    """Shear of any size only adds its own means and deviations, and power weighted by its taxel's
+    load."""
     x = noise()
     shear = np.random.default_rng(8).normal(-300, 9, (*x.shape, 2)).astype(np.float32)
     three = np.concatenate([shear, x[..., None]], axis=-1)
@@ -119,8 +119,8 @@ def test_correlations_are_those_of_scipy(frames: int):
 
 
 def test_a_still_taxel_takes_no_part_in_correlations():
-    """A dead taxel leaves the four numbers as they are, however large its digit; a single one that
-    moves has none."""
+    """A dead taxel leaves the four numbers unchanged, however large its count; a single varying
+    taxel has no correlation."""
     x = noise()
     for level in (0, 3.3e30):
         dead = np.concatenate([x, np.full((len(x), 2, 1), level, np.float32)], axis=2)
@@ -142,8 +142,8 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
 
 
 def test_a_mean_that_rounding_left_is_none():
-    """Float32 counts whose means were removed: equal weights, and no feature shows what rounding
-    left."""
+    """Float32 counts without their means: the weights are equal, and no feature shows the rounding
+    error."""
     x = noise()
     centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
     assert centred.mean(axis=0, dtype=np.float64).any()
@@ -154,7 +154,7 @@ def test_a_mean_that_rounding_left_is_none():
 
 @pytest.mark.parametrize(("rows", "cols"), [(1, 1), (3, 3), (16, 1), (20, 30)])
 def test_the_number_of_features_hangs_on_the_grid_alone(rows: int, cols: int):
-    """2 M + 7, 125 and 9, however long the sweep is."""
+    """2 M + 7, 125 and 9, whatever the length of the sweep."""
     for frames in (20, 61):
         x = np.random.default_rng(0).integers(0, 99, (frames, rows, cols)).astype(np.int16)
         assert [len(kinds.compute(k, x, 50.0)) for k in KINDS] == [2 * rows * cols + 7, 125, 9]
@@ -172,7 +172,7 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 @settings(max_examples=60, deadline=None)
 @given(_DIGITS, st.floats(1, 5000), st.sampled_from(KINDS))
 def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, kind: str):
-    """Whatever the counts, float32 numbers come out."""
+    """Finite float32 numbers for any counts."""
     assert np.isfinite(kinds.compute(kind, taxels, rate_hz)).all()
 
 
@@ -193,7 +193,7 @@ def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, k
 def test_what_cannot_be_computed_is_named(
     kind: str, shape: tuple[int, ...], rate_hz: float, message: str
 ):
-    """Each refusal is a FormatError with the value that was wrong."""
+    """Each refusal is a FormatError with the wrong value."""
     with pytest.raises(FormatError, match=message):
         kinds.compute(kind, np.ones(shape, np.uint8), rate_hz)
 
@@ -211,7 +211,7 @@ def test_exploring_stops_when_the_posterior_is_sure():
 
 
 def test_later_sweeps_correct_the_first():
-    """A wrong first sweep is outweighed, even one that is sure beyond float64."""
+    """Later sweeps outweigh a wrong first sweep, even if it is certain beyond float64."""
     log_p = np.log(np.array([[0.6, 0.4], [0.1, 0.9], [0.1, 0.9]]))
     assert explore(log_p, 0.95) == (1, 3)
     assert explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1

@@ -17,8 +17,8 @@ def test_a_difference_of_two_shares_is_newcombes():
 
 
 def test_the_interval_of_a_difference_holds_what_it_says():
-    """Of two shares drawn 2,000 times, the true difference lies in it at least 93 % of the time,
-    and not always."""
+    """For two shares drawn 2,000 times, at least 93 % of the intervals hold the true difference,
+    and not all."""
     rng, inside = np.random.default_rng(0), []
     for one, other in zip(
         rng.binomial(80, 0.9, 2000) / 80, rng.binomial(80, 0.7, 2000) / 80, strict=True
@@ -48,6 +48,6 @@ def test_an_entry_of_results_is_an_estimate():
 
 
 def test_of_nothing_there_is_no_mean():
-    """An error, no figure."""
+    """An error instead of a number."""
     with pytest.raises(ZeroDivisionError):
         differences.mean({})

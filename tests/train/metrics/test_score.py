@@ -10,7 +10,7 @@ from train.metrics.score import Score, accuracy_figure, fuse, interval
 
 
 def test_a_score_counts():
-    """Right of how many, as plain numbers."""
+    """The number of right answers and the total, as plain numbers."""
     assert Score.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
 
 
@@ -54,7 +54,7 @@ def test_windows_of_a_recording_are_fused_as_a_product():
 
 
 def test_no_window_can_veto_all_others():
-    """One with a probability of 0 in float does not outweigh the others with log 0."""
+    """A probability of 0 in float does not outweigh the others with log 0."""
     scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1

@@ -17,16 +17,16 @@ def drawn(n: int, groups: int, seed: int = 0, scale: float = 2.0):
 
 @pytest.mark.parametrize("times", [3.0, 6.0])
 def test_a_head_that_is_too_sure_is_cooled(times: float):
-    """Calibrated logits times `times`: that temperature, or one within an error of it, and never a
-    higher one."""
+    """For calibrated logits times `times`, the result is that factor, or within an error below it,
+    and never above."""
     logits, labels, groups = drawn(3000, 30)
     found = sufficient_temperature(times * logits, labels, groups)
     assert 0.8 * times < found < 1.05 * times
 
 
 def test_a_calibrated_head_stays_as_it_is():
-    """Where nothing shows that the head is too sure, the temperature is 1: so too where all sweeps
-    are right by far."""
+    """Without evidence of overconfidence the temperature is 1, also if all sweeps are right by a
+    large margin."""
     temperatures = [sufficient_temperature(*drawn(300, 10, seed)) for seed in range(20)]
     assert np.mean(np.array(temperatures) == 1) > 0.8
     assert max(temperatures) < 1.3
@@ -35,8 +35,8 @@ def test_a_calibrated_head_stays_as_it_is():
 
 
 def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
-    """Of 300 with a margin of 30 one is wrong, by a margin of 1: a little over half the temperature
-    that Platt's correction gives."""
+    """Of 300 sweeps with a margin of 30, one is wrong by a margin of 1: the temperature is a little
+    over half of that with Platt's correction."""
     labels = np.arange(300) % 3
     logits = 30 * np.eye(3)[labels]
     logits[0] = [0, 1, 0]
@@ -46,8 +46,8 @@ def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
 
 
 def test_sweeps_that_fail_together_count_as_one():
-    """All that speaks for a temperature comes from one group of thirty: no evidence. The same from
-    every group is some."""
+    """If all evidence comes from one group of thirty, it does not count. The same evidence from
+    every group does."""
     labels = np.zeros(300, int)
     logits = np.tile([6.0, 0.0], (300, 1))
     logits[:10] = [0.0, 6.0]
@@ -58,7 +58,7 @@ def test_sweeps_that_fail_together_count_as_one():
 
 
 def test_with_one_group_each_sweep_is_its_own():
-    """One group has no spread between groups; the sweeps' own is taken."""
+    """A single group has no spread between groups, so the spread of its sweeps is used."""
     logits, labels, groups = drawn(1000, 1)
     assert sufficient_temperature(4 * logits, labels, groups) == sufficient_temperature(
         4 * logits, labels, np.arange(1000)

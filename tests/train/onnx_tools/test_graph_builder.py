@@ -20,7 +20,7 @@ def made(output: str, by: float) -> onnx.ModelProto:
     """The sums of the two loudest taxels' counts, which all such graphs share, times `by`."""
     g = GraphBuilder()
     x = g("Cast", g("Reshape", "sweep", g.constant([1, 20, 4], "int64")), to=1)
-    axis, same = (g.constant([1], "int64") for _ in range(2))  # a constant that stands there twice
+    axis, same = (g.constant([1], "int64") for _ in range(2))  # a constant that occurs twice
     x = g("ReduceSum", x, axis, keepdims=1)
     sums = g("Reshape", g("ReduceSum", x, same, keepdims=1), g.constant([1, 4], "int64"))
     g.nodes.append(onnx.helper.make_node("TopK", [sums, g.constant([2], "int64")], ["most", "who"]))
@@ -102,7 +102,7 @@ def test_a_slim_model_gives_the_same_bits_in_fewer_bytes():
 
 
 def test_slim_keeps_optional_inputs_empty_and_second_outputs_apart():
-    """A joined graph, in which a node gives two outputs, each with its bits."""
+    """A joined graph with a node that has two outputs; each output keeps its bits."""
     both = joined(made("a", 0.5), made("b", 0.25))
     small = slim(both)
     for name in ("a", "b"):

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
-    """A fit on a set that takes all int8 has."""
+    """A fit with every kind of node that int8 has."""
     return stages.fit_network(close(), 1, FitRecipe(steps=60))
 
 
@@ -38,22 +38,22 @@ def measured(fitted: Fit) -> parity.Parity:
 
 
 def activations(found: parity.Parity) -> list[Layer]:
-    """Its rounded tensors behind convolutions, in order."""
+    """Its rounded tensors after convolutions, in order."""
     return [
         layer for layer in found.layers if layer.kind == "activations" and layer.against == "float"
     ]
 
 
 def booleans(n: int, wrong: list[int]) -> np.ndarray:
-    """All right but those."""
+    """All right except those in `wrong`."""
     right = np.ones(n, bool)
     right[wrong] = False
     return right
 
 
 def test_what_is_lost_is_counted_in_pairs():
-    """Three sweeps lost, one won, by hand with Agresti's and Min's halves; no loss of a hundred is
-    not certainly none."""
+    """Three sweeps lost, one won, checked by hand with the halves of Agresti and Min; no loss in a
+    hundred does not prove that there is none."""
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
     assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (
         50,
@@ -82,7 +82,8 @@ def test_the_interval_holds_what_it_promises():
 
 
 def test_sweeps_that_fail_together_count_together():
-    """All losses in one of five recordings: less sure than if they lay anywhere."""
+    """If all losses are in one of five recordings, the interval is wider than if they are
+    spread."""
     wrong = booleans(50, list(range(5)))
     alone, together = (
         parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10)
@@ -93,8 +94,8 @@ def test_sweeps_that_fail_together_count_together():
 
 
 def test_differences_by_hand():
-    """The common part of logits does not count; the largest and the mean difference of a
-    probability are of sweeps."""
+    """The common part of logits does not count; maximum and mean of the probability differences are
+    over sweeps."""
     want = np.float32([[1, 0], [0, 0.1]])
     have = np.float32([[6, 5], [0.3, 0]])
     apart = parity.compare(want, have)
@@ -109,7 +110,7 @@ def test_differences_by_hand():
 
 
 def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
-    """Percentiles and the share beyond reach of each stage, against its responses in PyTorch;
+    """Percentiles and the share out of range of each stage, compared with its responses in PyTorch;
     weights of seven bits."""
     found = measured(fitted)
     model = fitted.network()
@@ -132,8 +133,8 @@ def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
 
 
 def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
-    """A stage whose range is a fifth: its values are cut off, its signal drowns; those before are
-    as they were."""
+    """A stage whose range is a fifth: its values are cut off and its signal is lost in noise;
+    earlier stages are unchanged."""
     *before, last = fitted.ranges.responses
     broken = replace(fitted, ranges=replace(fitted.ranges, responses=(*before, last / 5)))
     whole, cut = (activations(measured(one)) for one in (fitted, broken))
@@ -143,8 +144,8 @@ def test_a_layer_that_saturates_is_the_one_that_is_named(fitted: Fit):
 
 
 def test_a_tap_that_was_moved_is_found(fitted: Fit):
-    """Taps that sum to zero, then one integer more: an offset can move the first convolution by
-    it."""
+    """Taps that sum to zero, then one of them increased: an offset can now change the first
+    convolution."""
     _, int8 = quantized_bundle.graphs(fitted)
     conv = next(n for n in int8.graph.node if n.op_type == "Conv")
     maker = next(n for n in int8.graph.node if conv.input[1] in n.output)
@@ -159,7 +160,7 @@ def test_a_tap_that_was_moved_is_found(fitted: Fit):
 
 
 def test_any_quantized_graph_can_be_compared(fitted: Fit):
-    """What onnxruntime quantizes has its twins in the float graph, too, behind the ReLU."""
+    """Tensors that onnxruntime quantizes are matched to the float graph too, after the ReLU."""
     reference, _ = quantized_bundle.graphs(fitted)
     int8 = quantize(reference, fitted.train.samples)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels, reference)
@@ -169,7 +170,7 @@ def test_any_quantized_graph_can_be_compared(fitted: Fit):
 
 
 def test_a_bundle_is_compared_without_float(fitted: Fit):
-    """Each tensor against itself, before it is rounded; a graph without int8 is named."""
+    """Each tensor against its value before rounding; a graph without int8 is refused by name."""
     reference, int8 = quantized_bundle.graphs(fitted)
     found = parity.measure(int8, fitted.held.samples, fitted.held.labels)
     assert (found.answers, found.accuracy, {layer.against for layer in found.layers}) == (
@@ -184,7 +185,7 @@ def test_a_bundle_is_compared_without_float(fitted: Fit):
 
 
 def test_the_command_reports_fits_and_bundles(fitted: Fit, tmp_path: Path):
-    """Table and JSON of both; a set of another kind is named."""
+    """Table and JSON of both; a set of another format is refused by name."""
     fitted.save(tmp_path / "fit.npz")
     quantized_bundle.export(fitted, tmp_path / "bundle", "close", "1", "")
     table = quantized_bundle.compared(tmp_path / "fit.npz", fitted.held, tmp_path / "parity.json")
