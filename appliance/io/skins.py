@@ -59,8 +59,8 @@ def open_readout(settings: Config, devices: Devices) -> SkinLink:
     if chosen.codec != "palpate":
         raise ConfigError(
             f'skin.profile = "{settings.skin.profile}" sends a protocol of its maker (codec '
-            f'"{chosen.codec}"), not PROTOCOL.md; '
-            'use skin.profile = "palpate" for a skin that does'
+            f'"{chosen.codec}"), not PROTOCOL.md; `palpate check` tests this skin; for a board of'
+            ' PROTOCOL.md use skin.profile = "palpate"'
         )
     return open_link(_config(settings, chosen), devices.backend, devices.clock)
 
