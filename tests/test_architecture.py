@@ -16,6 +16,7 @@ import pytest
 
 from tests.factories import emulated_machines
 from tests.factories.paths import ROOT
+from train.models import methods
 
 SOURCES = sorted(
     [*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")]
@@ -117,6 +118,23 @@ def test_packages_import_downwards_only():
     """The contracts of pyproject.toml, as `make lint` checks them."""
     output = run(Path(sys.executable).with_name("lint-imports"), cwd=ROOT)
     assert "0 broken" in output
+
+
+@pytest.mark.slow
+def test_every_module_of_training_serves_a_command():
+    """All of train but the studies is imported for a command of palpate-train; a method is imported
+    by its name for `evaluate --method`. A module that only a study uses is not."""
+    graph = module_imports("train")
+    commands = {name for name in graph if name.startswith("train.cli.")}
+    found, left = set(), ["train.__main__", *commands, *methods.MODULES]
+    while left:
+        if (name := left.pop()) not in found:
+            found.add(name)
+            left += graph[name]
+    packages = {path.parent for path in SOURCES}
+    modules = {name for name in graph if ROOT.joinpath(*name.split(".")) not in packages}
+    studies = {name for name in modules if name.startswith("train.studies.")}
+    assert modules - found == studies
 
 
 def foreign(path: Path) -> set[str]:

@@ -15,19 +15,15 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
-from appliance.sim import skin
 from train.data.sets import Dataset
 from train.export.bundle_graph import bundle_graph
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models.methods import model_inputs
-from train.models.recipe import graph, recipe
-from train.models.recipe.bank import LEAST_FILTERS, Bank
 from train.models.recipe.fitted import Fit, finished
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
-from train.onnx_tools.quantize import quantize
 
 Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
@@ -223,36 +219,3 @@ def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
         result = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
         put(file, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     return parity.table(found)
-
-
-def references(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write the models that `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx,
-    both with random weights.
-
-    The first is a trunk like that of the packaged bundle in float32, with stages and the fewest
-    filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.
-    """
-    from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
-    from train.models.recipe.stages import Compact  # here, as what follows: it imports PyTorch
-
-    rng, format, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
-    counts = rng.integers(0, 256, (4, format.window, *format.shape), np.uint8)
-    sweeps = Dataset(
-        counts, np.arange(4) % classes, skin.MATERIALS, format.rate_hz, {}, "random counts"
-    )
-    trunk = recipe.fixed_trunk(sweeps, seed)
-    stages = Compact(format, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
-    filters = Bank.of(trunk.weights)
-    filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
-    architecture = replace(recipe.STAGES, pools=2, distribution=True, spectrum=True)
-    small = graph.trunk_graph(
-        format, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
-    )
-    size = small.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-    small = with_head(small, rng.standard_normal((classes, size)), np.zeros(classes))
-    paper = quantize(random_paper_cnn(format, classes, rng), counts, INT8_NODES)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = folder / "fp32.onnx", folder / "paper_int8.onnx"
-    for path, model in zip(paths, (small, paper), strict=True):
-        path.write_bytes(model.SerializeToString())
-    return paths

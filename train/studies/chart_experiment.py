@@ -22,13 +22,14 @@ from train.evaluation import evaluate, parallel, robustness
 from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Plan, Where
 from train.evaluation.fold import fingerprint
-from train.export import measure, precisions
-from train.export.precisions import Packed
+from train.export import measure
 from train.metrics import score
 from train.models import methods
 from train.models.methods import Effort, Method
 from train.models.recipe.architectures import ARCHITECTURES
+from train.studies import precisions, stress_targets
 from train.studies.method_names import family
+from train.studies.precisions import Packed
 from train.studies.study import NO_DATA, Study, StudyCase, StudyRun
 
 Json = dict[str, Any]
@@ -204,7 +205,7 @@ class Chart:
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
     """The folder in the cache for the bundles of a method that was trained on these sweeps."""
     about = [sets.digest(train), method.name, method.effort, seed]
-    modules = methods.module_of(method.name), "train.export.precisions", "train.export.pack"
+    modules = methods.module_of(method.name), "train.studies.precisions", "train.export.pack"
     return cache / "dots" / fingerprint(about, *modules)
 
 
@@ -218,7 +219,7 @@ def joined(results: Sequence[Json]) -> Json:
 
 def under_stress(entry: Json) -> dict[str, Json]:
     """Accuracies under corruption from an entry of robustness.merge: "stress", the mean over
-    severities of the worst corruption, and robustness.TARGETS."""
+    severities of the worst corruption, and stress_targets.TARGETS."""
     curves, seeds = entry["curves"], entry["seeds"]
     n = next(iter(curves.values()))["total"] // len(seeds)
     mean = {
@@ -229,7 +230,7 @@ def under_stress(entry: Json) -> dict[str, Json]:
     entries = {"stress": _entry(mean[worst], n, seeds) | {"name": worst}}
     return entries | {
         f"stress:{key}": _entry(shares, n, seeds)
-        for key, shares in robustness.at_targets(curves).items()
+        for key, shares in stress_targets.at_targets(curves).items()
     }
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from train.metrics import differences
-from train.metrics.differences import Estimate
 from train.reports.formatting import points
+from train.studies import differences
+from train.studies.differences import Estimate
 
 Json = Mapping[str, Any]
 NEAR = -0.01

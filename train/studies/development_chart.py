@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from train.metrics import differences
-from train.metrics.differences import Estimate
+from train.studies import differences
+from train.studies.differences import Estimate
 from train.studies.method_names import family
 from train.studies.pareto import COSTS, ChartAxis
 

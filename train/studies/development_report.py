@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from appliance.core.errors import FormatError
-from train.metrics import differences
 from train.reports import html, provenance
 from train.reports.formatting import estimate, exact_percent, points
 from train.studies import (
@@ -20,6 +19,7 @@ from train.studies import (
     comparison,
     development_chart,
     development_plots,
+    differences,
     method_names,
     scatter,
 )

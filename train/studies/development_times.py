@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError, FormatError
 from train.data.progress import Progress
 from train.data.sets import Dataset
-from train.export import measure, precisions
+from train.export import measure
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
+from train.studies import precisions
 from train.studies.chart_experiment import kept_folder
 from train.studies.development_experiment import OURS
 

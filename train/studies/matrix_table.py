@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from appliance.core.storage import put
-from train.metrics import differences
 from train.models.methods import SHIPPED
 from train.reports import provenance
 from train.reports.formatting import estimate
-from train.studies import comparison, marked_text, plots
+from train.studies import comparison, differences, marked_text, plots
 from train.studies.development_chart import PROTOCOLS
 from train.studies.method_names import plain_name
 

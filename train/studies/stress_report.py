@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from appliance.core.errors import FormatError
-from train.evaluation.robustness import POINTS, TARGETS, at_targets, breaks_first
+from train.evaluation.robustness import POINTS, breaks_first
 from train.reports import html, provenance
 from train.reports.formatting import exact_percent, level, points
 from train.studies import TEMPLATES, stress_plots
 from train.studies.method_names import about, plain_name
+from train.studies.stress_targets import TARGETS, at_targets
 
 Json = Mapping[str, Any]
 EARLIER = plain_name("compact")

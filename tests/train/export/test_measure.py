@@ -15,10 +15,10 @@ from appliance.core.clock import SystemClock
 from appliance.inference.classifier import Classifier
 from tests.factories.loud_model import loud, sweeps
 from train.cli.main import main
-from train.export import measure, precisions
+from train.export import measure
 from train.export.measure import Measurement
 from train.models.peers import minirocket
-from train.studies import chart_experiment
+from train.studies import chart_experiment, precisions
 from train.studies.command import main as study
 
 KEYS = (

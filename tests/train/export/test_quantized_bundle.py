@@ -37,8 +37,9 @@ from train.models.recipe import stages
 from train.models.recipe.architectures import ARCHITECTURES
 from train.models.recipe.fitted import Fit, finished
 from train.models.recipe.stages import Compact, FitRecipe
-from train.onnx_tools import cost, graph_builder, parity
+from train.onnx_tools import graph_builder, parity
 from train.onnx_tools.parity import Layer
+from train.studies import cost
 from train.studies.command import main as study
 
 pytestmark = pytest.mark.slow

@@ -25,12 +25,12 @@ from train.metrics import score
 from train.models import methods
 from train.models.recipe import graph
 from train.models.recipe.architectures import ARCHITECTURES
-from train.onnx_tools import cost
 from train.onnx_tools.quantize import quantize
 from train.studies import (
     chart_experiment,
     chart_page,
     comparison,
+    cost,
     method_names,
     pages,
     pareto,

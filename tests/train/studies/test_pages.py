@@ -20,10 +20,10 @@ from tests.factories.page_reader import PageReader
 from tests.factories.paths import ROOT
 from tests.factories.study_pages import committed
 from tests.rig import soak_page
-from train.evaluation.robustness import at_targets
 from train.reports import formatting, html, selection_report
 from train.studies import chart_page, paper_report, scatter, stress_report, uncertainty_report
 from train.studies.method_names import plain_name
+from train.studies.stress_targets import at_targets
 
 Facts = Iterator[str]
 

@@ -21,10 +21,10 @@ from train.data import sets
 from train.data.progress import Progress
 from train.evaluation import robustness, uncertainty
 from train.evaluation.corruptions import EvaluationSweeps
-from train.export import bundle_stress, quantized_bundle
+from train.export import bundle_stress
 from train.metrics import score
 from train.models import methods
-from train.studies import alignment, sim_calibration
+from train.studies import alignment, references, sim_calibration
 from train.studies.study import results_file, save
 
 STRESSED = "sim:T-REAL:101-104:1"
@@ -39,8 +39,8 @@ def register(add: Add) -> None:
     _add_calibrate(add)
     _add_cnn_curve(add)
     _add_alignment(add)
-    references = add("references", run_references)
-    references.add_argument("--out", type=Path, required=True, metavar="DIR")
+    command = add("references", run_references)
+    command.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def _add_out(command: argparse.ArgumentParser, name: str) -> None:
@@ -280,5 +280,5 @@ def run_alignment(args: argparse.Namespace) -> None:
 
 def run_references(args: argparse.Namespace) -> None:
     """Write the references and print their paths."""
-    for path in quantized_bundle.references(args.out):
+    for path in references.write(args.out):
         print(path)

@@ -13,8 +13,9 @@ from appliance.inference.classifier import softmax
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.peers import ds_cnn, edge_spectral
-from train.onnx_tools import cost, graph_builder
+from train.onnx_tools import graph_builder
 from train.onnx_tools.quantize import quantize
+from train.studies import cost
 
 
 @pytest.mark.parametrize(

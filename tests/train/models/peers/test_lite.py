@@ -13,7 +13,8 @@ from appliance.inference.classifier import softmax
 from tests.factories.sweep_sets import easy
 from train.models import methods
 from train.models.peers import lite
-from train.onnx_tools import cost, graph_builder
+from train.onnx_tools import graph_builder
+from train.studies import cost
 
 
 def test_it_has_as_many_weights_as_published():

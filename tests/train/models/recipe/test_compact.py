@@ -25,8 +25,8 @@ from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architectu
 from train.models.recipe.augment import Augmentation
 from train.models.recipe.fitted import Fit
 from train.models.recipe.stages import Compact, FitRecipe
-from train.onnx_tools import cost as graph_cost
 from train.onnx_tools import graph_builder
+from train.studies import cost as graph_cost
 
 SMALL = Architecture((6, 8, 8), 8, 2)
 LIMITS = {"compact-10k": (1e6, 24), "compact-100k": (12e6, 96)}

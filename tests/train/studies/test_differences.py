@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appliance.core.statistics import wilson
-from train.metrics import differences
+from train.studies import differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():

@@ -21,7 +21,7 @@ from train.export import measure, pack
 from train.export.measure import Measurement
 from train.models.methods import Method
 from train.models.peers import minirocket
-from train.onnx_tools import cost
+from train.studies import cost
 
 Array = NDArray[Any]
 INDEX = "dots.json"
@@ -33,7 +33,7 @@ class Packed:
     of a peer.
 
     form: "" for the method itself, else the name of another of its precisions. precision, weights,
-    macs: as onnx_tools.cost counts them. window_s: length of a sweep in s.
+    macs: as train.studies.cost counts them. window_s: length of a sweep in s.
     """
 
     method: str
