@@ -1,5 +1,4 @@
-"""Readers of options that are numbers. In: what a person typed. Out: the number, or a FormatError
-with what is allowed."""
+"""Readers of numeric options, which raise FormatError with the allowed values."""
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ from appliance.core.errors import FormatError
 
 
 def whole(name: str, least: int) -> Callable[[str], int]:
-    """Reads the option `name`, a whole number from `least` on; raises FormatError for anything
-    else."""
+    """A reader of the option `name`, a whole number from `least` on. Any other text raises
+    FormatError."""
 
     def read(text: str) -> int:
         try:
@@ -26,8 +25,8 @@ def whole(name: str, least: int) -> Callable[[str], int]:
 
 
 def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[str], float]:
-    """Reads the option `name`, a number that `fits`; raises FormatError for anything else, with
-    what is `allowed`."""
+    """A reader of the option `name`, a number that passes `fits`. Any other text raises FormatError
+    with the `allowed` range."""
 
     def read(text: str) -> float:
         try:
@@ -42,13 +41,13 @@ def number(name: str, fits: Callable[[float], bool], allowed: str) -> Callable[[
 
 
 def above_zero(name: str) -> Callable[[str], float]:
-    """Reads the option `name`, a number above 0."""
+    """A reader of the option `name`, a number above 0."""
     return number(name, lambda x: x > 0, "above 0")
 
 
 def span(name: str, example: str) -> Callable[[str], range]:
-    """Reads the option `name`, a whole number or FIRST-LAST; raises FormatError for anything else,
-    with an `example`."""
+    """A reader of the option `name`, a whole number or FIRST-LAST. Any other text raises
+    FormatError with an `example`."""
 
     def read(text: str) -> range:
         first, _, last = text.partition("-")

@@ -1,5 +1,4 @@
-"""Options that several commands share. In: a parser, or the arguments it parsed. Out: options, or
-their values."""
+"""Options that several commands share, and readers of their values."""
 
 from __future__ import annotations
 
@@ -20,12 +19,15 @@ from train.data.summary import warnings_of
 from train.evaluation import evaluate
 from train.models import methods
 
-SET = "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME; several are joined"
+SET = (
+    "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME; "
+    "several are joined"
+)
 LOG_EVERY_S = 30
 
 
 def add_set(command: argparse.ArgumentParser, usual: str = "") -> None:
-    """--set and --only. usual: where none is given; without it one must be."""
+    """Add --set, --only and --rename. usual: the default set; without it --set is required."""
     told = f"{SET} ({usual})" if usual else SET
     command.add_argument(
         "--set", action="append", required=not usual, metavar="SET", dest="sets", help=told
@@ -43,25 +45,25 @@ def add_set(command: argparse.ArgumentParser, usual: str = "") -> None:
 
 
 def add_rename(command: argparse.ArgumentParser) -> None:
-    """--rename."""
+    """Add --rename."""
     command.add_argument(
         "--rename",
         action="append",
         default=[],
         metavar="OLD=NEW",
-        help="give a material another name, before --only; two that get the same become one",
+        help="rename a material, before --only; two with the same new name become one",
     )
 
 
 def add_effort(command: argparse.ArgumentParser) -> None:
-    """Options for how long networks are trained."""
+    """Add options for the length of trainings."""
     usual = methods.FULL_EFFORT
     command.add_argument(
         "--effort",
         type=numbers.above_zero("--effort"),
         default=usual.share,
         metavar="SHARE",
-        help="of the networks' usual iterations (1)",
+        help="share of the networks' usual iterations (1)",
     )
     command.add_argument(
         "--paper-steps",
@@ -77,7 +79,7 @@ def add_effort(command: argparse.ArgumentParser) -> None:
 
 
 def add_where(command: argparse.ArgumentParser) -> None:
-    """Options for where tasks run and where their results are kept."""
+    """Add options for where tasks run and where their results are kept."""
     add_jobs(command)
     command.add_argument(
         "--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks"
@@ -87,24 +89,27 @@ def add_where(command: argparse.ArgumentParser) -> None:
         type=Path,
         default=evaluate.CACHE,
         metavar="DIR",
-        help=f"where finished folds are kept, so that an interrupted run continues ({evaluate.CACHE})",
+        help=(
+            "where finished folds are kept, so that an interrupted run continues "
+            f"({evaluate.CACHE})"
+        ),
     )
 
 
 def add_jobs(command: argparse.ArgumentParser) -> None:
-    """--jobs."""
+    """Add --jobs."""
     command.add_argument(
         "--jobs", type=jobs, default=-1, metavar="N", help="processes (one for each core)"
     )
 
 
 def jobs(text: str) -> int:
-    """Reads --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
+    """Read --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
     return -1 if text == "-1" else numbers.whole("--jobs", 1)(text)
 
 
 def writable(path: Path, option: str = "--out") -> None:
-    """Make the folders above `path`, before hours of work. Raises FormatError where nothing can be
+    """Make the folders above `path`, before hours of work. Raises FormatError if nothing can be
     written there."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +122,7 @@ def writable(path: Path, option: str = "--out") -> None:
 
 
 def writable_file(path: Path, option: str = "--out") -> None:
-    """As `writable`; raises FormatError also where `path` is a folder."""
+    """As `writable`; also raises FormatError if `path` is a folder."""
     if path.is_dir():
         raise FormatError(f"{option} {path} is a folder; name a file")
     writable(path, option)
@@ -125,9 +130,9 @@ def writable_file(path: Path, option: str = "--out") -> None:
 
 def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated
-    ones that name none.
+    sets without one.
 
-    Warns of materials without a sweep, which are left out, and of taxels that never change.
+    Warns of materials without sweeps, which are left out, and of taxels that never change.
     """
     pairs = labels.parse_renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
@@ -140,26 +145,24 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
 
 
 def report_line(what: Path, sweeps: str = "") -> str:
-    """How to get a page about a fit or a bundle. sweeps: the set to judge it on, where one is
-    known."""
+    """The command for a page about a fit or a bundle. sweeps: the set to judge it on, if known."""
     words = ["palpate-train", "report", str(what), "--set", sweeps or "SET", "--out", "report.html"]
-    return f"a page about it, with what breaks it: {shlex.join(words)}"
+    return f"for a page about it and its limits: {shlex.join(words)}"
 
 
 def names(args: argparse.Namespace) -> tuple[str, ...]:
-    """The methods of --method."""
     return tuple(methods.every()) if args.method == "all" else tuple(args.method.split(","))
 
 
 def seeds(args: argparse.Namespace) -> range:
-    """1 to --seeds. Raises FormatError where that is below 1."""
+    """The seeds from 1 to --seeds. Raises FormatError if that is below 1."""
     if args.seeds < 1:
         raise FormatError(f"--seeds {args.seeds} is none; use 1 or more")
     return range(1, args.seeds + 1)
 
 
 def effort(args: argparse.Namespace) -> methods.Effort:
-    """How long networks are trained."""
+    """The length of trainings."""
     return methods.Effort(args.effort, args.paper_steps, args.bfloat16)
 
 
@@ -169,7 +172,7 @@ def where(args: argparse.Namespace) -> evaluate.Where:
 
 
 class Log:
-    """Shows progress on the error stream: on a terminal a bar and the latest line, else one line
+    """Shows progress on the error stream: on a terminal a bar and the latest line, otherwise a line
     every LOG_EVERY_S."""
 
     def __init__(self) -> None:
@@ -177,7 +180,7 @@ class Log:
         self._bar: Any = None
 
     def __call__(self, line: str) -> None:
-        """Show `line`; of a ProgressLine also how much is done."""
+        """Show `line`; for a ProgressLine also the share that is done."""
         if sys.stderr.isatty():
             known = (
                 {"completed": line.done, "total": line.total}
@@ -190,11 +193,11 @@ class Log:
             print(line, file=sys.stderr, flush=True)
 
     def keep(self, line: str) -> None:
-        """Show `line` at once, and leave it there."""
+        """Show `line` at once and permanently."""
         print(line, file=sys.stderr, flush=True)
 
     def _shown(self) -> Any:
-        """The bar, which goes when the process ends; what is printed meanwhile stands above it."""
+        """The bar, which disappears when the process ends; other output appears above it."""
         if self._bar is None:
             from rich import progress  # here: a tenth of a second that only a terminal needs
             from rich.console import Console

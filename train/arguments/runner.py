@@ -1,7 +1,7 @@
 """Runs one command of a program: help in groups, the command's own parser, exit codes.
 
-The names and descriptions of all commands stand in a table, so that help needs no import; the
-module of a command is imported when the command is wanted, since training takes seconds to import.
+A table holds the names and descriptions of all commands, so that help needs no import. The module
+of a command is imported only if the command is called, since training takes seconds to import.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from train.arguments.types import Run
 class Program:
     """A program and its commands.
 
-    groups: by heading the commands with their descriptions. modules: the module that registers each
-    command, below `package`.
+    groups: the commands with their descriptions, by heading. modules: by module below `package`,
+    the commands that it registers.
     """
 
     name: str
@@ -35,15 +35,15 @@ class Program:
 
     @property
     def menu(self) -> Menu:
-        """All commands in groups, without an import of any."""
+        """All commands in groups; no command is imported."""
         return Menu(self.name, self.about, self.groups)
 
     def descriptions(self) -> dict[str, str]:
-        """Of all commands, by name."""
+        """The description of each command."""
         return self.menu.commands
 
     def parser(self, wanted: str) -> argparse.ArgumentParser:
-        """The parser of one command; `args.run` is the function that carries it out."""
+        """The parser of one command; `args.run` is the function of the command."""
         parser = argparse.ArgumentParser(prog=self.name, description=self.about)
         commands = parser.add_subparsers(required=True, metavar="COMMAND")
         descriptions = self.descriptions()
@@ -61,7 +61,7 @@ class Program:
         return parser
 
     def run(self, argv: Sequence[str] | None = None) -> int:
-        """Run one command; its exit code. An error of this project is one line on standard error."""
+        """Run one command; its exit code. An error of this project is a line on standard error."""
         words = sys.argv[1:] if argv is None else list(argv)
         answered = self.menu.answer(words)
         return self._run(words) if answered is None else answered
@@ -73,7 +73,7 @@ class Program:
                 parser = self.parser(words[0])
                 from train.metrics import score  # here: it imports onnxruntime
             args = parser.parse_args(words)
-            score.provenance()  # read once, now: the code that runs is of this commit
+            score.provenance()  # read now: a later commit is not of the code that runs
             args.run(args)
             sys.stdout.flush()
         except ApplianceError as e:

@@ -1,4 +1,4 @@
-"""Types of the functions with which the module of a command registers it."""
+"""Types for the registration of commands."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ import argparse
 from collections.abc import Callable
 
 Run = Callable[[argparse.Namespace], None]
-"""Carries a command out."""
+"""Runs a command."""
 Add = Callable[[str, Run], argparse.ArgumentParser]
-"""Adds a command: its name and its function -> its parser."""
+"""Adds a command, given its name and its function, and returns its parser."""

@@ -33,10 +33,10 @@ from train.models.recipe.augment import Augmentation, default_augmentation
 from train.models.recipe.fitted import Fit
 
 MAINS = (50, 60)
-"""Hz; there are no others for the public."""
+"""Frequencies of the mains in Hz: public grids have no others."""
 STEPS = recipe.Settings().steps
 LEAST_STEPS = 2
-"""Of the training of a network alone: its learning rate rises and falls."""
+"""Steps that the training of a network needs at least, since its learning rate rises and falls."""
 
 
 def register(add: Add) -> None:
@@ -52,7 +52,7 @@ def register(add: Add) -> None:
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
     )
     parity.add_argument(
-        "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which has no float form"
+        "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which holds no float model"
     )
     options.add_set(parity)
     parity.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
@@ -66,7 +66,7 @@ def _add_fit(add: Add) -> None:
         "--seed",
         type=numbers.whole("--seed", 0),
         required=True,
-        help="of the training, and of simulated sets that name none",
+        help="seed of the training, and of simulated sets without one",
     )
     command.add_argument(
         "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
@@ -81,14 +81,14 @@ def _add_fit(add: Add) -> None:
         "--steps",
         type=numbers.whole("--steps", 0),
         default=STEPS,
-        help=f"of training of stages (default {STEPS}; 0 for none)",
+        help=f"training steps of the stages (default {STEPS}; 0 for none)",
     )
     command.add_argument(
         "--row-shift",
         type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
         metavar="SHARE",
         dest="moved",
-        help="share of training sweeps whose skin is moved by up to a row (default 0.5)",
+        help="share of training sweeps with a displacement of up to a row (default 0.5)",
     )
     command.add_argument(
         "--stretch",
@@ -102,23 +102,32 @@ def _add_fit(add: Add) -> None:
         choices=MAINS,
         default=int(MAINS_HZ),
         metavar="HZ",
-        help=f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum is not heard (default {MAINS_HZ:g})",
+        help=(
+            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum "
+            f"is not heard (default {MAINS_HZ:g})"
+        ),
     )
     command.add_argument(
         "--reattached",
         action="store_true",
-        help="the skin will be taken off and put back after the recordings: all heads see copies that look so",
+        help=(
+            "the skin will be taken off and put back after the recordings: train all heads on "
+            "augmented copies of that, too"
+        ),
     )
     command.add_argument(
         "--size",
         choices=[*ARCHITECTURES, "chosen"],
         default="chosen",
-        help="train a network of this size (default: filters, spectrum and stages as held-out groups ask for)",
+        help=(
+            "train a network of this size (default: filters, spectrum and stages as chosen on "
+            "held-out groups)"
+        ),
     )
     command.add_argument(
         "--keep-means",
         action="store_true",
-        help="give the head each taxel's mean too, for comparison",
+        help="also give the head the mean of each taxel, for comparison",
     )
 
 
@@ -135,7 +144,7 @@ def _add_bundles(add: Add) -> None:
         "--seed",
         type=numbers.whole("--seed", 0),
         required=True,
-        help="of the training, and of simulated sets that name none",
+        help="seed of the training, and of simulated sets without one",
     )
     options.add_effort(pack_command)
     for command in (export, pack_command):
@@ -151,12 +160,15 @@ def _add_bundles(add: Add) -> None:
         command.add_argument(
             "--full-scale",
             type=numbers.above_zero("--full-scale"),
-            help="the sensor's highest raw count (default: the maximum of its type)",
+            help="the skin's highest raw count (default: the maximum of its type)",
         )
         command.add_argument(
             "--pitch-mm",
             type=numbers.above_zero("--pitch-mm"),
-            help="from taxel to taxel; without it `palpate align` cannot show mm (known for the simulated skin)",
+            help=(
+                "distance between taxels; without it `palpate align` cannot show mm (known for the "
+                "simulated skin)"
+            ),
         )
 
 
@@ -182,15 +194,16 @@ def run_fit(args: argparse.Namespace) -> None:
     if args.rest and rest:
         command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
         print(
-            f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; after export: {command}"
+            f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; "
+            f"after export: {command}"
         )
     print(options.report_line(args.out, str(args.rest or "")))
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
-    """The fit that the options ask for, and the file that keeps its training until it is written.
+    """The fit for these options, and the file that keeps its training until the fit is written.
 
-    Raises FormatError where they contradict one another.
+    Raises FormatError if options contradict each other.
     """
     changes = {
         name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None
@@ -203,11 +216,13 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     if args.size in ARCHITECTURES:
         if args.reattached:
             raise FormatError(
-                f"--reattached is for the default recipe; --size {args.size} sees such copies anyway, leave it out"
+                f"--reattached is for the default recipe; --size {args.size} sees such "
+                "copies anyway, leave it out"
             )
         if args.steps < LEAST_STEPS:
             raise FormatError(
-                f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with --size {args.size}"
+                f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with "
+                f"--size {args.size}"
             )
         from train.models.recipe import stages  # here: the default recipe needs no PyTorch
 
@@ -219,7 +234,8 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
         ), unfinished
     if args.keep_means:
         raise FormatError(
-            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default recipe removes means"
+            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default "
+            "recipe removes means"
         )
     settings = recipe.Settings(
         args.steps,
@@ -234,8 +250,8 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
 
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:
-    """Where a training is kept until the fit is written: its name is a fingerprint of all that it
-    depends on."""
+    """The file that keeps a training until the fit is written. Its name is a fingerprint of all
+    that the training depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, asdict(augmentation), args.mains]
     return (
         CACHE
@@ -244,7 +260,8 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augment
 
 
 def _print_held_out(made: Fit) -> None:
-    """The accuracy on the sweeps that judged the fit, and how they differ from those of --rest."""
+    """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
+    --rest."""
     if made.about["held_out_by"] == "nothing":
         print(
             "nothing was held out that could judge the model, so export will refuse it: "
@@ -253,8 +270,8 @@ def _print_held_out(made: Fit) -> None:
         return
     by = f"held-out {made.about['held_out_by']}"
     print(
-        f"{by}: sweeps of this set, by heads that did not see them; they helped to choose the "
-        "model, so expect less of it"
+        f"{by}: sweeps of this set, by heads that did not see them; slightly too high, since "
+        "they also helped to choose the model"
     )
     if made.calibration:
         _print_figures(made.held_out_figures(by))
@@ -273,7 +290,7 @@ def run_export(args: argparse.Namespace) -> None:
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
     command = shlex.join(["palpate-train", "score", str(args.out), "--set", rest or "SET"])
-    print(f"what it names of {what}: {command}")
+    print(f"to score it on {what}: {command}")
     print(options.report_line(args.out, rest or ""))
 
 
@@ -286,7 +303,8 @@ def run_pack(args: argparse.Namespace) -> None:
         content = quantized_bundle.checked(content, content.reference)
     except pack.ExportRefused as e:
         raise pack.ExportRefused(
-            f"{e}; or make the bundle with palpate-train fit and export, which keep the float form where int8 differs"
+            f"{e}; or make the bundle with palpate-train fit and export, which keep the "
+            "float form where int8 differs"
         ) from e
     _print(pack.pack(content, *_packing(args)), args.out)
 
@@ -302,7 +320,8 @@ def run_score(args: argparse.Namespace) -> None:
     print(found.text())
     if loaded.manifest.made.get("set") == sweeps.source:
         print(
-            f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it has seen say nothing of new ones"
+            f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it "
+            "has seen say nothing of new ones"
         )
 
 
@@ -311,12 +330,12 @@ def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | Non
 
 
 def _print(manifest: Manifest, out: Path) -> None:
-    """The figures of a bundle, and its size; why it is not in int8 or cannot tell contact, where it
-    might."""
+    """Print the figures of a bundle and its size; also why it is not in int8 or cannot detect
+    contact, if so."""
     if why := manifest.made.get("float_because"):
-        print(f"in float, not int8, which takes more time: {why}")
+        print(f"the model is in float, which takes more time than int8: {why}")
     if why := manifest.made.get("contact_unknown_because"):
-        print(f"no-contact cannot be told: {why}")
+        print(f"no-contact cannot be detected: {why}")
     _print_figures(manifest.figures)
     if few := [
         f"{board} wires {bits}"
@@ -325,14 +344,15 @@ def _print(manifest: Manifest, out: Path) -> None:
     ]:
         needed = len(manifest.labels).bit_length()
         print(
-            f"answers on lines: {len(manifest.labels)} labels need {needed} of output.class_bits; {', '.join(few)}"
+            f"answers on GPIO lines: {len(manifest.labels)} labels need {needed} of "
+            f"output.class_bits; {', '.join(few)}"
         )
     size = measure.sizes(out)[1]
     print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def _class_bits() -> dict[str, int]:
-    """How many lines each delivered board file wires for the class code."""
+    """The number of GPIO lines for the class code in each delivered board file."""
     return {
         name: len(config.load(name, site=Path(os.devnull)).output.class_bits)
         for name in config.boards()
@@ -340,8 +360,8 @@ def _class_bits() -> dict[str, int]:
 
 
 def _print_figures(figures: Mapping[str, dict[str, Any]]) -> None:
-    """Each accuracy on a line: as the box answers, with what it does not name, and of the network
-    alone."""
+    """Print each accuracy on a line: the answers of the box with all other outcomes, and the
+    network alone."""
     for protocol, figure in figures.items():
         if "wrong" in figure:
             others = ", ".join(

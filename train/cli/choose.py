@@ -1,4 +1,5 @@
-"""The command choose. In: scene.toml. Out: a bundle, choice.json, and a page with the reasons."""
+"""The command `choose`: reads a scene.toml; writes a bundle, choice.json and a page with the
+reasons."""
 
 from __future__ import annotations
 
@@ -46,8 +47,8 @@ def register(add: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene,
-    NothingFits where no model fits."""
+    """Choose, pack, write and print the reasons. Raises FormatError for an invalid scene, and
+    NothingFits if no model fits."""
     pack.check_target(args.out)
     page = args.page or args.out.with_name(f"{args.out.name}-why")
     options.writable(page / "choice.json", "--page")
@@ -75,8 +76,8 @@ def run(args: argparse.Namespace) -> None:
 def _packed(
     args: argparse.Namespace, requested: scene.Scene, sweeps: Dataset, result: Json, change: Change
 ) -> Json:
-    """Pack the chosen method, on reduced sweeps where that passes the checks; the bundle's content
-    and cost."""
+    """Pack the chosen method, on reduced sweeps if their bundle passes the checks; the bundle's
+    content and cost."""
     (method,) = methods.find([result["chosen"]], options.effort(args))
     refused = ""
     if change != WHOLE:

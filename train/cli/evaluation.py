@@ -1,4 +1,4 @@
-"""The command that judges methods: evaluate."""
+"""The command `evaluate`, which compares methods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from train.models import methods
 
 
 class ListMethods(argparse.Action):
-    """--list: a line for each method, and the end."""
+    """Prints a line for each method and ends the process (--list)."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         print("\n".join(method_lines()), flush=True)
@@ -49,17 +49,24 @@ def register(add: Add) -> None:
         help="or all; see --list",
     )
     command.add_argument(
-        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+        "--remove-means", action="store_true", help="subtract the mean of each taxel in each window"
     )
     command.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="of training and random folds: 1 to N (1)"
+        "--seeds",
+        type=int,
+        default=1,
+        metavar="N",
+        help="seeds of training and random folds: 1 to N (1)",
     )
     command.add_argument(
         "--each",
         type=int,
         default=0,
         metavar="N",
-        help="train on N sweeps of each material, drawn by the seed: a point of a learning curve (all)",
+        help=(
+            "train on N sweeps of each material, drawn by the seed: a point of a learning "
+            "curve (all)"
+        ),
     )
     command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
     options.add_effort(command)
@@ -74,16 +81,16 @@ def method_lines() -> Iterator[str]:
 
 
 def run_evaluate(args: argparse.Namespace) -> None:
-    """Print each result as it is finished, and write all of them; name a method that cannot be
-    used, and go on.
+    """Print each result as it is finished, and write all of them. A method that cannot be used is
+    named and left out.
 
-    Raises FormatError at the end where there was one.
+    Raises FormatError at the end if a method was left out.
     """
     sweeps = options.load(args)
     names = options.names(args)
     if args.each < 0:
         raise FormatError(
-            f"--each {args.each} is no number of sweeps; use 1 or more, or leave it out for all"
+            f"--each {args.each} is out of range; use 1 or more, or leave it out for all"
         )
     seeds, effort = options.seeds(args), options.effort(args)
     plan = evaluate.Plan(names, tuple(args.protocols), seeds, args.remove_means, effort, args.each)
@@ -115,7 +122,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
 
 
 def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:
-    """Write a JSON list, one line each, whole or not at all."""
+    """Write a JSON list with a line for each result, whole or not at all."""
     put(
         path,
         ("[\n" + ",\n".join(json.dumps(result) for result in results) + "\n]\n").encode(),

@@ -15,7 +15,9 @@ PROGRAM = Program(
         "sweep sets": {
             "sets": "list the sweep sets that can be named, describe sets, or show a sweep",
             "pull": "fetch new recordings from a box",
-            "import": "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/how-to/import.md)",
+            "import": (
+                "make a sweep set of CSV, text, MAT, HDF5 and .npy files (docs/how-to/import.md)"
+            ),
         },
         "models": {
             "fit": "choose a model and fit it to sweep sets",

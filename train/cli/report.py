@@ -1,4 +1,4 @@
-"""The command that writes a page about a bundle: report."""
+"""The command `report`, which writes a page about a bundle."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ def register(add: Add) -> None:
         action="append",
         default=[],
         metavar="SET",
-        help="what it was fitted to, for a learning curve, and to leave each material out (those of a FIT)",
+        help=(
+            "the set it was fitted to, for a learning curve, and to leave each material out "
+            "(those of a FIT)"
+        ),
     )
     report.add_argument(
         "--quick",

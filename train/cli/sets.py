@@ -1,4 +1,4 @@
-"""The commands about sweep sets: sets, sets describe, sets view, pull."""
+"""The commands `sets`, `sets describe`, `sets view` and `pull`."""
 
 from __future__ import annotations
 
@@ -68,12 +68,12 @@ def register(add: Add) -> None:
 
 
 def run_known(args: argparse.Namespace) -> None:
-    """Print what can be named."""
+    """Print the sets that can be named."""
     print(summary.known())
 
 
 def run_describe(args: argparse.Namespace) -> None:
-    """Print what is in the sets named."""
+    """Print the content of the named sets."""
     print("\n\n".join(summary.describe(spec) for spec in args.sets))
 
 
@@ -82,13 +82,15 @@ def run_view(args: argparse.Namespace) -> None:
     kind, span = args.out.suffix.lower(), args.number
     if kind not in (".svg", ".html"):
         raise FormatError(
-            f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file that ends so"
+            f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file "
+            "that ends so"
         )
     options.writable_file(args.out)
     if kind == ".svg":
         if span is not None and len(span) != 1:
             raise FormatError(
-                f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an .html for more"
+                f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an "
+                ".html for more"
             )
         made = sweep_plot.draw(sweep_plot.load(args.sweep, None if span is None else span.start))
     else:
@@ -97,14 +99,15 @@ def run_view(args: argparse.Namespace) -> None:
         made = sweep_pages.page(found, shown, options.Log())
         if span is None and len(shown) < found.count:
             print(
-                f"{len(shown)} of {found.count} sweeps, from all over the set; --number FIRST-LAST shows others"
+                f"{len(shown)} of {found.count} sweeps, from all over the set; --number "
+                "FIRST-LAST shows others"
             )
     put(args.out, made.encode(), parents=True)
     print(args.out)
 
 
 def run_pull(args: argparse.Namespace) -> None:
-    """Fetch, and print what was fetched and what was not."""
+    """Fetch recordings; print which were fetched and which were not."""
     ssh_options = [part for option in args.ssh_option for part in ("-o", option)]
     box = pull.RecordingHost(
         args.host, args.folder, [*ssh_options, *(["-p", str(args.port)] if args.port else [])]
@@ -114,7 +117,10 @@ def run_pull(args: argparse.Namespace) -> None:
         pull.pull(box, args.out, report, options.Log())
     finally:
         print(
-            f"fetched {len(report.fetched)}, there already {len(report.present)}, refused {len(report.refused)}",
+            (
+                f"fetched {len(report.fetched)}, there already {len(report.present)}, refused "
+                f"{len(report.refused)}"
+            ),
             flush=True,
         )
         _print(report, args.out)
@@ -125,16 +131,22 @@ def run_pull(args: argparse.Namespace) -> None:
 
 
 def _print(report: pull.PullReport, out: Path) -> None:
-    """A line for each kind of recording that somebody should look at."""
+    """Print a line for each kind of recording that needs attention."""
     for names, what in (
         (report.incomplete, "without its .json or .npy on the box; left there"),
         (
             report.relabelled,
-            f"described otherwise on the box; what is in {out} stays: remove its .npy and .json to take the box's",
+            (
+                f"another description on the box; what is in {out} stays: remove its .npy and "
+                ".json to take the box's"
+            ),
         ),
         (
             report.different,
-            f"another sweep on the box under the same name; the one in {out} stays: remove it, or pull into another folder",
+            (
+                f"another sweep on the box under the same name; the one in {out} stays: remove "
+                "it, or pull into another folder"
+            ),
         ),
         (report.refused, "refused"),
     ):

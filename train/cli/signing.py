@@ -1,5 +1,5 @@
-"""The command that signs bundles. It is apart from `bundles`, whose imports take seconds and which
-it does not need."""
+"""The command `sign`. It has a module of its own, since it does not need the imports of `bundles`,
+which take seconds."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def register(add: Add) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Sign the bundle, and print what was signed."""
+    """Sign the bundle; print its name, version, counter and identity."""
     signed = sign.sign(args.bundle, args.key, args.counter)
     print(
-        f"signed: {signed.name} {signed.version}, counter {signed.counter}, {bundle.identity(signed.json())} in {args.bundle}"
+        f"signed: {signed.name} {signed.version}, counter {signed.counter}, "
+        f"{bundle.identity(signed.json())} in {args.bundle}"
     )

@@ -1,10 +1,9 @@
-"""Corruptions: the ways in which a sweep goes wrong. In: test sweeps. Out: the same sweeps with one
-thing wrong.
+"""Corruptions of test sweeps: one fault at a time, in steps from none to severe.
 
-Each corruption is one entry of CORRUPTIONS, in steps from none to severe. What can be physical is:
-simulated sweeps are drawn anew with the skin, the force or the window elsewhere, each from its own
-random stream. The rest is done to the raw counts, which are digitized again. What is drawn does not
-depend on the severity: a corruption only grows with it.
+Each corruption is an entry of CORRUPTIONS. A physical corruption of simulated sweeps draws them
+again with another placement of the skin, another force or another window, each sweep from its own
+random stream. All other corruptions change the raw counts, which are then digitized again. The
+random draws do not depend on the severity, so that a corruption only grows with it.
 """
 
 from __future__ import annotations
@@ -29,23 +28,23 @@ from train.data.sets import Dataset
 Array = NDArray[Any]
 HUM_HZ = 50.0
 NOISY = 4.0
-"""Noise of a noisy taxel, in deviations of the set."""
+"""Noise of a noisy taxel, in standard deviations of the set."""
 GAIN_LAW = 0.25
-"""Of the shifted grid: gains are drawn evenly within this range each way, on a logarithmic scale,
-at the severest shift."""
+"""Spread of the gains at the severest shift of the grid: their logarithms are drawn evenly within
+this range each way."""
 USUAL_SWEEPS = 120
-"""Test sweeps of a file that are corrupted; more narrow the intervals and slow everything down."""
+"""Test sweeps of a file that are corrupted; more sweeps narrow the intervals and take more time."""
 REST_S = 0.1
-"""How long the simulated finger rests before and after the slide, which is as long as the
+"""Seconds that the simulated finger rests before and after the slide, which is as long as the
 window."""
 
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """Simulated sweeps that can be drawn anew, each from the random stream that it had.
+    """Simulated sweeps that can be drawn again, each from its own random stream.
 
-    materials: text [N]. places: where the skin sat in each sweep. worlds: seed of the set that each
-    sweep is of. physics: as they were drawn.
+    materials: text [N]. places: placement of the skin in each sweep. worlds: seed of the set of
+    each sweep. physics: the world in which they were drawn.
     """
 
     materials: tuple[str, ...]
@@ -87,15 +86,14 @@ class SimulatedScene:
 
 @dataclass(frozen=True)
 class EvaluationSweeps:
-    """Test sweeps that can be corrupted and, where they are simulated, the scene that draws them
-    anew."""
+    """Test sweeps that can be corrupted. If they are simulated, `scene` draws them again."""
 
     sweeps: Dataset
     scene: SimulatedScene | None = None
 
     @classmethod
     def of(cls, sweeps: Dataset, most: int = USUAL_SWEEPS, seed: int = 0) -> EvaluationSweeps:
-        """About `most` of the `sweeps`, equally many of each material as far as there are."""
+        """About `most` of the `sweeps`, with equal numbers of each material if there are enough."""
         order = np.random.default_rng(seed).permutation(len(sweeps))
         rank = np.empty(len(sweeps), int)
         for label in np.unique(sweeps.labels):
@@ -108,14 +106,15 @@ class EvaluationSweeps:
         """Sweeps as in the set "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest
         before and after each.
 
-        They are drawn at the same places as those of that set, with other noise. Raises FormatError
-        as `sets.load` does.
+        They have the placements of that set and other noise. Raises FormatError as `sets.load`
+        does.
         """
         base = sets.load(spec, seed)
         found = sets.SIMULATED.fullmatch(spec)
         if not found:
             raise FormatError(
-                f"set {spec!r} is not a simulated one; use sim:NAME, or EvaluationSweeps.of for a file"
+                f"set {spec!r} is not a simulated one; use sim:NAME, or "
+                "EvaluationSweeps.of for a file"
             )
         first = int(found["seed"] or seed)
         name = cast("skin.SetName", found["name"])
@@ -128,7 +127,7 @@ class EvaluationSweeps:
 
     @cached_property
     def deviation(self) -> Array:
-        """Standard deviation in raw counts [R, C] or [R, C, A] within a sweep, root mean square
+        """Standard deviation in raw counts [R, C] or [R, C, A] within a sweep, as root mean square
         over sweeps."""
         deviation: Array = np.sqrt(self.sweeps.samples.var(axis=1, dtype=np.float64).mean(axis=0))
         return deviation
@@ -140,8 +139,8 @@ class EvaluationSweeps:
 
     @cached_property
     def load(self) -> float:
-        """Full load in raw counts: the 99.9th percentile of their magnitude. The very largest may
-        be an accident."""
+        """Full load in raw counts: the 99.9th percentile of their magnitude. The largest count may
+        be an outlier."""
         return float(np.percentile(np.abs(self.sweeps.samples.astype(np.float32)), 99.9))
 
 
@@ -150,10 +149,12 @@ Change = Callable[[Array, float, Generator, EvaluationSweeps], Array]
 
 @dataclass(frozen=True)
 class Corruption:
-    """One thing that goes wrong.
+    """One fault.
 
-    title: its name for readers. unit: of `severities`, which rise from 0 = none. change: (float32 [N, T, R, C] or [N, T, R, C, A], severity, rng, test)
-    -> the same shape, not yet digitized. only: "simulated" where a scene is needed, "files" for what replaces it without one.
+    title: its name for readers. unit: of `severities`, which rise from 0 for none. change: takes
+    (float32 [N, T, R, C] or [N, T, R, C, A], severity, rng, test) and returns the same shape, not
+    yet digitized. only: "simulated" if the corruption needs a scene, "files" if it replaces such a
+    corruption for sweeps without a scene.
     """
 
     name: str
@@ -165,19 +166,21 @@ class Corruption:
     only: str = ""
 
     def apply(self, test: EvaluationSweeps, severity: float, seed: int) -> Array:
-        """The raw counts of `test`, corrupted, of the same type; unchanged at severity 0.
+        """The corrupted raw counts of `test`, with the same type; unchanged at severity 0.
 
         The same seed draws the same taxels, signs and noise for every severity. Raises FormatError
-        for a severity out of range, and where the corruption needs a scene and `test` has none.
+        for a severity out of range, and if the corruption needs a scene and `test` has none.
         """
         samples = test.sweeps.samples
         if not 0 <= severity <= self.severities[-1]:
             raise FormatError(
-                f"severity {severity:g} of stress {self.name!r} is out of range; use 0 to {self.severities[-1]:g}"
+                f"severity {severity:g} of stress {self.name!r} is out of range; use 0 to "
+                f"{self.severities[-1]:g}"
             )
         if self.only == "simulated" and test.scene is None:
             raise FormatError(
-                f"stress {self.name!r} draws sweeps anew and {test.sweeps.source} cannot; use sim:NAME"
+                f"stress {self.name!r} draws sweeps anew and {test.sweeps.source} cannot; "
+                "use sim:NAME"
             )
         if severity == 0:
             return samples
@@ -188,8 +191,8 @@ class Corruption:
 
 
 def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
-    """As the converter digitizes: whole counts within the range of their type; float32 stays as it
-    is."""
+    """Counts as the converter gives them: whole numbers within the range of their type. float32
+    stays unchanged."""
     if kind.kind == "f":
         return x.astype(kind)
     limits = np.iinfo(kind)
@@ -197,7 +200,7 @@ def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
 
 
 def _scene(test: EvaluationSweeps) -> SimulatedScene:
-    """Of corruptions that draw anew, for which `apply` has refused sweeps without a scene."""
+    """The scene of a corruption that draws again; `apply` has refused sweeps without a scene."""
     assert test.scene
     return test.scene
 
@@ -234,16 +237,16 @@ def _window_held(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) ->
 
 
 def _over(times: Array, x: Array) -> Array:
-    """`times` [..., T] as it is broadcast over the taxels and axes of `x` [N, T, R, C] or [N, T, R,
-    C, A]."""
+    """`times` [..., T] in the shape that broadcasts over the taxels and axes of `x` [N, T, R, C] or
+    [N, T, R, C, A]."""
     return times.reshape(*times.shape, *(1,) * (x.ndim - 2))
 
 
 def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator) -> Array:
-    """Taxels read between their neighbours, `rows` further on and turned; beyond its edge the grid
-    is mirrored. Of three axes the first two, shear along rows and columns, turn with the skin.
+    """Taxels interpolated between their neighbours on a grid that is shifted by `rows` and turned.
 
-    share: of GAIN_LAW, by which their gains spread.
+    Beyond its edge the grid is mirrored. With three axes, the two of shear along rows and columns
+    turn with the skin. share: part of GAIN_LAW by which the gains spread.
     """
     r, c = x.shape[2:4]
     i, j = np.indices((r, c)) - (np.array([r, c]) - 1)[:, None, None] / 2
@@ -275,7 +278,7 @@ def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps)
 
 
 def _some(x: Array, n: float, rng: Generator) -> Array:
-    """`n` taxels of each sweep, or all where there are fewer: bool [N, 1, R, C] or [N, 1, R, C,
+    """`n` random taxels of each sweep, or all if there are fewer: bool [N, 1, R, C] or [N, 1, R, C,
     1]."""
     r, c, *axes = x.shape[2:]
     order = rng.permuted(np.tile(np.arange(r * c), (len(x), 1)), axis=1)
@@ -312,7 +315,7 @@ def _speed(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSw
 
 
 def _stretch(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    """The sweep is stretched in time about the window's middle; beyond its ends it is mirrored."""
+    """Stretch the sweep in time about the middle of the window; it is mirrored beyond its ends."""
     frames = x.shape[1]
     spectrum = np.fft.rfft(np.concatenate([x[:, ::-1], x, x[:, ::-1]], axis=1), axis=1)
     n = round(3 * frames / (1 + sign * share))
@@ -336,10 +339,9 @@ def _bits(x: Array, fewer: float, rng: Generator, test: EvaluationSweeps) -> Arr
 
 def _lost(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     lost = rng.random(x.shape[:2]) < share
-    lost[:, [0, -1]] = False  # on the box the frames around the window are there too
-    for t in range(
-        sweep_window.MAX_GAP, x.shape[1]
-    ):  # the box refuses a sweep that lacks more in a row
+    lost[:, [0, -1]] = False  # the box also has the frames around the window
+    # the box refuses a sweep with more lost frames in a row
+    for t in range(sweep_window.MAX_GAP, x.shape[1]):
         lost[:, t] &= ~lost[:, t - sweep_window.MAX_GAP : t].all(axis=1)
     number = np.arange(x.shape[1])
     for taxels, missing in zip(x, lost, strict=True):
@@ -545,14 +547,14 @@ CORRUPTIONS = (
 
 
 def applicable(test: EvaluationSweeps) -> tuple[Corruption, ...]:
-    """All corruptions that apply to `test`: drawn anew where it has a scene, done to the raw counts
-    where it has none."""
+    """All corruptions that apply to `test`: physical ones with a scene, changes of raw counts
+    without."""
     other = "files" if test.scene else "simulated"
     return tuple(corruption for corruption in CORRUPTIONS if corruption.only != other)
 
 
 def find(names: Sequence[str]) -> tuple[Corruption, ...]:
-    """The corruptions of these names. Raises FormatError naming one that is unknown."""
+    """The corruptions with these names. Raises FormatError with the first unknown name."""
     known = {corruption.name: corruption for corruption in CORRUPTIONS}
     for name in names:
         if name not in known:

@@ -1,8 +1,7 @@
-"""Evaluation: method x protocol x fold x seed. In: a sweep set, methods, protocols. Out: one Result
-each.
+"""Evaluation of methods on a sweep set: one Result for each method, protocol and seed.
 
-Every fold is one task, run by parallel.py and kept in a cache: an interrupted run continues where
-it was.
+Every fold is one task. parallel.py runs the tasks, and a cache keeps the results, so that an
+interrupted run continues.
 """
 
 from __future__ import annotations
@@ -45,7 +44,8 @@ class Result:
 
     @property
     def refused(self) -> str:
-        """Why the method cannot work with this set, else ""; there are no other results then."""
+        """Why the method cannot work with this set, or ""; after a refusal all other results are
+        missing."""
         return next((fold.refused for fold in self.folds if fold.refused), "")
 
     @property
@@ -59,7 +59,7 @@ class Result:
         return np.concatenate([fold.logits for fold in self.folds])
 
     def json(self) -> dict[str, Any]:
-        """The result for scripts; every count with its 95 % interval."""
+        """The result for scripts; every count has its 95 % interval."""
         logits, sweeps = self.logits, self.sweeps
         confusion = np.zeros((len(sweeps.materials),) * 2, int)
         np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
@@ -92,7 +92,7 @@ class Result:
         )
 
     def _counts(self, logits: Array) -> dict[str, Any]:
-        """Right answers by window, and by recording where the set has recordings."""
+        """Right answers by window, and by recording if the set has recordings."""
         labels, recording = self.sweeps.labels[self.test], self.sweeps.group("recording")[self.test]
         clusters = Protocol(self.protocol).clusters(self.sweeps)
         clusters = None if clusters is None else clusters[self.test]
@@ -111,9 +111,11 @@ class Result:
         return counts
 
     def _form(self, name: str) -> dict[str, Any]:
-        """The same models in another precision: counts, how far the answers are apart
-        (parity.AnswerDifference), and the accuracy that int8 loses against float, whichever of the
-        two this form is (parity.AccuracyLoss)."""
+        """The same models in another precision.
+
+        Counts, the distance between the answers (parity.AnswerDifference), and the accuracy that
+        int8 loses against float (parity.AccuracyLoss), whichever of the two `name` is.
+        """
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
         labels, clusters = (
@@ -129,27 +131,32 @@ class Result:
         return self._counts(logits) | {key: round(value, 4) for key, value in figures.items()}
 
 
-HEADER = f"{'method':<20} {'protocol':<22} means  {'windows':<30} {'recordings':<30} {'fit s':>7} {'ms':>7}"
+HEADER = (
+    f"{'method':<20} {'protocol':<22} means  {'windows':<30} {'recordings':<30} "
+    f"{'fit s':>7} {'ms':>7}"
+)
 
 
 def line(result: dict[str, Any]) -> str:
-    """What Result.json() returned, as a line under HEADER."""
+    """The result of Result.json() as a line under HEADER."""
     means = "out" if result["means_removed"] else "in"
     counts = [_count(result["window"], result["interval"])]
     counts.append(
         _count(result["recording"], result["recording_interval"]) if "recording" in result else ""
     )
     times = f"{result['fit_s']:>7.2f} {result['ms_p50']:>7.3f}"
-    return f"{result['method']:<20} {result['protocol']:<22} {means:<6} {counts[0]:<30} {counts[1]:<30} {times}"
+    names = f"{result['method']:<20} {result['protocol']:<22} {means:<6}"
+    return f"{names} {counts[0]:<30} {counts[1]:<30} {times}"
 
 
 def _count(count: dict[str, int], ends: Sequence[float]) -> str:
-    return f"{count['right']}/{count['total']} {count['right'] / count['total']:.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
+    right, total = count["right"], count["total"]
+    return f"{right}/{total} {right / total:.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to evaluate: every method under every protocol with every seed, and with what effort.
+    """The runs of an evaluation: every method under every protocol with every seed; and the effort.
 
     each: training sweeps of each material, drawn by the seed from those of a fold; 0 for all.
     """
@@ -162,8 +169,8 @@ class Plan:
     each: int = 0
 
     def folds(self, sweeps: Dataset, protocol: str, seed: int) -> list[tuple[Array, Array]]:
-        """Pairs (training, test) of sweep numbers. Raises FormatError where the protocol does not
-        fit the set."""
+        """Pairs (training, test) of sweep numbers. Raises FormatError if the protocol does not fit
+        the set."""
         pairs = Protocol(protocol).folds(sweeps, seed)
         if not self.each:
             return pairs
@@ -172,8 +179,8 @@ class Plan:
 
 @dataclass(frozen=True)
 class Where:
-    """Where folds run and are kept: see parallel.results. cache None: nowhere. kept: run none, use
-    only kept ones."""
+    """Where folds run (see parallel.results) and in which folder they are kept; cache None keeps
+    none. kept: train nothing and use only kept folds."""
 
     jobs: int = -1
     scheduler: str = ""
@@ -184,10 +191,10 @@ class Where:
 def evaluate(
     sweeps: Dataset, plan: Plan, where: Where, log: Callable[[str], None] = lambda line: None
 ) -> Iterator[Result]:
-    """Results as they are complete; of a method that is refused one for each protocol and seed, at
-    once.
+    """The results in the order in which they are complete. A refused method gives one result for
+    each protocol and seed, at once.
 
-    Raises FormatError where a method or protocol is unknown, or a protocol does not fit the set.
+    Raises FormatError if a method or protocol is unknown, or if a protocol does not fit the set.
     """
     known = known_methods.find(plan.methods, plan.effort)
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
@@ -216,11 +223,11 @@ def evaluate(
 def folds(
     tasks: dict[Any, FoldTask], sweeps: Dataset, data: str, kind: str, where: Where
 ) -> Iterator[tuple[Any, Fold]]:
-    """Every task's Fold: those in the cache first, then the others as they finish.
+    """The Fold of every task: those in the cache first, then the others as they finish.
 
-    On this machine an interrupted training of the paper's CNN goes on from a file beside the folds.
-    data: digest of `sweeps`. kind: the input of the tasks' methods; where it cannot be computed all
-    are refused.
+    On this machine, an interrupted training of the paper's CNN continues from a file beside the
+    folds. data: digest of `sweeps`. kind: the input of the tasks' methods; if it cannot be
+    computed, all tasks are refused.
     """
     paths = {
         name: where.cache / f"{key(task, data)}.npz" for name, task in tasks.items() if where.cache
@@ -241,7 +248,7 @@ def folds(
 def _trained(
     tasks: Sequence[tuple[Any, FoldTask]], sweeps: Dataset, kind: str, where: Where
 ) -> Iterator[tuple[Any, Fold]]:
-    """The Fold of each named task as it finishes; all refused where the input `kind` cannot be
+    """The Fold of each named task as it finishes; all are refused if the input `kind` cannot be
     computed."""
     try:
         shared = (sweeps, known_methods.model_inputs(kind, sweeps)) if tasks else ()

@@ -1,8 +1,7 @@
-"""One fold. In: a method, sweeps to train on and sweeps to test on. Out: a Fold, with logits and
-times.
+"""One fold: a method is trained on some sweeps and tested on others.
 
-A fold is kept under a fingerprint of all that it depends on: the data, the code and the versions of
-libraries too.
+A fold is kept under a fingerprint of all that its result depends on, including the code and the
+versions of libraries.
 """
 
 from __future__ import annotations
@@ -37,8 +36,9 @@ Array = NDArray[Any]
 Answer = Callable[[Array], Array]
 """Raw counts [T, R, C] -> logits [K]."""
 TIMED_SWEEPS = 24
-"""How many test sweeps go one by one through an inference session of the box (of a method without a
-graph, through its library), for their time and to compare their labels."""
+"""Number of test sweeps that are classified one by one, to measure their time and to compare their
+labels. They run in an inference session of the box, or in the method's library if the method has no
+graph."""
 NOT_COUNTED = (
     "train.data.readers",
     "train.data.sets",
@@ -48,7 +48,7 @@ NOT_COUNTED = (
     "train.models.methods",
 )
 """Modules that methods use and that do not change the result of a fold: it stays valid when their
-code changes. Of the sets the data themselves count."""
+code changes. Sets are fingerprinted by their data."""
 OWN = ("train", "appliance")
 COUNTED = ("train", "appliance.signal")
 """Packages whose code may change the result of a fold. `agreement` compares the box's other code
@@ -66,20 +66,20 @@ class FoldTask:
     test: Array
 
     def kept_in(self, path: Path) -> FoldTask:
-        """The same fold, whose unfinished training is kept in this file."""
+        """The same fold with `path` as the file that keeps its unfinished training."""
         return replace(self, effort=replace(self.effort, unfinished=path))
 
 
 @dataclass(frozen=True)
 class Fold:
-    """The result of one fold. logits: float32 [n, K] of its test sweeps; ms: median time of one
-    sweep, features and graph.
+    """The result of one fold.
 
-    agreement: share of the timed sweeps to which the exported graph, or its library where it has
-    none, gives the same label when it answers them one by one. ran: what was trained, where the
-    method's name does not say it. cost: the training's cross entropy, [iterations, 2], where it has
-    one. forms: logits float32 [n, K] of the same sweeps by the same model in other precisions.
-    refused: why the method cannot work with this set; all else is empty then.
+    logits: float32 [n, K] of its test sweeps. ms: median time of one sweep, for features and graph.
+    agreement: share of the timed sweeps that get the same label one by one from the exported graph,
+    or from the library if the method has no graph. ran: name of the trained model, if the method's
+    name does not state it. cost: the training's cross entropy [iterations, 2], if it has one.
+    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions. refused:
+    why the method cannot work with this set; all else is empty then.
     """
 
     test: Array
@@ -107,7 +107,7 @@ class Fold:
 
     @classmethod
     def load(cls, path: Path) -> Fold | None:
-        """What `save` wrote; None where the file is missing or cannot be read."""
+        """Read a fold that `save` wrote; None if the file is missing or cannot be read."""
         try:
             with np.load(path, allow_pickle=False) as z:
                 arrays = {k: z[k] for k in PLAIN}
@@ -123,7 +123,7 @@ PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
 
 
 def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:
-    """Train on one side, answer on the other; a refusal where the method raises FormatError.
+    """Train on one side and classify the other; a refusal if the method raises FormatError.
 
     inputs: the method's input of all `sweeps`.
     """
@@ -169,8 +169,8 @@ def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
 
 
 def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answer:
-    """What answers one sweep: features and the graph in the box's kind of session, or the library
-    that has no graph."""
+    """The function that classifies one sweep: features and the graph in a session like the box's,
+    or the library of a method without a graph."""
     if method.library:
         return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[
             0
@@ -190,20 +190,21 @@ def key(task: FoldTask, data: str) -> str:
 
 
 def fingerprint(about: Any, *modules: str) -> str:
-    """32 hex digits of a hash of `about` (for JSON), of the code of `modules` and of all that they
-    import here, and of the versions of the libraries that this code uses."""
+    """32 hex digits of a hash over `about` (for JSON), the code of `modules`, the code that they
+    import from this project, and the versions of the libraries that this code uses."""
     versions = {name: version(name) for name in libraries(modules)}
     return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
 
 
 @cache
 def libraries(modules: tuple[str, ...]) -> tuple[str, ...]:
-    """The installed distributions that `modules` import, directly or through other code of this
-    project, and those that compute beneath them, as SciPy does beneath scikit-learn.
+    """The installed distributions that can change a result of `modules`.
 
-    The code of the box counts here too: it stays comparable with the desktop's, but the libraries
-    that it calls can change a result. A requirement of a distribution computes where it requires
-    numpy itself; all others, such as Jinja beneath PyTorch, leave a fold as it is.
+    These are the distributions that `modules` import, directly or through other code of this
+    project, and numerical distributions beneath them, such as SciPy beneath scikit-learn. Imports
+    of the box's code count as well: `agreement` guards its code, but the libraries that it calls
+    can change a result. A requirement is numerical if it requires numpy itself. All others, such as
+    Jinja beneath PyTorch, do not change a fold.
     """
     closure = _closure(modules, OWN, NOT_COUNTED)
     roots = {name.partition(".")[0] for module in closure for name in _import_names(module)}
@@ -219,7 +220,7 @@ def libraries(modules: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _normal(name: str) -> str:
-    """The name of a distribution in the one spelling of PEP 503."""
+    """The name of a distribution in the normal form of PEP 503."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -232,7 +233,7 @@ def _installed(name: str) -> bool:
 
 
 def _required(name: str) -> list[str]:
-    """The distributions that `name` requires without its extras; none where it is not installed."""
+    """The distributions that `name` requires without its extras; none if it is not installed."""
     lines = (requires(name) or ()) if _installed(name) else ()
     own = [line for line in lines if not re.search(r";.*\bextra\b", line)]
     return [_normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) for line in own]
@@ -240,7 +241,8 @@ def _required(name: str) -> list[str]:
 
 @cache
 def _code(modules: tuple[str, ...]) -> bytes:
-    """SHA-256 of the code, read once: a process continues with the code that it began with."""
+    """SHA-256 of the code. It is read once, since a process continues with the code that it
+    loaded."""
     code = hashlib.sha256()
     for module in sorted(reached(modules)):
         code.update(_file(module).read_bytes())
@@ -248,13 +250,14 @@ def _code(modules: tuple[str, ...]) -> bytes:
 
 
 def reached(modules: Sequence[str]) -> set[str]:
-    """`modules` and all that these import of the packages COUNTED, directly or not, but for
-    NOT_COUNTED."""
+    """`modules` and all modules of the packages COUNTED that they import, directly or indirectly,
+    without NOT_COUNTED."""
     return _closure(modules, COUNTED, NOT_COUNTED)
 
 
 def _closure(modules: Sequence[str], packages: Sequence[str], without: Sequence[str]) -> set[str]:
-    """`modules` and all that they import of `packages`, directly or not, but for `without`."""
+    """`modules` and all modules of `packages` that they import, directly or indirectly, except
+    `without`."""
     found, left = set(without), list(modules)
     while left:
         if (module := left.pop()) not in found:
@@ -278,8 +281,8 @@ def _imported(module: str, packages: Sequence[str]) -> list[str]:
 
 @cache
 def _import_names(module: str) -> tuple[str, ...]:
-    """All names in the import statements of a module, those in its functions too: `a.b` and `a.b.c`
-    for `from a.b import c`."""
+    """All names in the import statements of a module and of its functions: `a.b` and `a.b.c` for
+    `from a.b import c`."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.Import):

@@ -1,9 +1,8 @@
-"""Many tasks at once. In: a function and its tasks. Out: the result of each, in the order of
-finishing.
+"""Runs many tasks in parallel and yields each result as its task finishes.
 
-joblib runs them on this machine; with the address of a Dask scheduler its workers do. There the
-data is copied to every worker first, so that one that dies loses only the task it was computing,
-which is computed again elsewhere.
+joblib runs them on this machine. With the address of a Dask scheduler, its workers run them: the
+data is first copied to every worker, so that a worker that dies loses only its current task, which
+another worker computes again.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from appliance.core.errors import FormatError
-from train.data.progress import Progress as Progress  # of tasks, which are mostly run here
+from train.data.progress import Progress as Progress  # tasks use it to show progress
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 CONNECT_S = 10
-"""How long a scheduler may take to answer, and its first worker to appear."""
+"""Seconds that a scheduler may take to answer, and its first worker to appear."""
 
 
 def results(
@@ -32,12 +31,12 @@ def results(
     jobs: int = -1,
     scheduler: str = "",
 ) -> Iterator[tuple[Task, Result]]:
-    """call(task, *shared) of every task, as they finish; each has one thread.
+    """The result of call(task, *shared) for every task, as they finish; each has one thread.
 
-    jobs: processes on this machine, -1 one for each core. scheduler: address of a Dask scheduler,
-    whose workers then run all tasks. What a task raises is raised here. Raises FormatError where no
-    scheduler or no worker answers, where workers died so often that a task is given up, and where
-    they lack this project.
+    jobs: processes on this machine, -1 for one on each core. scheduler: address of a Dask
+    scheduler, whose workers then run all tasks. An error of a task is raised here. Raises
+    FormatError if no scheduler or no worker answers, if workers died so often that a task is
+    abandoned, or if they lack this project.
     """
     if scheduler and tasks:
         yield from _on_cluster(call, tasks, shared, scheduler)
@@ -60,7 +59,7 @@ def _on_cluster(
     call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], scheduler: str
 ) -> Iterator[tuple[Task, Result]]:
     try:
-        # asked directly: joblib's Dask backend waits for ever when a task cannot be run any more
+        # not through joblib: its Dask backend waits for ever if a task cannot run any more
         from distributed import Client, KilledWorker, wait
     except ImportError as e:
         raise FormatError(
@@ -95,7 +94,8 @@ def _on_cluster(
             if "deserialization" not in str(e):
                 raise
             raise FormatError(
-                f"the cluster at {scheduler!r} lacks this version of palpate-train; install it there"
+                f"the cluster at {scheduler!r} lacks this version of palpate-train; "
+                "install it there"
             ) from e
         except KilledWorker as e:
             raise FormatError(

@@ -1,9 +1,8 @@
-"""Robustness: under which corruptions each method fails. In: methods, a training set,
-EvaluationSweeps. Out: curves.
+"""Robustness: accuracy of each method under each corruption.
 
 One task is one method and one seed: `evaluate_method` trains it and tests it under every
-corruption, `merge` makes a result of many tasks, wherever they ran. What a task returns, and the
-result, are plain numbers and text that JSON can hold.
+corruption. `merge` joins the results of many tasks. The results of tasks and the joined result hold
+only numbers and text, for JSON.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_input
 Array = NDArray[Any]
 Json = dict[str, Any]
 POINTS = 0.05
-"""A method fails where it has lost so much of its own accuracy."""
+"""Loss of accuracy at which a method counts as failed, against its own accuracy on clean sweeps."""
 
 
 def evaluate_method(
@@ -46,16 +45,18 @@ def evaluate_method(
     corruptions: Sequence[Corruption] | None,
     seed: int,
 ) -> Json:
-    """A task: train `method` and test it under `corruptions`; None stands for all that apply to the
-    test sweeps.
+    """A task: train `method` and test it under `corruptions`; None for all that apply to the test
+    sweeps.
 
-    Where the method cannot work with this set, the reason is in `refused`. Raises FormatError where
-    train and test differ in format or materials: that is the caller's mistake.
+    If the method cannot work with this set, the reason is in `refused`. Raises FormatError if train
+    and test differ in format or materials, which is a mistake of the caller.
     """
     if (train.format, train.materials) != (test.sweeps.format, test.sweeps.materials):
         raise FormatError(
-            f"{test.sweeps.source} ({test.sweeps.format}, {len(test.sweeps.materials)} materials) is "
-            f"not of the kind of {train.source} ({train.format}, {len(train.materials)} materials); "
+            f"{test.sweeps.source} ({test.sweeps.format}, {len(test.sweeps.materials)} "
+            "materials) is "
+            f"not of the kind of {train.source} ({train.format}, {len(train.materials)} "
+            "materials); "
             "test on what the methods are trained for"
         )
     try:
@@ -72,8 +73,8 @@ def evaluate_model(
     corruptions: Sequence[Corruption] | None,
     seed: int,
 ) -> Json:
-    """What `evaluate_method` returns, of a trained model. The sweeps depend on test, corruption,
-    severity and seed alone."""
+    """The result of `evaluate_method` for a trained model. The sweeps depend only on test,
+    corruption, severity and seed."""
     trials = CorruptionCounts(test)
     clean = _right(method, model, test.sweeps, test.sweeps.samples)
     for corruption in applicable(test) if corruptions is None else corruptions:
@@ -94,15 +95,15 @@ def evaluate_model(
 
 
 class CorruptionCounts:
-    """Counts right answers to `test` under one corruption after another, for a task that `merge`
-    takes."""
+    """Counts right answers to `test` under one corruption after another; `merge` takes the
+    result."""
 
     def __init__(self, test: EvaluationSweeps) -> None:
         self.test, self.curves = test, dict[str, Json]()
 
     def add(self, corruption: Corruption, answers: Sequence[tuple[Array, int]]) -> None:
-        """answers: at each severity, bool [N], which sweeps were named rightly, and how many
-        answers were not finite."""
+        """answers: for each severity, bool [N] of the right answers, and the number of answers that
+        were not finite."""
         position = self.test.sweeps.groups.get("position")
         low, high = zip(*(interval(right, position) for right, _ in answers), strict=True)
         self.curves[corruption.name] = {
@@ -117,7 +118,7 @@ class CorruptionCounts:
         }
 
     def task(self, name: str, seed: int) -> Json:
-        """All of it; `name` answered."""
+        """All counts as a task of the method `name`."""
         sweeps = self.test.sweeps
         return {
             "method": name,
@@ -141,11 +142,11 @@ def run(
     effort: Effort = FULL_EFFORT,
     log: Callable[[str], None] = lambda line: None,
 ) -> Json:
-    """All methods and seeds under all corruptions that apply, merged; tasks whose results are kept
-    are not done again.
+    """All methods and seeds under all corruptions that apply, merged. Kept tasks do not run again.
 
-    Every method gets its first seed before any gets its second, so that an interrupted run compares
-    alike. Raises FormatError as `evaluate_method` does, and for an unknown method.
+    Every method runs with the first seed before any method gets the second, so that the results of
+    an interrupted run can be compared. Raises FormatError as `evaluate_method` does, and for an
+    unknown method.
     """
     about = [digest(train), digest(test.sweeps), test.scene is not None]
     tasks = {
@@ -183,13 +184,13 @@ def _run_task(
 
 
 def merge(tasks: Iterable[Json]) -> Json:
-    """The result of tasks, whatever their order: {"sets": [...], "methods": {name: entry}}.
+    """Join tasks in any order: {"sets": [...], "methods": {name: entry}}.
 
-    An entry holds seeds, refused ("" or why), ran, clean (accuracy), curves and trouble. A curve
-    holds title, unit, about, severities, right and total (sums), accuracy, low and high, broken
-    (answers that were not finite; they count as wrong), falls and lost. low to high is the mean of
-    the tasks' 95 % intervals, extended to the spread of the tasks: seeds see the same sweeps, and
-    the interval of their sum would be too narrow.
+    An entry holds seeds, refused ("" or the reason), ran, clean (accuracy), curves and trouble. A
+    curve holds title, unit, about, severities, right and total (sums), accuracy, low and high,
+    broken (number of answers that were not finite; they count as wrong), falls and lost. low and
+    high are the means of the tasks' 95 % intervals, extended to the spread of the tasks: seeds
+    share their sweeps, and the interval of their sum would be too narrow.
     """
     tasks = sorted(tasks, key=lambda t: (t["set"], t["seed"]))
     names = sorted({t["method"] for t in tasks})
@@ -198,11 +199,8 @@ def merge(tasks: Iterable[Json]) -> Json:
 
 
 def falls(curve: Json, points: float = POINTS) -> float | None:
-    """The severity at which accuracy is `points` below that of clean sweeps, on the line between
-    two severities.
-
-    None where it never is.
-    """
+    """The severity at which accuracy is `points` below that of clean sweeps, interpolated between
+    two severities; None if it never is."""
     severity: list[float] = curve["severities"]
     accuracy: list[float] = curve["accuracy"]
     limit = accuracy[0] - points + 1e-9  # .9 - .05 is less than .85
@@ -214,8 +212,8 @@ def falls(curve: Json, points: float = POINTS) -> float | None:
 
 
 def breaks_first(curves: Mapping[str, Any]) -> list[str]:
-    """The corruptions that cost five points, those first that do so in the smallest share of the
-    range tried."""
+    """The corruptions that cost five points, ordered by the share of their range that this
+    takes."""
     reach = {
         name: curve["falls"] / curve["severities"][-1]
         for name, curve in curves.items()
@@ -225,11 +223,10 @@ def breaks_first(curves: Mapping[str, Any]) -> list[str]:
 
 
 def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) -> dict[str, str]:
-    """What becomes of uninformative sweeps on the desktop: "finite", "refused: why", "not finite"
-    or "crashed: why".
+    """The answers of a method on the desktop to sweeps without information, by kind of sweep.
 
-    They take the way of all sweeps: into a checked set, then to the method's input, then to the
-    model.
+    Each is "finite", "refused: why", "not finite" or "crashed: why". The sweeps pass through the
+    same stages as all others: a checked set, the method's input, the model.
     """
     found = {}
     for name, taxels in _uninformative(test.sweeps.format, test.load).items():
@@ -243,14 +240,14 @@ def uninformative_answers(method: Method, model: Model, test: EvaluationSweeps) 
             found[name] = "finite" if np.isfinite(logits).all() else "not finite"
         except FormatError as e:
             found[name] = f"refused: {e}"
-        except Exception as e:  # whatever a method's libraries raise: the table is there to show it
+        except Exception as e:  # the table shows any error of a method's libraries
             found[name] = f"crashed: {type(e).__name__}: {e}"
     return found
 
 
 def box_answers(bundle: Bundle) -> dict[str, str]:
-    """The same on the box: the status of each verdict, with "not finite" where one of its numbers
-    is not."""
+    """The answers of the box to the same sweeps: the status of each verdict, or "not finite" if one
+    of its numbers is not."""
     limits = bundle.manifest.thresholds
     found = {}
     for name, taxels in _uninformative(bundle.format, limits.full_scale).items():
@@ -276,15 +273,15 @@ def answer(bundle: Bundle, taxels: Array) -> Verdict:
 
 
 def _right(method: Method, model: Model, sweeps: Dataset, samples: Array) -> tuple[Array, int]:
-    """Which of `samples` are named rightly, bool [N], and how many answers are not finite (those
-    are wrong)."""
+    """bool [N], the `samples` that get the right label, and the number of answers that are not
+    finite. Those count as wrong."""
     logits = np.asarray(model.logits(model_inputs(method.input, replace(sweeps, samples=samples))))
     finite = np.isfinite(logits).all(axis=1)
     return finite & (logits.argmax(axis=1) == sweeps.labels), int(np.sum(~finite))
 
 
 def _entry(tasks: list[Json]) -> Json:
-    """One method of the result, from all its tasks."""
+    """The entry of one method from all its tasks."""
     done = [t for t in tasks if not t["refused"]]
     refused = next((t["refused"] for t in tasks if t["refused"]), "")
     entry: Json = {
@@ -300,7 +297,7 @@ def _entry(tasks: list[Json]) -> Json:
             [t["curves"][name] for t in done], np.array([t["total"] for t in done])
         )
         entry["clean"] = entry["curves"][name]["accuracy"][0]
-    for t in done:  # of several answers the worst one counts
+    for t in done:  # the worst of several answers counts
         for name, status in t["trouble"].items():
             entry["trouble"][name] = max(entry["trouble"].get(name, status), status, key=_badness)
     return entry
@@ -311,7 +308,7 @@ def _badness(status: str) -> int:
 
 
 def _curve(parts: list[Json], totals: Array) -> Json:
-    """The tasks' curves of one method and corruption as one. totals [tasks]: sweeps of each."""
+    """The joined curve of one method and corruption. totals [tasks]: sweeps of each task."""
     right = np.array([part["right"] for part in parts])  # [tasks, severities]
     shares = right / totals[:, None]
     accuracy = right.sum(axis=0) / totals.sum()
@@ -330,8 +327,8 @@ def _curve(parts: list[Json], totals: Array) -> Json:
 
 
 def _uninformative(format: SweepFormat, top: float) -> dict[str, Array]:
-    """Windows [T, R, C] or [T, R, C, A] without information, one of a single frame. top: the
-    highest count where their type sets none."""
+    """Windows [T, R, C] or [T, R, C, A] without information, one of them with a single frame. top:
+    the highest count, for a type without a limit."""
     level = np.full((format.window, *format.shape), top / 2).astype(format.numpy_type)
     whole = format.numpy_type.kind != "f"
     found = {

@@ -1,9 +1,8 @@
-"""Uncertainty: how far probabilities can be trusted. In: Cases. Out: figures, as the results hold
-them.
+"""Figures on uncertainty, computed from Cases: how far probabilities can be trusted.
 
-Calibration, the sequential test, unknown materials, enrolment and early decisions, each on test
-sweeps that nothing was fitted on. Intervals are 95 %, bootstrapped over the places where the skin
-sat, whose sweeps fail together.
+They cover calibration, the sequential test, unknown materials, enrolment and early decisions, each
+on test sweeps that nothing was fitted to. Intervals are 95 %, from a bootstrap over the placements
+of the skin, since the errors of sweeps at one placement are correlated.
 """
 
 from __future__ import annotations
@@ -35,18 +34,18 @@ from train.models.recipe.calibrate import Calibration
 Array = NDArray[Any]
 Json = dict[str, Any]
 BINS = 10
-"""Of the reliability diagram and of the calibration error."""
+"""Bins of the reliability diagram and of the calibration error."""
 WANTED = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 MOST_SWEEPS = 5
-"""After so many sweeps of an object the answer is final."""
+"""Number of sweeps of an object after which the answer is final."""
 ENROLLED = (1, 2, 3, 5, 7, 10)
 """Numbers of sweeps from which a material is enrolled."""
 LIMITS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0)
-"""Multiples of the novelty limit at which what it keeps and what it lets through is reported."""
+"""Multiples of the novelty limit at which the shares of kept and of passed sweeps are reported."""
 DRAWS, ORDERS = 500, 20
 """Draws of the bootstrap; random orders of the sweeps of one object, or of one enrolment."""
 Trained = tuple[Case, Calibration]
-"""One training, and what is fitted after it."""
+"""One training and its calibration."""
 
 
 def run(
@@ -59,10 +58,10 @@ def run(
     effort: Effort = methods.FULL_EFFORT,
     seed: int = 1,
 ) -> dict[str, Any]:
-    """All figures, as the results hold them. test: the set that is tested on; without it
-    `protocol` says what is left out.
+    """All figures for the results. test: the set to test on; without it, `protocol` selects the
+    held-out sweeps.
 
-    Raises FormatError where the sets do not fit, or the method cannot do it.
+    Raises FormatError if the sets do not fit together, or if the method gives no such figures.
     """
     start = time.monotonic()
     if test is not None:
@@ -94,7 +93,7 @@ def run(
 
 
 def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
-    """All figures; those that need a material left out are missing where there are only two."""
+    """All figures. With two materials there are none that need a material left out."""
     fitted = [(case, case.calibration()) for case in trained]
     full = [one for one in fitted if one[0].left_out < 0]
     result = {
@@ -110,8 +109,8 @@ def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Jso
 
 
 def calibration(full: Sequence[Trained]) -> Json:
-    """Expected calibration error and reliability before (LDA's own posteriors) and after the
-    temperature."""
+    """Expected calibration error and reliability before the temperature (LDA's own posteriors) and
+    after."""
     labels, places = _joined(full, "labels"), _places(full)
     result: Json = {
         "n": len(labels),
@@ -151,8 +150,8 @@ def _error_of(confidence: Array, right: Array, some: Array) -> float:
 
 
 def reliability(confidence: Array, right: Array) -> list[Json]:
-    """Of each bin of the highest probability [n] that is not empty: its mean (`said`), the share
-    right, the number."""
+    """For each non-empty bin of the highest probability [n]: its mean (`said`), the share of right
+    answers, and their number."""
     which = np.minimum((confidence * BINS).astype(int), BINS - 1)
     some = [(which == b) for b in range(BINS) if (which == b).any()]
     return [
@@ -166,11 +165,11 @@ def reliability(confidence: Array, right: Array) -> list[Json]:
 
 
 def sequence(full: Sequence[Trained], seed: int) -> Json:
-    """Mean number of sweeps against accuracy for WANTED probabilities: sweeps of one object are
-    fused until the probability is reached, or up to MOST_SWEEPS.
+    """Mean number of sweeps and accuracy for each of the WANTED probabilities.
 
-    "same place": all sweeps of one attachment, whose errors are correlated; "several places": from
-    anywhere in the test.
+    Sweeps of one object are fused until the probability is reached, at most MOST_SWEEPS. "same
+    place": all sweeps are of one attachment, and their errors are correlated. "several places":
+    they are drawn from all test sweeps.
     """
     log_p = np.log(
         np.maximum(
@@ -205,7 +204,7 @@ def sequence(full: Sequence[Trained], seed: int) -> Json:
 
 
 def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json:
-    """The sequential test's result where it stops at the probability `wanted`, or after the last
+    """The result of a sequential test that stops at the probability `wanted` or after the last
     sweep."""
     enough = fused.max(2) >= wanted
     decided = enough.any(axis=1)
@@ -223,8 +222,8 @@ def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json
 
 
 def early(full: Sequence[Trained]) -> Json:
-    """Accuracy against the mean share of the sweep: by the rules as found in training, by others,
-    always at a tenth."""
+    """Accuracy and mean share of the sweep for the rules found in training, for other rules, and
+    for an answer after the first tenth."""
     labels, places = _joined(full, "labels"), _places(full)
     p = np.concatenate([done.probabilities(case.new) for case, done in full])
     whole = p[:, -1].argmax(1) == labels
@@ -271,10 +270,13 @@ def early(full: Sequence[Trained]) -> Json:
 
 
 def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
-    """Leave one material out: AUROC of known test sweeps against those of the material, by several
-    scores; the share of known sweeps that the limit found in training keeps, and of unknown ones
-    that it lets through as known; the same at multiples of the limit, and where a second sweep at
-    the same place must pass too."""
+    """Detection of a material that was left out of training.
+
+    Gives the AUROC of known test sweeps against those of the material, for several scores; the
+    share of known sweeps below the limit found in training, and of unknown sweeps that pass as
+    known; the same at multiples of the limit, and if a second sweep at the same placement must pass
+    as well.
+    """
     materials_of: dict[str, Json] = {}
     every: dict[str, list[float]] = {}
     passed: list[Array] = []
@@ -332,9 +334,9 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
 def _passed(
     scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int
 ) -> tuple[float, float]:
-    """Shares of known and of unknown sweeps that pass `factor` times the limit, each together with
-    the n - 1 sweeps of its material that follow at its place; the last sweeps of a place have too
-    few and are left out."""
+    """Shares of known and of unknown sweeps that pass `factor` times the limit together with the
+    next n - 1 sweeps of their material at their placement. The last sweeps of a placement have too
+    few successors and are left out."""
     order = np.lexsort((labels, places))
     here, fits = np.stack([places, labels])[:, order], (scores <= factor)[order]
     size = len(order) - n + 1
@@ -353,8 +355,7 @@ def _mean_of(values: Array, some: Array) -> float:
 
 
 def _of_trunk(case: Case, done: Calibration) -> Array:
-    """Squared distance in the trained features alone; the same for all sweeps where there are
-    none."""
+    """Squared distance in the trained features alone; 0 for all sweeps if there are none."""
     if not (size := case.seen.shape[2] - case.fixed):
         return np.zeros(len(case.new))
     return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
@@ -368,16 +369,18 @@ SCORES: dict[str, Callable[[Case, Calibration], Array]] = {
     ).novelty(case.new[:, -1]),
     "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
 }
-"""Each is larger for a sweep that is less like the training sweeps. Limits of several folds differ:
-the first score is in units of the limit."""
+"""Each score is larger for a sweep that is less like the training sweeps. The limits of folds
+differ, so the first score is in units of the limit."""
 
 
 def enrolment(
     full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int
 ) -> Json:
-    """Leave a material out and enrol it from some sweeps of one place: balanced accuracy of all
-    classes there and elsewhere, as a share of that of the model trained on all; and the accuracy
-    that the old classes lose."""
+    """Enrolment of a material that was left out of training, from some sweeps of one placement.
+
+    Gives the balanced accuracy of all classes at the same placement and at others, as a share of
+    that of the model trained on all materials; and the accuracy lost by the old classes.
+    """
     whole = {case.fold: (case, done) for case, done in full}
     rows: dict[tuple[str, int], list[tuple[float, ...]]] = {}
     for case, done in without:
@@ -413,8 +416,8 @@ def enrolment(
 def _enrolled(
     case: Case, done: Calibration, whole: Case, trained: Calibration, rng: np.random.Generator
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
-    """Of random draws: (sweeps, where, (accuracy, that of the whole model, recall of the new one,
-    loss of the old))."""
+    """For each random draw: (sweeps, where, (accuracy, accuracy of the model trained on all
+    materials, recall of the new material, loss of the old ones))."""
     z, k = done.embedding(case.new[:, -1]), case.left_out
     as_trained = trained.logits(whole.new[:, -1]).argmax(1)
     names = np.append(
@@ -453,8 +456,8 @@ def _enrolled(
 
 
 def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
-    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r] with one label more,
-    enrolled from `sweeps` [m, r] as the box enrols it."""
+    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r]; the last label is
+    enrolled from `sweeps` [m, r] as on the box."""
     enrolled = extended(embedding.classes(), sweeps)
     logits: Array = z @ enrolled.means.T + enrolled.bias
     return logits
@@ -469,13 +472,13 @@ def _joined(held: Sequence[Trained], name: str) -> Array:
 
 
 def _places(held: Sequence[Trained]) -> Array:
-    """Where the skin sat, from 0 on."""
+    """The placement of the skin in each test sweep, numbered from 0."""
     places: Array = np.unique(_joined(held, "places"), return_inverse=True)[1]
     return places
 
 
 def _parted(rows: Array, held: Sequence[Trained]) -> list[Array]:
-    """`rows` of all cases, case by case."""
+    """`rows` of all cases, split by case."""
     return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
 
 
@@ -489,11 +492,12 @@ def _accuracy(right: Array, clusters: Array) -> Json:
 
 
 def _bootstrap(figure: Callable[[Array], float], clusters: Array) -> tuple[float, float]:
-    """The 95 % interval of `figure` (of sweep numbers), by a bootstrap of whole clusters [n]."""
+    """The 95 % interval of `figure`, a function of sweep numbers, from a bootstrap of clusters
+    [n]."""
     members = [np.flatnonzero(clusters == c) for c in np.unique(clusters)]
     rng, drawn = np.random.default_rng(0), []
     for _ in range(DRAWS):
-        with suppress(FormatError):  # a draw without a sweep of one kind has no figure
+        with suppress(FormatError):  # a draw that lacks a kind of sweep has no figure
             drawn.append(
                 figure(
                     np.concatenate(

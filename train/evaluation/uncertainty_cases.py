@@ -1,9 +1,8 @@
-"""Trainings for the study of uncertainty. In: a sweep set, its folds, a method. Out: Cases, kept in
-a cache.
+"""Trainings for the figures on uncertainty, kept in a cache as Cases.
 
 A Case is one training, on all materials or all but one, with the features of every sweep. All
-figures are computed from Cases without training again. Sweeps that a rule, a limit or a temperature
-is fitted on are never tested on.
+figures are computed from Cases without another training. Sweeps to which a rule, a limit or a
+temperature is fitted are never test sweeps.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ from train.onnx_tools.graph_builder import run as run_graph
 Array = NDArray[Any]
 Log = Callable[[str], None]
 NONE_LEFT_OUT = -1
-"""Stands for the material left out where none is."""
+"""The value of left_out if no material is left out."""
 
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One training. train, test: numbers of sweeps; left_out: a material, or NONE_LEFT_OUT."""
+    """One training. train, test: numbers of sweeps. left_out: a material, or NONE_LEFT_OUT."""
 
     method: str
     effort: Effort
@@ -54,15 +53,16 @@ class CaseTask:
 
 @dataclass(frozen=True)
 class Case:
-    """The result of one training. left_out: the material it did not see. fixed: number of features
-    that were not trained; they are the last ones.
+    """The result of one training. left_out: the material without training sweeps. fixed: number of
+    features that were not trained; they are the last ones.
 
-    seen: features [N, 10, F] of prefixes of the training sweeps, whose materials are numbered
-    `seen_labels` [N] from 0 on without the one left out; seen_groups [N]: positions or recordings;
-    judged: bool [N], those that the trunk did not see, which may judge. copied: features [M, F] of
-    augmented copies, of copied_labels, copied_groups and copied_held [M]; see AugmentedCopies.
-    faulty: bool [N] of the seen sweeps; see CalibrationInputs. new, labels, places: features
-    of test sweeps, the set's labels, and where the skin sat. plan: HeadPlan.json as text.
+    seen: features [N, 10, F] of prefixes of the training sweeps. seen_labels [N]: their materials,
+    numbered from 0 without left_out. seen_groups [N]: positions or recordings. judged: bool
+    [N], the sweeps that the trunk did not see, on which a choice may be judged. copied: features
+    [M, F] of augmented copies, with copied_labels, copied_groups and copied_held [M]; see
+    AugmentedCopies. faulty: bool [N] of the seen sweeps; see CalibrationInputs. new, labels,
+    places: features of the test sweeps, the set's labels, and the placements of the skin. plan:
+    HeadPlan.json as text.
     """
 
     left_out: int
@@ -88,7 +88,7 @@ class Case:
         return known
 
     def calibration(self) -> Calibration:
-        """What is fitted on the trunk of this training."""
+        """The calibration that is fitted on the trunk of this training."""
         copies = AugmentedCopies(
             self.copied, self.copied_labels, self.copied_groups, self.copied_held
         )
@@ -106,8 +106,8 @@ class Case:
         return fit_calibration(given)
 
     def numbered(self) -> Array:
-        """The test sweeps' labels [n], numbered as `seen_labels`; those of the material left out
-        mean nothing."""
+        """The test sweeps' labels [n], numbered like `seen_labels`. Those of the material left out
+        have no meaning."""
         if self.left_out == NONE_LEFT_OUT:
             return self.labels
         return self.labels - (self.labels > self.left_out)
@@ -116,12 +116,13 @@ class Case:
 def learn(task: CaseTask, sweeps: Dataset) -> Case:
     """Train, and compute the features of every sweep with the trained trunk.
 
-    Raises FormatError where the method is none of the compact family, or cannot work with this set.
+    Raises FormatError if the method is not one of the compact family, or cannot work with this set.
     """
     (method,) = methods.find([task.method], task.effort)
     if not methods.module_of(task.method).startswith("train.models.recipe."):
         raise FormatError(
-            f"method {task.method!r} gives no features of tenths; use default, compact or one of its family"
+            f"method {task.method!r} gives no features of the tenths of a sweep; "
+            "use default, compact or one of its family"
         )
     kept = task.train[sweeps.labels[task.train] != task.left_out]
     part = sweeps.take(kept)
@@ -155,7 +156,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
 def tasks(
     sweeps: Dataset, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
 ) -> list[CaseTask]:
-    """Every fold with all materials, and without each of them in turn where at least two remain."""
+    """Every fold with all materials, and without each of them in turn if at least two remain."""
     out = [NONE_LEFT_OUT, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
     return [
         CaseTask(method, effort, seed, i, *fold, left)
@@ -165,8 +166,8 @@ def tasks(
 
 
 def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:
-    """The Case of each task in their order: kept ones from the cache, the others trained. log:
-    receives the progress."""
+    """The Case of each task in order, from the cache or from a new training. log: receives the
+    progress."""
     data, done = digest(sweeps), {}
     keys = [
         fingerprint(

@@ -109,7 +109,8 @@ def aligned(test: Dataset, train: Dataset) -> Dataset:
     """
     if test.format != train.format:
         raise FormatError(
-            f"{train.source} is of {train.format}, {test.source} of {test.format}; name sets of one form"
+            f"{train.source} is of {train.format}, {test.source} of {test.format}; name "
+            "sets of one form"
         )
     numbers = np.array(
         [train.materials.index(name) if name in train.materials else -1 for name in test.materials]

@@ -35,11 +35,13 @@ def chosen(found: SweepSource, numbers: range | None) -> list[int]:
         return [round(at) for at in np.linspace(0, found.count - 1, min(found.count, MOST, held))]
     if numbers.stop > found.count:
         raise FormatError(
-            f"--number {numbers.start}-{numbers.stop - 1}: {found.name} holds sweeps 0 to {found.count - 1}; name some of them"
+            f"--number {numbers.start}-{numbers.stop - 1}: {found.name} holds sweeps 0 to "
+            f"{found.count - 1}; name some of them"
         )
     if len(numbers) > held:
         raise FormatError(
-            f"--number {numbers.start}-{numbers.stop - 1} are {len(numbers)} sweeps; a page holds {held} of this skin: name fewer"
+            f"--number {numbers.start}-{numbers.stop - 1} are {len(numbers)} sweeps; a "
+            f"page holds {held} of this skin: name fewer"
         )
     return list(numbers)
 

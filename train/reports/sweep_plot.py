@@ -196,7 +196,8 @@ def _grid(path: Path, tare: Any, grid: tuple[int, ...]) -> Array:
         made = np.empty(0)
     if made.shape != grid or not np.isfinite(made).all():
         raise FormatError(
-            f"{path}: the tare in its .json is no {' x '.join(map(str, grid))} numbers; write null there"
+            f"{path}: the tare in its .json is no {' x '.join(map(str, grid))} numbers; "
+            "write null there"
         )
     return made
 

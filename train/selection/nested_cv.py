@@ -1,9 +1,8 @@
-"""Nested cross-validation. In: a scene's sweeps, and the groups that vary there. Out: what a method
-gets right.
+"""Nested cross-validation of methods on the sweeps of a scene, over the groups that vary there.
 
 The values of every group that varies are distributed over a few parts. A method is trained without
-one part, or without two, and tested on them. One training without the parts p and q is used twice:
-as the inner fold that tests on q while p is held out, and the other way round.
+one part or without two parts, and tested on them. A training without the parts p and q serves two
+inner folds: p is held out and q tests, or q is held out and p tests.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ from train.selection.scene import Scene
 
 Array = NDArray[Any]
 FOLDS = {0: 5, 1: 5, 2: 4}
-"""Parts of each group by the number of groups; MANY_GROUPS for more. Five parts make fifteen
-trainings of a method, two times four parts thirty-six."""
+"""Parts of each group, by the number of groups; MANY_GROUPS for more groups. Five parts take
+fifteen trainings of a method, two groups of four parts take thirty-six."""
 MANY_GROUPS = 3
 Unseen = tuple[int, ...]
-"""Numbers of the one or two parts that are left out of a training."""
+"""Numbers of the one or two parts that a training leaves out."""
 
 
 class Refused(FormatError):
@@ -46,7 +45,7 @@ class Refused(FormatError):
 
 @dataclass(frozen=True)
 class HeldOutPart:
-    """Some values of one group. out: bool [N], its sweeps."""
+    """Some values of one group. out: bool [N], the sweeps with these values."""
 
     group: str
     values: tuple[int, ...]
@@ -54,11 +53,11 @@ class HeldOutPart:
 
 
 def parts(sweeps: Dataset, varies: Sequence[str], folds: int = 0) -> list[HeldOutPart]:
-    """The parts of all groups `varies`; of recordings, with materials spread evenly, where nothing
-    varies.
+    """The parts of all groups `varies`. If nothing varies, parts of the recordings, with the
+    materials spread evenly.
 
-    Raises FormatError where a group has a single value, divides recordings, or where leaving out a
-    part leaves a material without training sweeps.
+    Raises FormatError if a group has a single value, if it divides recordings, or if a material has
+    no training sweeps without one of the parts.
     """
     most = folds or FOLDS.get(len(varies), MANY_GROUPS)
     if not varies:
@@ -89,7 +88,8 @@ def _part(sweeps: Dataset, name: str, values: Array) -> HeldOutPart:
         )
     for label in np.setdiff1d(sweeps.labels[out], sweeps.labels[~out]):
         raise FormatError(
-            f"{sweeps.source}: without {name} {first} there is no {sweeps.materials[label]!r} to train on; "
+            f"{sweeps.source}: without {name} {first} there is no "
+            f"{sweeps.materials[label]!r} to train on; "
             f"record it elsewhere too, or take {name!r} out of varies"
         )
     return HeldOutPart(name, tuple(sorted(values.tolist())), out)
@@ -97,8 +97,8 @@ def _part(sweeps: Dataset, name: str, values: Array) -> HeldOutPart:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far one method is behind another: the mean share of sweeps, its standard error and its 95
-    % interval."""
+    """The difference between two methods: mean share of sweeps, standard error and 95 %
+    interval."""
 
     mean: float
     se: float
@@ -107,20 +107,20 @@ class Difference:
 
     @property
     def within(self) -> bool:
-        """Whether it is at most one standard error."""
+        """Whether the difference is at most one standard error."""
         return self.mean <= self.se + 1e-12
 
     def json(self) -> dict[str, float]:
-        """For scripts, rounded."""
+        """The figures for scripts, rounded."""
         return {k: round(v, 4) for k, v in vars(self).items()}
 
 
 class Trials:
-    """Trains and tests on a scene's sweeps, each training once. sweeps: as recorded; asked: with
-    the corrupted ones too.
+    """Trains and tests on a scene's sweeps; each training runs once. sweeps: as recorded; asked:
+    together with the corrupted ones.
 
-    conditions: names of the corruptions of the test sweeps, of which each counts the same; the
-    first is none. progress: counts the trainings.
+    conditions: names of the corruptions of the test sweeps, with equal weights; the first is none.
+    progress: counts the trainings.
     """
 
     def __init__(
@@ -153,7 +153,8 @@ class Trials:
 
     @property
     def most(self) -> int:
-        """The trainings that a method takes at most: without each part, and without each two."""
+        """The largest number of trainings for one method: without each part, and without each two
+        parts."""
         return len(self.seeds) * (len(self.parts) + len(self.pairs()))
 
     def pairs(self) -> list[Unseen]:
@@ -162,8 +163,8 @@ class Trials:
         return [u for u in every if len(np.unique(self.sweeps.labels[self._kept(u)])) > 1]
 
     def run(self, method: str, what: Sequence[Unseen], changes: Sequence[Change] = ()) -> None:
-        """Train `method` without each of `what`; changes: of the sweeps, one for each of `what`.
-        Raises Refused where the method cannot work with them."""
+        """Train `method` without each of `what`. changes: of the sweeps, one for each of `what`.
+        Raises Refused if the method cannot work with them."""
         changes = changes or [WHOLE] * len(what)
         left = [
             (method, c, s, u)
@@ -194,16 +195,16 @@ class Trials:
         return kept
 
     def _split(self, unseen: Unseen) -> tuple[Array, Array]:
-        """Numbers of sweeps of `asked`: those as recorded to train on, all conditions to test
-        on."""
+        """Numbers of sweeps in `asked`: as recorded for training, in all conditions for the
+        test."""
         kept = self._kept(unseen)
         return np.flatnonzero(kept), np.flatnonzero(np.tile(~kept, len(self.conditions)))
 
     def folds(
         self, method: str, unseen: Unseen, change: Change = WHOLE
     ) -> Iterator[tuple[int, Array, Array]]:
-        """The results of `run` for each seed and condition: the condition's number, sweeps [n],
-        logits [n, K]."""
+        """The results of `run` for each seed and condition: (number of the condition, sweeps [n],
+        logits [n, K])."""
         for seed in self.seeds:
             fold = self._done[method, change, seed, unseen]
             condition, sweep = np.divmod(fold.test, len(self.sweeps))
@@ -212,8 +213,8 @@ class Trials:
                 yield c, sweep[tested], fold.logits[tested]
 
     def right(self, method: str, unseen: Unseen, change: Change = WHOLE) -> Array:
-        """Share [N] of the seeds and conditions in which each sweep got the right label; NaN where
-        it was not tested."""
+        """Share [N] of the seeds and conditions in which each sweep got the right label; NaN if it
+        was not tested."""
         total = np.zeros(len(self.sweeps))
         for _, sweep, logits in self.folds(method, unseen, change):
             total[sweep] += logits.argmax(1) == self.sweeps.labels[sweep]
@@ -224,10 +225,10 @@ class Trials:
     def scores(
         self, method: str, aside: int | None = None, changes: Sequence[Change] = ()
     ) -> Array:
-        """`right` of every sweep when its own part is left out, [groups, N].
+        """`right` of every sweep by the training without its own part, [groups, N].
 
-        aside: a part that no training and no test may use; NaN there. changes: of the sweeps, one
-        for each part.
+        aside: a part that is used neither for training nor for tests; NaN there. changes: of the
+        sweeps, one for each part.
         """
         rows = np.full((len(self.groups), len(self.sweeps)), np.nan)
         keys = self.seen_from(aside)
@@ -241,19 +242,20 @@ class Trials:
         return rows
 
     def seen_from(self, aside: int | None) -> dict[int, Unseen]:
-        """By part that is tested on, the parts left out of the training: that part alone, or it and
-        the part `aside`."""
+        """By tested part, the parts left out of its training: that part alone, or also the part
+        `aside`."""
         if aside is None:
             return {p: (p,) for p in range(len(self.parts))}
         pairs = [u for u in self.pairs() if aside in u]
         return {u[u[0] == aside]: u for u in pairs}
 
     def difference(self, better: Array, worse: Array) -> Difference:
-        """Of two methods' `scores`, paired by sweep: a sweep that is hard for both does not count.
+        """The difference of two methods' `scores`, paired by sweep, which removes the effect of
+        hard sweeps.
 
-        The standard error is that of the mean over values of the group, whose sweeps are
-        correlated, or that over sweeps where it is larger: a few values may agree by chance. Of
-        several groups it is the mean of theirs, as if these were correlated too.
+        The standard error is that of the mean over the values of the group, since the sweeps of a
+        value are correlated. It is that over sweeps if this is larger, since a few values may agree
+        by chance. With several groups it is the mean of theirs, as if they were correlated too.
         """
         means: list[float] = []
         errors: list[float] = []
@@ -302,7 +304,7 @@ class Trials:
 
 
 def _error(lost: Array, cluster: Array) -> tuple[float, float, int]:
-    """Mean of `lost` [n], its standard error, and how many clusters there are."""
+    """Mean of `lost` [n], its standard error, and the number of clusters."""
     member = np.unique(cluster, return_inverse=True)[1]
     mean, n = float(lost.mean()), int(member.max()) + 1
     by_sweep = float(lost.std(ddof=1)) / np.sqrt(len(lost)) if len(lost) > 1 else 0.0

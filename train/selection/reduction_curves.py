@@ -1,9 +1,8 @@
-"""How far the sweeps of a scene can be reduced. In: a Selection. Out: a curve for each kind of
-reduction, and a Change.
+"""Curves of accuracy over reduced sweeps of a scene, one for each kind of reduction.
 
-Each curve trains the chosen method again on reduced sweeps, on the same parts, and compares it with
-whole sweeps, paired by sweep. Kept is the strongest reduction for which it, and every weaker one,
-loses at most one standard error.
+For each curve, the chosen method is trained again on reduced sweeps, with the same parts, and
+compared with the whole sweeps, paired by sweep. A reduction is accepted if it and every weaker one
+lose at most one standard error; the strongest accepted reduction is kept.
 """
 
 from __future__ import annotations
@@ -24,25 +23,32 @@ from train.selection.select import Selection
 Array = NDArray[Any]
 Json = dict[str, Any]
 Step = tuple[str, float, list[Change], Change]
-"""One point of a curve: its name, the share that is left, the change for each part, the change for
-all sweeps."""
+"""One point of a curve: its name, the share that is left, the change for each part, and the change
+for all sweeps."""
 WINDOWS, RATES, BITS = (0.75, 0.5, 0.25), (2, 4, 8), (1, 2, 3, 4)
 POINTS_BEYOND = 2
-"""A curve ends at the second point that loses too much: two show where accuracy falls."""
+"""A curve ends at the second point that loses too much: two points show where accuracy falls."""
 CONFUSED = 0.25
-"""Two materials are proposed as one where this share of their sweeps is confused; guessing gives
+"""Share of confused sweeps from which on two materials are proposed as one; guessing confuses
 half."""
 HOW_TO_SET = {
-    "window": "nothing to set: the box takes the middle of each sweep; the robot may slide for less long",
+    "window": (
+        "nothing to set: the box uses the middle of each sweep; the robot may slide for less time"
+    ),
     "rate": "set the readout board to average {0} frames and send one",
-    "taxels": "connect only these taxels, in this order, or leave the others out on the readout board",
-    "bits": "a converter of this many bits will do; the raw counts keep their type, and nothing changes in the bundle",
+    "taxels": (
+        "connect only these taxels, in this order, or leave the others out on the readout board"
+    ),
+    "bits": (
+        "a converter of this many bits is enough; the raw counts keep their type, and the bundle "
+        "does not change"
+    ),
 }
 
 
 def most(trials: Trials, kinds: Collection[str]) -> int:
-    """The trainings that the curves of these kinds, and what is applied of them together, take at
-    most."""
+    """The largest number of trainings for the curves of these kinds and for their joint
+    application."""
     taxels = trials.sweeps.format.rows * trials.sweeps.format.cols
     points = {
         "window": len(WINDOWS),
@@ -58,8 +64,8 @@ def most(trials: Trials, kinds: Collection[str]) -> int:
 
 
 def curves(choice: Selection, scene: Scene) -> tuple[list[Json], Change, Json]:
-    """The curves of scene.reduce; the reductions of scene.apply as one Change, and the accuracy
-    with it."""
+    """The curves of scene.reduce, the reductions of scene.apply as one Change, and the accuracy
+    with that change."""
     found: list[Json] = []
     strongest: dict[str, Step] = {}
     for at, kind in enumerate(scene.reduce):
@@ -111,8 +117,8 @@ def _scores(trials: Trials, method: str, step: Step) -> Array:
 
 
 def _fine(trials: Trials, scene: Scene, full: Array, scores: Array) -> bool:
-    """Whether the reduced sweeps suffice, and do not miss the wanted accuracy where the whole ones
-    reach it."""
+    """Whether the reduced sweeps suffice: they lose little, and they reach the wanted accuracy if
+    the whole sweeps do."""
     falls_short = trials.mean(scores) < scene.accuracy <= trials.mean(full)
     return trials.difference(full, scores).within and not falls_short
 
@@ -162,8 +168,8 @@ def _bits(trials: Trials) -> Iterator[Step]:
 
 
 def _taxels(trials: Trials) -> Iterator[Step]:
-    """Numbers of taxels that are powers of two. Which taxels is found again without each part, as
-    it is part of the test."""
+    """Numbers of taxels that are powers of two. The taxels are selected again without each part,
+    since their selection is part of the test."""
     format = trials.sweeps.format
     count = format.rows * format.cols
     orders = [transforms.rank_taxels(trials.sweeps.take(~part.out)) for part in trials.parts]
@@ -184,8 +190,8 @@ STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
 
 
 def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
-    """The reductions of `least` applied one after another, each kept only while all kept ones
-    together are still fine."""
+    """The reductions of `least`, applied one after another; each is kept only if all kept ones
+    together still suffice."""
     trials, method = choice.trials, choice.final.chosen
     full = reduced = choice.final.scores[method]
     changes, total = [WHOLE] * len(trials.parts), WHOLE
@@ -203,11 +209,11 @@ def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[
 
 
 def classes(choice: Selection, wanted: float) -> Json:
-    """The accuracy gained by merging materials, the most confused pair first; counted without
-    training again.
+    """The accuracy gained by merging materials, the most confused pair first, counted without
+    another training.
 
-    Proposed are pairs that are CONFUSED, and as many as are needed to reach the wanted accuracy.
-    Nothing is applied: only the user knows whether two materials may share a name.
+    Pairs are proposed that are CONFUSED, and as many as are needed for the wanted accuracy. Nothing
+    is applied: only the user knows whether two materials may share a label.
     """
     trials = choice.trials
     group, _, sweep, probability = trials.tested(choice.final.chosen)
@@ -248,8 +254,8 @@ def classes(choice: Selection, wanted: float) -> Json:
 
 
 def _confused(label: Array, probability: Array) -> Array:
-    """[K, K], above the diagonal: the share of two materials' sweeps that are labelled as the other
-    one."""
+    """[K, K], above the diagonal: for two materials, the share of their sweeps that are taken for
+    the other."""
     k = probability.shape[1]
     counts = np.zeros((k, k))
     np.add.at(counts, (label, probability.argmax(1)), 1)

@@ -1,8 +1,7 @@
-"""Scenes: what an integrator has, and what a model must do there. In: scene.toml. Out: a checked
-Scene and its sweeps.
+"""Scenes: the equipment and the task of an integrator, read from a scene.toml and checked.
 
-docs/choose/tubes.toml shows every key. The dataclasses are the schema: a field's type and limits
-say what the file may hold.
+docs/choose/tubes.toml shows every key. The dataclasses are the schema: the type and limits of a
+field determine the allowed values in the file.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from train.models import methods
 REDUCTIONS = ("window", "rate", "taxels", "bits", "classes")
 """Properties of the sweeps that can be reduced."""
 APPLICABLE = ("window", "rate", "taxels")
-"""Those of them that the format of a bundle holds. The others are only reported."""
+"""The reductions that the format of a bundle can hold. The others are only reported."""
 
 
 def _text(default: str, form: re.Pattern[str] = LABEL) -> Any:
@@ -79,12 +78,12 @@ def _merged(value: Any) -> dict[str, tuple[str, ...]] | None:
 
 @dataclass(frozen=True)
 class Budget:
-    """The limits of the board; a figure without a limit does not count. Measured as export.measure
-    measures.
+    """The limits of the board, in the terms of export.measure. A figure without a limit does not
+    count.
 
     ms: processor time of a sweep in the box's classifier. kb: size of the whole bundle in units of
-    1000 bytes. mb: resident memory of a process with the bundle in MiB. slower: how many ms the
-    board needs for one of this machine's: an assumption, until it is measured there.
+    1000 bytes. mb: resident memory of a process with the bundle in MiB. slower: assumed time on the
+    board as a multiple of the time on this machine, until it is measured on the board.
     """
 
     ms: float = number(math.inf, 0.001, 1_000_000)
@@ -95,16 +94,17 @@ class Budget:
 
 @dataclass(frozen=True)
 class Scene:
-    """The content of scene.toml. Every field but `sets` may be left out.
+    """The content of scene.toml. Only `sets` is required.
 
     name, version: of the bundle; default: the file's name, and "1". sets: as --set, files relative
-    to scene.toml, $NAMES replaced by environment variables; only: as --only. materials: those to
-    tell apart, all where empty; merge: several labels that become one. varies: groups that differ
-    in operation from training. folds: number of parts of each group (0: five for one group, four
-    for two, else three). stress: severity by name of the corruption. accuracy: wanted; 0: as high
-    as possible. seeds: number of seeds of training, from 1 on. methods: the candidates, where they
-    are not the usual ones. reduce: properties to try with less of; apply: those of them with which
-    the bundle is packed. full_scale: the sensor's highest raw count; 0: the maximum of its type.
+    to scene.toml, $NAMES replaced by environment variables. only: as --only. materials: the
+    materials to distinguish; all if empty. merge: new label by the labels that it replaces. varies:
+    groups that differ between training and operation. folds: number of parts of each group (0: five
+    for one group, four for two, else three). stress: severity by name of the corruption. accuracy:
+    wanted accuracy; 0 for the highest possible. seeds: number of training seeds, from 1 on.
+    methods: the candidates; the usual ones if empty. reduce: properties to try with reductions.
+    apply: those reductions with which the bundle is packed. full_scale: the skin's highest raw
+    count; 0 for the maximum of its type.
     """
 
     name: str = _text("")
@@ -128,8 +128,8 @@ class Scene:
     path: Path = Path()
 
     def sweeps(self) -> Dataset:
-        """The sweeps of the sets, narrowed and merged. Raises FormatError naming scene.toml and
-        what does not fit the sets."""
+        """The sweeps of the sets, narrowed and merged. Raises FormatError with scene.toml and with
+        the value that does not fit the sets."""
         whole = sets.join([sets.load(self._located(spec), 1) for spec in self.sets]).select(
             self.only
         )
@@ -161,7 +161,8 @@ class Scene:
         full = os.path.expandvars(spec)
         if "$" in full:
             raise FormatError(
-                f"{self.path.name}: sets: {spec!r} names a variable that is not set; set it to a folder"
+                f"{self.path.name}: sets: {spec!r} names a variable that is not set; set "
+                "it to a folder"
             )
         return full if full.startswith("sim:") else str(self.path.parent / full)
 
@@ -170,8 +171,8 @@ class Scene:
 
 
 def read(path: Path) -> Scene:
-    """The scene in a file. Raises FormatError naming the file, the key, its value and what is
-    allowed."""
+    """The scene in a file. Raises FormatError with the file, the key, its value and the allowed
+    values."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
@@ -191,7 +192,7 @@ def read(path: Path) -> Scene:
 
 
 def _values(file: str, section: str, schema: type[Any], table: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of one table, each as its field reads it."""
+    """The values of one table, each read by its field."""
     known = {name: key for name, key in keys(schema).items() if key.limits}
     return read_table(
         known,
@@ -204,7 +205,7 @@ def _values(file: str, section: str, schema: type[Any], table: Mapping[str, Any]
 
 
 def _check(scene: Scene, table: Mapping[str, Any]) -> None:
-    """Check what concerns several keys. Raises FormatError."""
+    """Check conditions on several keys. Raises FormatError."""
     file = scene.path.name
     if not scene.sets:
         raise FormatError(f'{file}: no sets; name some, e.g. sets = ["recordings.npz"]')
@@ -224,11 +225,13 @@ def _check(scene: Scene, table: Mapping[str, Any]) -> None:
     for name, severity in scene.stress.items():
         if name not in digital:
             raise FormatError(
-                f"{file}: stress {name!r} is none that any sweep can be put under{_near(name, tuple(digital))}"
+                f"{file}: stress {name!r} is unknown, or only for simulated "
+                f"sweeps{_near(name, tuple(digital))}"
             )
         if severity > (most := digital[name].severities[-1]):
             raise FormatError(
-                f"{file}: stress.{name} = {severity:g} is out of range; use up to {most:g} {digital[name].unit}"
+                f"{file}: stress.{name} = {severity:g} is out of range; use up to {most:g} "
+                f"{digital[name].unit}"
             )
     if "apply" in table and (unused := set(scene.apply) - set(scene.reduce)):
         raise FormatError(

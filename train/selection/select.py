@@ -1,10 +1,9 @@
-"""The smallest model that a scene needs. In: a scene and its sweeps. Out: a Selection: what was
-chosen, and why.
+"""Selects the smallest model that a scene needs, with the reasons.
 
-The candidates are tried from the cheapest up. Chosen is the cheapest one within one standard error
-of the best (Breiman et al. 1984, sec. 3.4.3), the error being that of the paired difference. Nested
-validation (Stone 1974) says what such a choice is worth: the same choice is made without each part
-in turn, which then judges what was chosen.
+The candidates are tried from the cheapest up. We choose the cheapest one within one standard error
+of the best (Breiman et al. 1984, sec. 3.4.3), with the error of the paired difference. Nested
+validation (Stone 1974) estimates the accuracy of such a choice: the choice is repeated without each
+part in turn, and that part tests the chosen model.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
 LARGER_WITHOUT_GAIN = 2
-"""So many larger candidates of one family in a row that change nothing end the search in it."""
+"""Number of consecutive larger candidates of a family without a gain that ends the search in it."""
 
 
 class NothingFits(ApplianceError):
@@ -49,11 +48,11 @@ class NothingFits(ApplianceError):
 
 @dataclass(frozen=True)
 class BundleCost:
-    """What a method's bundle costs on this machine: its Measurement, in the units of the scene's
-    budget.
+    """The cost of a method's bundle on this machine, in the units of the scene's budget.
 
-    ms: processor time of a sweep, median. kb: size of the whole bundle in units of 1000 bytes. mb:
-    resident memory in MiB. refused: why there is no bundle; the rest is not a number then.
+    ms: median processor time of a sweep. kb: size of the whole bundle in units of 1000 bytes. mb:
+    resident memory in MiB. refused: the reason if it could not be packed; all else is
+    NaN then.
     """
 
     ms: float = math.nan
@@ -63,18 +62,21 @@ class BundleCost:
 
     @classmethod
     def of(cls, measurement: Measurement) -> BundleCost:
-        """All three figures from one measurement."""
+        """The three figures of a measurement."""
         return cls(measurement.ms_p50, measurement.bundle_kb, measurement.rss_mib)
 
     def order(self, budget: Budget) -> tuple[float, float]:
-        """What candidates are sorted by: the share of the board's time or of its storage that is
-        used, whichever is larger; where neither has a limit the size alone. Memory does not count:
-        it is nearly the same for all. Equal ones are sorted by time."""
+        """The sort key of candidates: the larger of the shares of the board's time and of its
+        storage.
+
+        If neither has a limit it is the size. Memory does not count, as it is nearly the same for
+        all. Ties are sorted by time.
+        """
         shares = [share for key, share in self.used(budget).items() if key != "mb"]
         return max(shares, default=self.kb), self.ms
 
     def used(self, budget: Budget) -> dict[str, float]:
-        """Share of each part of the budget that has a limit."""
+        """The used share of each part of the budget that has a limit."""
         needs = {"ms": self.ms * budget.slower, "kb": self.kb, "mb": self.mb}
         return {
             k: v / limit for k, v in needs.items() if math.isfinite(limit := getattr(budget, k))
@@ -82,8 +84,8 @@ class BundleCost:
 
 
 def candidates(scene: Scene) -> list[str]:
-    """The scene's methods, or the usual ones: the paper's classical ones that are cheap, the family
-    of compact, and the default."""
+    """The methods of the scene. By default, the cheap classical methods of the paper, the compact
+    family and the default."""
     if scene.methods:
         return list(scene.methods)
     known = methods.every()
@@ -102,8 +104,8 @@ def bundle_costs(
 ) -> dict[str, BundleCost]:
     """The cost of each method's bundle, the cheapest first and refused ones last.
 
-    Bundles are packed one after another and kept; then all are measured at once, and the figures
-    are kept together.
+    Bundles are packed one after another and kept. Then they are all measured together, and their
+    figures are kept together.
     """
     with tempfile.TemporaryDirectory() as aside:
         kept = (where.cache or Path(aside)) / "bundles"
@@ -123,8 +125,8 @@ def bundle_costs(
 
 
 def _packed(method: Method, sweeps: Dataset, scene: Scene, kept: Path) -> tuple[Path, str]:
-    """The folder of the method's bundle, and why there is none; what lies in `kept` is not made
-    again."""
+    """The folder of the method's bundle, and the reason if there is none. A bundle in `kept` is not
+    packed again."""
     about = [
         "bundle",
         platform.node(),
@@ -149,8 +151,8 @@ def _packed(method: Method, sweeps: Dataset, scene: Scene, kept: Path) -> tuple[
 
 
 def _measured(folders: dict[str, Path], sweeps: Dataset, kept: Path) -> dict[str, BundleCost]:
-    """The costs of bundles that were measured together: kept ones where the very same bundles were
-    measured before."""
+    """The costs of the bundles, measured together; kept costs if the same bundles were measured
+    before."""
     if not folders:
         return {}
     about = [platform.node(), *(folder.name for folder in folders.values())]
@@ -168,11 +170,11 @@ def _measured(folders: dict[str, Path], sweeps: Dataset, kept: Path) -> dict[str
 
 @dataclass
 class SizeSearch:
-    """One choice while it is made, candidate by candidate in the order of cost. aside: the part it
-    must not see, or None.
+    """A choice in progress, candidate by candidate in the order of cost. aside: the part that it
+    must not use, or None.
 
     scores: of the candidates so far, as Trials.scores. unchanged: by family, its newest candidate
-    and how many in a row changed nothing.
+    and the number of consecutive candidates that changed nothing.
     """
 
     trials: Trials
@@ -181,12 +183,11 @@ class SizeSearch:
     unchanged: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def enough(self, name: str) -> str:
-        """Why the next candidate `name` need not be tried, "" where it could still change the
-        choice.
+        """The reason to skip the next candidate `name`, or "" if it could still change the choice.
 
-        It need not where even a faultless model would be within one standard error of what is
-        chosen, and where LARGER_WITHOUT_GAIN candidates of its family in a row changed nothing and
-        the last was no better than the one before.
+        There are two reasons: even a faultless model would be within one standard error of the
+        current choice; or LARGER_WITHOUT_GAIN consecutive candidates of its family changed nothing,
+        and the last was not better than its predecessor.
         """
         if not self.scores:
             return ""
@@ -203,7 +204,7 @@ class SizeSearch:
         return list(self.trials.seen_from(self.aside).values())
 
     def add(self, name: str) -> None:
-        """The candidate `name` has been tried."""
+        """Note that the candidate `name` has been tried."""
         before = self.chosen if self.scores else ""
         self.scores[name] = self.trials.scores(name, self.aside)
         last, times = self.unchanged.get(_family(name), ("", 0))
@@ -215,7 +216,7 @@ class SizeSearch:
 
     @property
     def best(self) -> str:
-        """The candidate with the highest mean; of equal ones the cheapest."""
+        """The candidate with the highest mean; the cheapest of equal ones."""
         return max(self.scores, key=lambda name: self.trials.mean(self.scores[name]))
 
     @property
@@ -224,7 +225,7 @@ class SizeSearch:
         return next(name for name in self.scores if self.behind(name).within)
 
     def behind(self, name: str, ahead: str = "") -> Difference:
-        """How far `name` is behind another candidate, usually the best."""
+        """The difference between another candidate, usually the best, and `name`."""
         return self.trials.difference(self.scores[ahead or self.best], self.scores[name])
 
 
@@ -234,8 +235,9 @@ def _family(name: str) -> str:
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen. costs: of all candidates, the cheapest first. why_not: reasons by candidate
-    that was not tried. final: the choice with all data; inner: without each part in turn."""
+    """The result of a choice. costs: of all candidates, the cheapest first. why_not: by candidate,
+    the reason why it was not tried. final: the choice with all data. inner: the choice without each
+    part in turn."""
 
     trials: Trials
     costs: dict[str, BundleCost]
@@ -245,8 +247,8 @@ class Selection:
 
     @property
     def nested(self) -> Array:
-        """Scores [groups, N] of what was chosen without each part, on that part: what the choice is
-        worth."""
+        """Scores [groups, N] of the models chosen without each part on that part, which estimate
+        the accuracy of the choice."""
         scores = np.full_like(self.final.scores[self.final.chosen], np.nan)
         for p, search in enumerate(self.inner):
             part = self.trials.parts[p]
@@ -255,7 +257,7 @@ class Selection:
         return scores
 
     def json(self, scene: Scene) -> Json:
-        """What scripts read of it."""
+        """The result for scripts."""
         trials, final = self.trials, self.final
         order = list(self.costs)
         return {
@@ -273,8 +275,7 @@ class Selection:
         }
 
     def _nested_json(self) -> Json:
-        """Accuracy of the nested choice, for each group too, and how often each candidate was
-        chosen."""
+        """Accuracy of the nested choice, also by group, and how often each candidate was chosen."""
         trials, scores = self.trials, self.nested
         number = np.arange(len(trials.groups))[:, None]
         groups = {
@@ -337,7 +338,8 @@ class Selection:
         ]
 
     def _confused(self) -> list[Json]:
-        """What is taken for what, the most frequent first: shares of the sweeps of a material."""
+        """Confused pairs of materials, the most frequent first: shares of the sweeps of a
+        material."""
         _, _, sweep, probability = self.trials.tested(self.final.chosen)
         names, counts = self.trials.sweeps.materials, np.zeros((probability.shape[1],) * 2)
         np.add.at(counts, (self.trials.sweeps.labels[sweep], probability.argmax(1)), 1)
@@ -360,18 +362,19 @@ def choose(
     log: Log,
     later: Callable[[Trials], int] = lambda _: 0,
 ) -> Selection:
-    """Search the candidates from the cheapest up. later: so many trainings come after that, for
-    what is left in all.
+    """Search the candidates from the cheapest up. later: number of trainings that follow, for the
+    progress.
 
-    Raises NothingFits where no candidate can be taken, and FormatError where the scene cannot be
-    judged.
+    Raises NothingFits if no candidate can be used, and FormatError if the scene cannot be judged.
     """
     progress = Progress(0, log)
     trials = Trials(sweeps, scene, effort, where, progress)
     for p in (p for p in range(len(trials.parts)) if not trials.seen_from(p)):
         raise FormatError(
-            f"{scene.path.name}: without {trials.parts[p].group} {trials.parts[p].values[0]} nothing is left "
-            "to choose by; a group that varies needs three values: one to train on, one to choose by, one "
+            f"{scene.path.name}: without {trials.parts[p].group} "
+            f"{trials.parts[p].values[0]} nothing is left "
+            "to choose by; a group that varies needs three values: one to train on, one to "
+            "choose by, one "
             "to judge the choice by"
         )
     names = candidates(scene)
@@ -405,7 +408,7 @@ def choose(
 
 
 def _over(cost: BundleCost, scene: Scene) -> str:
-    """Why a candidate does not fit the board, or nothing."""
+    """Why a candidate does not fit the board, or ""."""
     limits = {k: getattr(scene.budget, k) for k in ("ms", "kb", "mb")}
     needs = {"ms": cost.ms * scene.budget.slower, "kb": cost.kb, "mb": cost.mb}
     over = [
@@ -417,7 +420,7 @@ def _over(cost: BundleCost, scene: Scene) -> str:
 
 
 def _nearest(costs: dict[str, BundleCost], why_not: dict[str, str], scene: Scene) -> str:
-    """Why nothing could be taken, with the candidate that is least over the budget."""
+    """Why no candidate could be used, with the candidate that exceeds the budget least."""
     over = {
         name: max(costs[name].used(scene.budget).values())
         for name, why in why_not.items()
@@ -426,4 +429,7 @@ def _nearest(costs: dict[str, BundleCost], why_not: dict[str, str], scene: Scene
     if not over:
         return "; ".join(f"{name} cannot be used here: {why}" for name, why in why_not.items())
     name = min(over, key=lambda name: over[name])
-    return f"no model fits the board; nearest is {name}, {why_not[name]}: raise the budget, or record shorter sweeps"
+    return (
+        f"no model fits the board; the nearest is {name}, {why_not[name]}: "
+        "raise the budget, or record shorter sweeps"
+    )

@@ -246,7 +246,9 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     are needed."""
     manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
     bundles._print(manifest, bundle.DEFAULT)
-    line = "answers on lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
+    line = (
+        "answers on GPIO lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
+    )
     assert (line in capsys.readouterr().out) == told
 
 

@@ -39,6 +39,7 @@ from train.models.recipe.fitted import Fit, finished
 from train.models.recipe.stages import Compact, FitRecipe
 from train.onnx_tools import graph_builder, parity
 from train.onnx_tools.parity import Layer
+from train.onnx_tools.quantize import quantize
 from train.studies import cost
 from train.studies.command import main as study
 
@@ -137,7 +138,7 @@ def test_quantizing_leaves_its_model_alone(fitted: Fit):
     """onnxruntime empties the model that it gets; ours still runs."""
     trunk = fitted.trunk(int8=False)
     before = trunk.SerializeToString()
-    quantized_bundle.quantize(trunk, fitted.train.samples[:4])
+    quantize(trunk, fitted.train.samples[:4])
     assert trunk.SerializeToString() == before
 
 
@@ -507,8 +508,8 @@ def test_the_command_exports_what_fit_wrote(
         "held-out recording, network alone",
         "held-out recording, by recording",
         "bundle",
-        "what it names of sweeps that the fit has not seen",
-        "a page about it, with what breaks it",
+        "to score it on sweeps that the fit has not seen",
+        "for a page about it and its limits",
     ]
     assert lines[-2].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
     assert lines[-1].endswith(

@@ -84,7 +84,7 @@ def test_the_whole_way(
     and is in place. A skin with another rest works after TARE. Without an unloaded skin in the
     recordings, export says that `no-contact` cannot be recognised, and the box never answers it."""
     model = exported(folder, tmp_path / "known")
-    assert "no-contact cannot be told" not in capsys.readouterr().out
+    assert "no-contact cannot be detected" not in capsys.readouterr().out
     m = model.manifest
     assert m.tare == pytest.approx(np.full(FORM.shape, REST), abs=40)
     assert m.contact
@@ -115,7 +115,7 @@ def test_the_whole_way(
     (line,) = [
         line
         for line in capsys.readouterr().out.splitlines()
-        if line.startswith("no-contact cannot be told: ")
+        if line.startswith("no-contact cannot be detected: ")
     ]
     assert (
         "what the unloaded skin gives is not known; record with palpate record, and send TARE"

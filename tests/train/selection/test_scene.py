@@ -123,8 +123,14 @@ def test_every_key_is_read(tmp_path: Path):
             'sets = ["a"]\nmethods = ["L-gaus"]',
             "method 'L-gaus' is unknown; did you mean 'L-gauss'",
         ),
-        ('sets = ["a"]\n[stress]\nnoize = 0.1', "stress 'noize' is none .*; did you mean 'noise'"),
-        ('sets = ["a"]\n[stress]\nshift-rows = 1', "stress 'shift-rows' is none that any sweep"),
+        (
+            'sets = ["a"]\n[stress]\nnoize = 0.1',
+            "stress 'noize' is unknown, .*; did you mean 'noise'",
+        ),
+        (
+            'sets = ["a"]\n[stress]\nshift-rows = 1',
+            "stress 'shift-rows' is unknown, or only for simulated sweeps",
+        ),
         (
             'sets = ["a"]\n[stress]\nnoise = 3',
             r"stress\.noise = 3 is out of range; use up to 0.5 deviations",
