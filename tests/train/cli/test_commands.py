@@ -97,7 +97,7 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         ),
         (
             ["--set", "sim:T-LAB:1:1", "--rename", "wod=oak"],
-            "no material is called 'wod'; did you mean 'wood'?",
+            "there is no material 'wod'; did you mean 'wood'?",
         ),
         (
             ["--set", "sim:T-LAB:1:1", "--rename", "wood=a", "--rename", "wood=b"],

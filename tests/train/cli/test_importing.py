@@ -50,7 +50,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     assert {s.tobytes() for s in made.samples} == {s.tobytes() for s in expected}
     out, err = capsys.readouterr()
     assert [*caplog.messages, *re.findall(".*[Ww]arning.*|.*Gemm.*", err)] == []
-    assert "they helped to choose the model" in out
+    assert "they also helped to choose the model" in out
     assert (
         "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n"
         in out
