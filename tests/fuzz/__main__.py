@@ -1,9 +1,9 @@
-"""Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`. In: targets, CPU minutes for
-each, a seed. Out: a line of figures for each target, the smallest corpus that covers as much, and
-in crashes/ each input that broke a promise.
+"""Runs the fuzzing: `python -m tests.fuzz [TARGET ...] --minutes N`, N in CPU minutes for each
+target.
 
-The inputs that it finds lie in build/fuzz/; the next run begins with them, also after an
-interruption.
+Prints a line of figures for each target, and saves the smallest corpus that covers as much, and in
+crashes/ each input that broke a promise. New inputs are kept in build/fuzz/; the next run begins
+with them, also after an interruption.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from tests.fuzz.targets import TARGETS
 
 WORK = seeds.ROOT / "build" / "fuzz"
 LONGEST_INPUT = 5000
-"""Bytes of an input: the largest packet there can be, and something around it."""
+"""Largest input in bytes: a little more than the largest packet."""
 LONGEST_SAVED = 2048
-"""Bytes of an input that is saved: longer ones do the same things more often."""
+"""Largest input that is saved, in bytes: longer inputs repeat the same operations."""
 OPTIONS = (f"-max_len={LONGEST_INPUT}", "-timeout=300", "-print_final_stats=1", "-reload=0")
-"""libFuzzer counts seconds of the clock, so its limit is only for what never ends; the engine has
-one in processor time."""
+"""libFuzzer measures real time, so its limit only stops endless runs; the engine limits processor
+time."""
 
 
 @dataclass(frozen=True, slots=True)
 class FuzzRun:
-    """Figures of one run of libFuzzer. coverage: places of the instrumented code. features: places
-    with their counts."""
+    """Figures of one run of libFuzzer. coverage: reached places of the instrumented code. features:
+    these places with their counts."""
 
     executions: int
     coverage: int
@@ -43,7 +43,7 @@ class FuzzRun:
 
 
 def main() -> int:
-    """Fuzz the named targets, or all, one after another; 1 where a promise was broken."""
+    """Fuzz the named targets, or all, one after another; 1 if a promise was broken."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.fuzz", description=__doc__.split("\n\n")[0]
     )
@@ -89,25 +89,28 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
     ]
     if not kept:
         raise SystemExit(
-            f"{target}: the merge kept no input; see {place / 'log'}; the saved corpus stays as it is"
+            f"{target}: the merge kept no input; see {place / 'log'}; "
+            "the saved corpus stays as it is"
         )
     corpus.save(target, kept)
     print(
-        f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, {run.executions / run.cpu_s:.0f}/s; "
-        f"coverage {before.coverage} -> {run.coverage}, features {before.features} -> {run.features}; "
+        f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, "
+        f"{run.executions / run.cpu_s:.0f}/s; coverage {before.coverage} -> {run.coverage}, "
+        f"features {before.features} -> {run.features}; "
         f"corpus {len(kept)} inputs, {sum(map(len, kept))} bytes; crashes {len(run.crashes)}",
         flush=True,
     )
     for crash in run.crashes:
         print(
-            f"{target}: {crash} breaks a promise; mend it, name the file, and explain it in BROKE of "
+            f"{target}: {crash} breaks a promise; "
+            "mend it, name the file, and explain it in BROKE of "
             "tests/appliance/bundle/test_fuzzed_input.py"
         )
     return 1 if run.crashes else 0
 
 
 def _engine(target: str, seconds: float, *options: object) -> FuzzRun:
-    """One fuzzing process, to its end; seconds: of its processor time, 0 for no limit."""
+    """Run one fuzzing process to its end. seconds: of its processor time, 0 for no limit."""
     found = WORK / target / "found"
     rmtree(found, ignore_errors=True)
     found.mkdir()
@@ -139,7 +142,7 @@ def _engine(target: str, seconds: float, *options: object) -> FuzzRun:
 
 
 def _cpu_s() -> float:
-    """Processor seconds of all fuzzing processes so far."""
+    """Processor seconds of all fuzzing processes up to now."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

@@ -1,5 +1,5 @@
-"""The saved inputs: one text file a target, one input a line, written as Python writes bytes, the
-shortest first.
+"""The saved inputs: a text file for each target, an input on each line in Python's notation for
+bytes, the shortest first.
 
 So a change shows the added inputs, and no tool is needed to read them.
 """
@@ -16,7 +16,7 @@ CRASHES = Path(__file__).with_name("crashes")
 
 
 def load(target: str) -> list[bytes]:
-    """The saved inputs of a target; none where none were saved."""
+    """The saved inputs of a target; none if it has no file."""
     file = SAVED / f"{target}.txt"
     return (
         [literal_eval(line) for line in file.read_text("ascii").splitlines()]
@@ -38,7 +38,7 @@ def name(data: bytes) -> str:
 
 
 def keep_crash(target: str, data: bytes) -> Path:
-    """Keep an input that broke a promise; its file."""
+    """Keep an input that broke a promise; returns its file."""
     file = CRASHES / target / f"{name(data)}.bin"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(data)
@@ -46,5 +46,5 @@ def keep_crash(target: str, data: bytes) -> Path:
 
 
 def crashes(target: str) -> list[Path]:
-    """The inputs that once broke a promise."""
+    """The inputs that once broke a promise of this target."""
     return sorted((CRASHES / target).glob("*.bin"))

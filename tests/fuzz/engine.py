@@ -1,7 +1,7 @@
-"""One fuzzing process: Atheris (libFuzzer) drives one target. In: the target's name, CPU seconds,
-libFuzzer's options.
+"""One fuzzing process: Atheris (libFuzzer) drives one target.
 
-It is started by the runner, since libFuzzer ends the process that it runs in.
+The runner starts it as a process, because libFuzzer ends the process in which it runs. Arguments
+are the target's name, CPU seconds, and libFuzzer's options.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ with atheris.instrument_imports(include=["appliance", "tomllib", "train.data"]):
 from tests.fuzz.mutators import MUTATORS
 
 MEMORY = 1 << 30
-"""Bytes that a process may ask for; an input that makes the box ask for more ends in a MemoryError,
-which is a crash."""
+"""Memory limit of the process in bytes. An input for which the box needs more ends in a
+MemoryError, which counts as a crash."""
 
 SLOW_S = 10
-"""An input that takes longer, in processor time, is a crash, too."""
+"""An input that takes more processor time than this counts as a crash, too."""
 
 
 def main(name: str, seconds: float, *options: str) -> None:
-    """Fuzz a target for so much CPU time; libFuzzer prints its progress on standard error."""
+    """Fuzz a target for this much CPU time; libFuzzer prints its progress on standard error."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     target, mutate = targets.TARGETS[name], MUTATORS[name]
     with TemporaryDirectory(prefix=f"fuzz-{name}-") as folder:
@@ -40,14 +40,15 @@ def main(name: str, seconds: float, *options: str) -> None:
             return mutate(data, Random(seed), lambda part: atheris.Mutate(part, most))[:most]
 
         def once(data: bytes) -> None:
-            begin = time.process_time()  # not the clock: a busy machine takes nothing away
+            begin = time.process_time()  # not real time, which a busy machine would take away
             target(data, place)
             end = time.process_time()
             assert end - begin < SLOW_S, f"this input took {end - begin:.0f} s of processor time"
             if 0 < seconds < end:
-                os.kill(os.getpid(), signal.SIGUSR1)  # libFuzzer's clean end
+                os.kill(os.getpid(), signal.SIGUSR1)  # ends libFuzzer cleanly
 
-        again = f"{sys.executable} -m tests.fuzz.engine {name} {seconds}"  # how libFuzzer starts itself to merge
+        # the command with which libFuzzer starts itself for a merge
+        again = f"{sys.executable} -m tests.fuzz.engine {name} {seconds}"
         atheris.Setup([again, *options], once, custom_mutator=mutator)
         atheris.Fuzz()
 

@@ -1,5 +1,7 @@
-"""The promises about enrolment.npz. In: any bytes, beside a small bundle. Out: nothing, or an error
-if a promise is broken, as in `targets`; also seeds, and changes that leave the archive readable.
+"""The promises about enrolment.npz, read beside a small bundle; also seeds, and mutations that
+leave the archive readable.
+
+The target raises an error if a promise is broken, as in `targets`.
 """
 
 from __future__ import annotations
@@ -25,12 +27,12 @@ from tests.fuzz.files import one_line
 
 LABELS = ("cork", "felt", "silk")
 MOST_SWEEPS = 1_000_000
-"""That a label may claim to come from; more is nobody's patience."""
+"""Largest number of sweeps that a label may claim; nobody records more."""
 
 
 @cache
 def small() -> Bundle:
-    """The bundle that an input adds labels to."""
+    """The bundle to which an input adds labels."""
     with TemporaryDirectory() as folder:
         return toy_bundle.load(Path(folder) / "small")
 
@@ -41,7 +43,7 @@ def read(data: bytes, folder: Path) -> Bundle:
 
 
 def _check_classes(old: Bundle, got: Bundle) -> None:
-    """Statistics of the trained labels are unchanged, and all are finite."""
+    """Check that the statistics of trained labels are unchanged, and that all are finite."""
     assert old.classes
     assert got.classes
     n, trained = len(old.manifest.labels), old.classes.arrays()
@@ -101,8 +103,8 @@ def _right(labels: int) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """One to three labels; of each array another value that is refused; another bundle's, a label
-    that is taken, none."""
+    """One to three labels; each array with another invalid value; the enrolment of another bundle,
+    a label that exists, no label."""
     right = [_right(1), _right(2), _right(3)]
     with np.load(io.BytesIO(right[0])) as z:
         arrays = dict(z.items())
@@ -130,7 +132,7 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    """Names of arrays, and of numpy's head."""
+    """Names of arrays and words of numpy's header."""
     return [
         *(f"{name}.npy".encode() for name in enrolled.ARRAYS),
         b"'<f4'",
@@ -141,14 +143,12 @@ def words() -> list[bytes]:
 
 
 def mutated(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> bytes:
-    """One or two arrays changed, taken out or written twice, and the archive made right again; or
-    bytes changed."""
+    """One or two arrays changed, removed or written twice, in a valid archive; or bytes changed."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
-            arrays = {
-                name: values for name, values in z.items() if isinstance(values, np.ndarray)
-            }  # else plain bytes
-    except Exception:  # whatever numpy says of an archive that is not one
+            # numpy returns bytes for a member that is not an array
+            arrays = {name: values for name, values in z.items() if isinstance(values, np.ndarray)}
+    except Exception:  # numpy raises many kinds of errors for invalid archives
         return plain(data)
     if not arrays or random.random() < 0.2:
         return plain(data)
@@ -156,9 +156,8 @@ def mutated(data: bytes, random: Random, plain: Callable[[bytes], bytes]) -> byt
         name = random.choice(list(arrays))
         values = arrays[name]
         if values.dtype.kind in "iuf" and values.size and random.random() < 0.7:
-            values.ravel()[random.randrange(values.size)] = random.choice(
-                (1, 2, 7, 100)
-            )  # as it may be
+            # numbers that a valid enrolment may hold
+            values.ravel()[random.randrange(values.size)] = random.choice((1, 2, 7, 100))
         else:
             arrays[name] = changed(values, random)
         if len(arrays) > 1 and random.random() < 0.05:

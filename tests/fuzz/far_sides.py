@@ -1,6 +1,7 @@
-"""The promises about requests of a controller over Modbus, and about files that a person imports.
-In: any bytes. Out: nothing, or an error if a promise is broken, as in `targets`; also seeds, and
-the words of their formats.
+"""The promises about a controller's requests over Modbus, and about files that a person imports;
+also seeds, and words of their formats.
+
+A target raises an error if a promise is broken, as in `targets`.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ WORDS = {
         *(struct.pack("<II", kind, 8) for kind in (1, 2, 5, 6, 9, 14, 15)),
     ],
 }
-"""What each format is made of."""
+"""The words of each format."""
 
 
 def modbus(data: bytes, folder: Path) -> None:
-    """modbus_pdu: the same requests wherever the bytes were cut, each read or refused, and replies
-    that fit a packet."""
+    """modbus_pdu: the requests are the same wherever the bytes are cut; each is read or refused,
+    and replies fit into a packet."""
     try:
         found, rest = modbus_pdu.requests(data)
     except FormatError as e:
@@ -80,7 +81,7 @@ def _imported(suffix: str) -> Callable[[bytes, Path], None]:
 
 
 def modbus_seeds() -> list[bytes]:
-    """A request of each kind, two in a row, one that is cut."""
+    """A request of each kind, two in a row, a truncated request."""
     pdus = [struct.pack(">BHH", function, 0, 8) for function in (1, 2, 3, 4)]
     pdus += [struct.pack(">BHH", 5, 0, 0xFF00), struct.pack(">BHHBB", 15, 0, 3, 1, 5)]
     each = [HEADER.pack(i, 0, len(pdu) + 1, 1) + pdu for i, pdu in enumerate(pdus)]
@@ -88,7 +89,7 @@ def modbus_seeds() -> list[bytes]:
 
 
 def text_seeds() -> list[bytes]:
-    """Tables as people keep them: with and without a head, with commas, semicolons or spaces."""
+    """Tables as people keep them: with and without a header, with commas, semicolons or spaces."""
     return [
         b"t,a,b\n0,1,2\n1,3,4\n",
         b"1;2\n3;4\n",
@@ -98,7 +99,7 @@ def text_seeds() -> list[bytes]:
 
 
 def mat_seeds() -> list[bytes]:
-    """Files of version 5, packed and not."""
+    """MAT files of version 5, compressed and plain."""
     found = []
     for packed in (False, True):
         file = io.BytesIO()
@@ -112,7 +113,7 @@ def mat_seeds() -> list[bytes]:
 
 
 def requests_of(data: bytes) -> list[bytes]:
-    """Nothing, and the pieces of `data` by what their headers say of their length."""
+    """An empty first piece, then the requests in `data`, cut by the lengths in their headers."""
     found, at = [b""], 0
     while at < len(data):
         end = at + 6 + max(int.from_bytes(data[at + 4 : at + 6], "big"), 1)
@@ -122,7 +123,7 @@ def requests_of(data: bytes) -> list[bytes]:
 
 
 def elements_of(data: bytes) -> list[bytes]:
-    """The head of a MAT file, and its elements by what their tags say of their length."""
+    """The head of a MAT file, then its elements, cut by the lengths in their tags."""
     found, at = [data[:128]], 128
     while at < len(data):
         end = at + 8 + int.from_bytes(data[at + 4 : at + 8], "little")

@@ -1,6 +1,8 @@
 """The promises about files: a site file, a bundle's manifest, a recorded sweep (.npy with its
-.json), a capture. In: any bytes, and a folder that they are written to. Out: nothing, or an error
-where a promise is broken, as in `targets`.
+.json), a capture.
+
+Each target writes the bytes to a folder and reads them. It raises an error if a promise is broken,
+as in `targets`.
 """
 
 from __future__ import annotations
@@ -30,15 +32,15 @@ NPY = b"\x93NUMPY"
 
 
 def one_line(error: Exception) -> str:
-    """The message, which a person can read as one line of a terminal or a journal."""
+    """The message of an error, which must be readable as one line of a terminal or a log."""
     text = str(error)
     assert text.isprintable(), f"message is not one printable line: {text!r}"
     return text
 
 
 def settings(data: bytes, folder: Path) -> None:
-    """config.load: a site file is a Config within its limits that is described and loads again, or
-    a ConfigError."""
+    """config.load: a site file is a valid Config that can be described and loads again, or a
+    ConfigError."""
     site = folder / "palpate.toml"
     (folder / "board-a.toml").write_text(BOARD)
     site.write_bytes(data)
@@ -79,7 +81,7 @@ def _values(got: config.Config) -> Iterator[tuple[str, Any, Any, str]]:
 
 
 def _names_the_place(message: str, data: bytes) -> None:
-    """A message names the file, and one of the keys in it where it is TOML at all."""
+    """Check that a message names the file, and a key in it if the file is TOML."""
     assert "palpate.toml" in message, message
     try:
         table = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n"))
@@ -88,7 +90,7 @@ def _names_the_place(message: str, data: bytes) -> None:
         return
     shown = (
         form for key in table for form in (key, repr(key)[1:-1], f"{repr(key)[:77]}...")
-    )  # a long one is cut
+    )  # a long key is cut
     assert any(form in message for form in shown), message
 
 
@@ -115,7 +117,7 @@ def manifest(data: bytes, folder: Path) -> None:
 
 
 def _usable(read: bundle.Manifest) -> None:
-    """What other modules do with a manifest cannot fail."""
+    """Check that a manifest works in all other modules."""
     f = read.format
     for value in (f.rows, f.cols, f.axes, f.window, read.schema, read.thresholds.dead_taxels):
         assert type(value) is int, f"{value!r} is no whole number"
@@ -173,7 +175,7 @@ def recording(data: bytes, folder: Path) -> None:
 
 
 def played(data: bytes, folder: Path) -> None:
-    """capture.Playback: a file plays to its end in as many turns as it has records, or is a
+    """capture.Playback: a file plays to its end in as many turns as it has records, or raises
     FormatError."""
     file = folder / "capture"
     file.write_bytes(data)

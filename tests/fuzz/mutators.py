@@ -1,5 +1,6 @@
-"""Changes that keep a format's form, so that they come past its checksums and brackets. In: an
-input, a generator, and the fuzzer's own mutator. Out: another input.
+"""Mutations that keep the structure of a format, so that inputs pass its checksums and brackets.
+
+Each takes an input, a random generator and the fuzzer's own mutator, and returns another input.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ ODD: tuple[Any, ...] = (
 
 
 def rearranged(pieces: list[bytes], random: Random) -> bytes:
-    """The pieces of an input, one of them repeated, put elsewhere or replaced by another."""
+    """The pieces of an input, one of them repeated, moved or replaced by another."""
     piece = random.choice(pieces)
     pieces.insert(random.randrange(len(pieces) + 1), piece)
     if random.random() < 0.5:
@@ -71,8 +72,7 @@ def parts(split: Callable[[bytes], list[bytes]]) -> Mutator:
 
 
 def packets(data: bytes, random: Random, plain: Plain) -> bytes:
-    """Packets left out, repeated or put elsewhere, bytes changed, and then most checksums made
-    right again."""
+    """Packets removed, repeated or moved, bytes changed, and then most checksums corrected."""
     pieces = [p for p in re.split(rb"(?=\x50\xc1)", data) if p]
     data = rearranged(pieces, random) if pieces and random.random() < 0.3 else plain(data)
     changed = bytearray(data)
@@ -84,7 +84,7 @@ def packets(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def sentences(data: bytes, random: Random, plain: Plain) -> bytes:
-    """Bytes changed, and then most checksums made right again."""
+    """Bytes changed, and then most checksums corrected."""
 
     def seal(match: re.Match[bytes]) -> bytes:
         right = checksum(match[1].decode("latin-1").encode("ascii", "replace").decode())
@@ -94,7 +94,7 @@ def sentences(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def tables(data: bytes, random: Random, plain: Plain) -> bytes:
-    """Lines left out, repeated or put elsewhere, or bytes changed."""
+    """Lines removed, repeated or moved, or bytes changed."""
     lines = data.split(b"\n")
     if random.random() < 0.5:
         return plain(data)
@@ -106,8 +106,8 @@ def tables(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def trees(data: bytes, random: Random, plain: Plain) -> bytes:
-    """One place in the JSON gets an odd value, another place's value or another name, or is left
-    out; or bytes change."""
+    """An entry of the JSON gets an odd value, the value of another entry or another name, or is
+    removed; or bytes change."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -129,13 +129,13 @@ def trees(data: bytes, random: Random, plain: Plain) -> bytes:
             branch[key] = value if value is not branch else None
     try:
         return json.dumps(tree).encode()
-    except ValueError:  # a branch that holds itself
+    except ValueError:  # a branch must not contain itself
         return plain(data)
 
 
 def headed(data: bytes, random: Random, plain: Plain) -> bytes:
-    """The JSON at the head changed as `trees` does, or the bytes after it; a length before it is
-    made right again."""
+    """The JSON at the head changed as by `trees`, or the bytes after it; the length before it is
+    corrected."""
     start, end = data.find(b"{"), data.find(b"}\x93") + 1 or data.find(b"}") + 1
     if not 0 <= start < end or random.random() < 0.3:
         return plain(data)
@@ -149,8 +149,8 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def frames(data: bytes, random: Random, plain: Plain) -> bytes:
-    """A skin's frames left out, repeated or put elsewhere, or bytes changed; then most sums of
-    PapillArray made right."""
+    """Frames of a skin removed, repeated or moved, or bytes changed; then most sums of PapillArray
+    corrected."""
     pieces = [
         p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p
     ]

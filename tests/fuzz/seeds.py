@@ -1,6 +1,5 @@
-"""Where each target begins, and the words that its format knows. In: the simulator, PROTOCOL.md,
-the board files and the default bundle. Out: inputs and dictionary words, both bytes.
-"""
+"""The seeds of each target and the words of its format, from the simulator, PROTOCOL.md, the board
+files and the default bundle."""
 
 from __future__ import annotations
 
@@ -49,12 +48,11 @@ ENDLESS = packets.HEADER.pack(
     0,
     0,
 )
-"""The header of the largest packet there can be; what follows waits for its end."""
+"""The header of the largest possible packet; a reader waits for the end of this packet."""
 
 
 def unpack() -> list[bytes]:
-    """Packets of a simulated sweep, of other skins, of a board that starts anew, and broken
-    ones."""
+    """Packets of a simulated sweep, of other skins, of a restarted board, and broken packets."""
     frames = next(iter(script.tubes(1, 1))).frames[:60]
     sent = [
         packets.pack(2**32 - 12 + 6 * i, 2**32 - 16_000 + 8000 * i, frames[6 * i : 6 * i + 6])
@@ -92,8 +90,8 @@ def unpack() -> list[bytes]:
 
 
 def command() -> list[bytes]:
-    """Each command as a program and as a person sends it, the document's sentences, and lines that
-    are none."""
+    """Each command as programs and people send it, the document's sentences, and lines that are not
+    commands."""
     sealed = [
         sentences.sentence(name, *["plastic rough"] * (name in robot_link.TEXT_COMMANDS))
         for name in robot_link.COMMANDS
@@ -112,7 +110,7 @@ def command() -> list[bytes]:
 
 
 def feed() -> list[bytes]:
-    """The requests of a reader, at once and in one line, the document's examples, and lines that
+    """The requests of a reader, separately and in one line, the document's examples, and lines that
     are not requests."""
     asked = [
         json.dumps(one).encode()
@@ -136,8 +134,8 @@ def feed() -> list[bytes]:
 
 
 def settings() -> list[bytes]:
-    """The files that come with the box without their comments, and all settings as `palpate config`
-    prints them."""
+    """The files that come with the box, without their comments, and all settings as `palpate
+    config` prints them."""
     files = sorted((ROOT / "firmware_config").glob("*.toml"))
     values = [
         "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files
@@ -149,7 +147,7 @@ def settings() -> list[bytes]:
 
 
 def manifest() -> list[bytes]:
-    """The default bundle's manifest, the least of it, and its older form."""
+    """The default bundle's manifest, the smallest valid manifest, and the older schema."""
     whole = (bundle.DEFAULT / bundle.MANIFEST).read_bytes()
     least = json.loads(whole) | {"figures": {}, "made": {}}
     older = {k: v for k, v in least.items() if k not in ("early", "known")} | {"schema": 1}
@@ -158,7 +156,7 @@ def manifest() -> list[bytes]:
 
 
 def recording() -> list[bytes]:
-    """Recordings of four frames, of three skins: each its sidecar, then its records."""
+    """Recordings of four frames with three skins, each a sidecar and its frames."""
     found, n = [], np.arange(4)
     skins = (
         SweepFormat(2, 2, 100.0, 4, "int16"),
@@ -178,7 +176,7 @@ def recording() -> list[bytes]:
 
 
 def capture() -> list[bytes]:
-    """A capture with a record of each kind, and its head alone."""
+    """A capture with a record of each kind, and a capture's header alone."""
     frames, begin = next(iter(script.tubes(1, 1))).frames, 1_000_000_000
     with TemporaryDirectory() as folder:
         path = Path(folder) / "capture"
@@ -221,7 +219,7 @@ FILES: Mapping[str, tuple[type, ...]] = {
     "recording": (SweepFormat, Sweep),
     "capture": (SweepFormat,),
 }
-"""Classes whose fields are keys of a file."""
+"""Classes whose fields are the keys of a file."""
 MAGICS = {
     "recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"],
     "capture": [MAGIC],
@@ -240,7 +238,7 @@ def _settings() -> list[bytes]:
 
 
 def _file(target: str) -> list[bytes]:
-    """Keys of a file of JSON, values, and the words that surround them."""
+    """Keys of a JSON file, values, and punctuation."""
     names = [FILE_KEYS.get(f.name, f.name) for kind in FILES[target] for f in fields(kind)]
     if target == "manifest":
         names.append("contact")  # key of Thresholds; a field of Manifest has the same name

@@ -1,10 +1,9 @@
-"""The promises about skins: each codec takes any bytes, and the reader of profiles any file. In:
-any bytes, and a folder that a file is written to. Out: nothing, or an error where a promise is
-broken, as in `targets`.
+"""The promises about skins: each codec accepts any bytes, and the reader of profiles any file.
 
-Promises of a codec: in parts as at once; garbage is counted and the rest is bounded; no frame is
-invented. For the last, each frame that comes out is looked for in the bytes by a second reading
-that is slow and made from the skins' published layouts, not from the codecs.
+A codec gives the same frames if bytes come in parts, counts garbage, bounds the bytes that it
+keeps, and invents no frame. To check the last, a second and slow reader looks for each frame in the
+bytes. It follows the skins' published layouts and shares no code with the codecs. A target raises
+an error if a promise is broken, as in `targets`.
 """
 
 from __future__ import annotations
@@ -26,7 +25,8 @@ from tests.skins.noise import FAULTS
 from tests.skins.subjects import PROFILES, subject
 
 MOST_REST = 70_000
-"""Bytes that a codec may keep waiting for more, of any skin: some frames of the largest."""
+"""Largest number of bytes that any codec may keep while it waits for more: some frames of the
+largest skin."""
 GRIDS = {
     "flexitac": (2, 3),
     "anyskin": (1, 2),
@@ -36,15 +36,15 @@ GRIDS = {
     "xela-can": (1, 2),
     "robotiq-tsf": (7, 4),
 }
-"""Grids on the wire, small enough that an input holds some frames. One skin of each codec; of the
-codecs for markers and for text two, which use other parts of them."""
+"""Grids on the wire, small enough that an input holds some frames. One skin for each codec; two for
+the codecs for markers and for text, because they use different parts of them."""
 SUBJECTS = {name: subject(name, *grid, n=16) for name, grid in GRIDS.items()}
 CODECS = {name: codec(subject.profile) for name, subject in SUBJECTS.items()}
-"""Made here, so that their modules are imported where the fuzzer instruments them."""
+"""Made at import, so that their modules are imported while the fuzzer instruments them."""
 
 Enclosed = Callable[[SkinProfile, bytes], Iterator[bytes]]
-"""A profile and the bytes up to the end of a frame -> every content that such a frame can have, as
-the numbers' bytes."""
+"""A profile and the bytes up to the end of a frame -> every possible content of the frame, as the
+bytes of its numbers."""
 
 
 def target(name: str) -> Callable[[bytes, Path], None]:
@@ -107,8 +107,8 @@ def _fixed(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """The last lines: one that is a frame, or the rows and a shorter line, which may hold numbers,
-    too."""
+    """The last lines: a line that is a frame, or the rows and a shorter line, which may hold
+    numbers too."""
     lines = before.split(b"\n")[:-1]
     count = profile.rows if profile.lines == "rows" else 1
     for tail in (lines[-count:], lines[-count - 1 : -1]):
@@ -122,8 +122,8 @@ def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _papillarray(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """Any beginning whose sum fits, and no other packet in between; the pillars are where the
-    tables of offsets say."""
+    """Any beginning whose checksum fits, with no other packet in between; the tables of offsets
+    give the places of the pillars."""
     head, tail = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
     for start in (m.start() + 4 for m in re.finditer(re.escape(head), before)):
         body = before[start:-6]
@@ -138,8 +138,7 @@ def _papillarray(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _pillars(body: bytes, width: int) -> list[np.ndarray]:
-    """Six numbers of each pillar, one after the other, of the block of type 3, wherever its list
-    has it."""
+    """Six numbers of each pillar, in order, from the block of type 3, at any place in the list."""
 
     def offsets(at: int) -> list[int]:
         (n,) = struct.unpack_from("<H", body, at)
@@ -152,8 +151,8 @@ def _pillars(body: bytes, width: int) -> list[np.ndarray]:
             body[at + 2 : at + 2 + width], "little"
         )
         at += 2 + width
-    # a codec may read on in order instead of following the inner offsets, so the content is
-    # searched in order, too
+    # a codec may read on in order instead of following the inner offsets, so this searches in
+    # order, too
     (n,) = struct.unpack_from("<H", body, table[3])
     place, found = table[3] + 2 + n * width, []
     for _ in range(n):
@@ -168,12 +167,14 @@ def _pillars(body: bytes, width: int) -> list[np.ndarray]:
 
 
 def _xela(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """The last R x C messages, taxel after taxel; answers to commands may stand between them."""
+    """The last R x C messages, one for each taxel in order; answers to commands may stand between
+    them."""
     lines = [line for line in re.split(rb"[\r\n\a]", before)[:-1] if re.match(rb"t7", line)]
     words = []
     for i, line in enumerate(lines[-profile.rows * profile.cols :]):
         match = re.fullmatch(
-            rb"t([0-9A-Fa-f]{3})([78])[0-9A-Fa-f]{2}([0-9A-Fa-f]{12})(?:[0-9A-Fa-f]{2})?([0-9A-Fa-f]{4})?",
+            rb"t([0-9A-Fa-f]{3})([78])[0-9A-Fa-f]{2}([0-9A-Fa-f]{12})"
+            rb"(?:[0-9A-Fa-f]{2})?([0-9A-Fa-f]{4})?",
             line,
         )
         if not match or int(match[1], 16) != 0x710 + i or int(match[3][:2], 16) >= 250:
@@ -184,7 +185,7 @@ def _xela(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _robotiq(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """Grids of all fingers in the packet that ends here, and in those right before it."""
+    """Grids of all fingers in the packet that ends here, and in the packets right before it."""
     for start in (m.start() for m in re.finditer(b"\x9a\x00", before)):
         grids = dict(_grids(before[start:]))
         if sorted(grids) == list(range(profile.rows * profile.cols // 28)):
@@ -207,7 +208,7 @@ def _grids(packets: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _taken(profile: SkinProfile, wire: np.ndarray) -> bytes:
-    """The numbers of the wire that the profile takes, turned as it says, as bytes."""
+    """The numbers that the profile uses, rotated as it states, as bytes."""
     grid = wire.reshape(profile.rows, profile.cols, profile.values)[..., list(profile.take)]
     for turn in profile.orientation:
         grid = {
@@ -268,11 +269,12 @@ MARKS: dict[str, tuple[bytes, ...]] = {
     "xela-can": (b"t7108", b"t711", b"\r", b"z\r"),
     "robotiq-tsf": (b"\x9a\x00\x58", b"\x10", b"\x14"),
 }
-"""What tells frames apart."""
+"""The markers between frames."""
 
 
 def seeds(name: str) -> list[bytes]:
-    """Frames of a skin; damaged ones between sound ones; the answers of an adapter among them."""
+    """Frames of a skin; damaged frames between valid frames; the answers of an adapter among
+    them."""
     subject, rng = SUBJECTS[name], np.random.default_rng(1)
     skin = subject.wire()
     frames = [subject.sent(skin, i) for i in range(8)]
@@ -285,8 +287,8 @@ def seeds(name: str) -> list[bytes]:
 
 
 def profile_seeds() -> list[bytes]:
-    """The delivered profiles without their comments, the least that is one, and some that are
-    none."""
+    """The delivered profiles without their comments, the smallest valid profile, and invalid
+    profiles."""
     files = sorted(PROFILES.glob("*.toml"))
     values = [
         "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files

@@ -1,8 +1,7 @@
-"""The promises about any input. In: any bytes, and a folder for bytes that are read as a file. Out:
-nothing, or an error if a promise is broken: an AssertionError from here, or an error that the box
-would not have survived.
+"""The promises about any input, as functions of bytes.
 
-Each target is a pure function of its bytes; the folder holds only the files that it wrote there.
+A target raises an AssertionError if a promise is broken; any other error would have ended the box.
+It depends on its bytes alone: its folder only holds files that it wrote itself.
 """
 
 from __future__ import annotations
@@ -32,31 +31,31 @@ Target = Callable[[bytes, Path], None]
 SKIN = SweepFormat(4, 4, 750.0, 1500, "uint8")
 LONGEST = wire.HEADER.size + wire.MAX_PAYLOAD + wire.CRC.size
 REQUEST = 1024
-"""Bytes of a request to the feed by PROTOCOL.md, part 4."""
+"""Largest request to the feed in bytes (PROTOCOL.md, part 4)."""
 LINE = 128
-"""Characters of a sentence or command by PROTOCOL.md, part 2."""
+"""Largest sentence or command in characters (PROTOCOL.md, part 2)."""
 ITEM_SIZES = {0: 1, 1: 2, 2: 2, 3: 4}
 
 
 class Scanned(bytes):
-    """Bytes that count how often somebody searches them from some place on."""
+    """Bytes that count how often they are searched from each position."""
 
     searches = 0
 
     def find(self, *args: Any) -> int:
-        """As that of bytes."""
+        """As bytes.find."""
         self.searches += 1
         return super().find(*args)
 
 
 def cuts(data: bytes) -> set[int]:
-    """Where to cut: in the middle, and where the last byte says."""
+    """Positions at which to cut the input: the middle, and a place that the last byte gives."""
     return {len(data) // 2, data[-1] % len(data)} if data else {0}
 
 
 def by_the_document(data: bytes) -> list[bytes]:
-    """All whole packets in `data`, as PROTOCOL.md's table reads, in few words and without care for
-    speed."""
+    """All whole packets in `data`, read by PROTOCOL.md's table; short code that need not be
+    fast."""
     found, at = [], 0
     while (at := data.find(b"\x50\xc1", at)) >= 0 and len(data) - at >= 20:
         version, kind, n, _, count, rows, cols, digit, axes = struct.unpack_from(
@@ -86,7 +85,7 @@ def shown(packets: list[wire.Packet], replies: list[wire.Reply]) -> list[tuple[o
 
 
 def unpack(data: bytes, folder: Path) -> None:
-    """wire.unpack: exactly the document's packets, each byte accounted for, in parts as at once, in
+    """wire.unpack: exactly the document's packets, every byte accounted for, the same in parts, in
     one pass."""
     scanned = Scanned(data)
     got = wire.unpack(scanned)
@@ -117,8 +116,8 @@ def unpack(data: bytes, folder: Path) -> None:
 
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
-    """Frames that a sensor makes of it: numbers rise, and each frame that came is out, stale or
-    lost."""
+    """The frames that a sensor makes of the bytes: numbers rise, and each frame that came is
+    returned, stale or lost."""
     counters = usb_sensor.SensorCounters()
     stream = usb_sensor.Stream(SKIN, counters)
     stream.restart()
@@ -139,7 +138,7 @@ def _stream(data: bytes, cut: int, sent: int) -> None:
 
 
 def _follow(packets: list[wire.Packet]) -> None:
-    """Each frame is fresh or stale, and fresh ones rise."""
+    """Each frame is fresh or stale, and the numbers of fresh frames rise."""
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     sizes = [len(p.taxels) for p in packets]
     assert sum(len(p.taxels) for _, p in fresh) + stale == sum(sizes)
@@ -169,8 +168,8 @@ def _replies(data: bytes, replies: list[wire.Reply]) -> None:
 
 
 def command(data: bytes, folder: Path) -> None:
-    """sink.parse: one Command a line, in parts as at once, a bounded rest, and an answer that can
-    be sent to each."""
+    """sink.parse: one Command for each line, the same in parts, a bounded rest, and an answer to
+    each that can be sent."""
     got, rest = robot_link.parse(data)
     assert len(rest) <= LINE + 1
     *lines, last = re.split(rb"[\r\n]+", data)
@@ -193,7 +192,7 @@ def _is_command(line: bytes, name: str) -> bool:
     body, star, given = line.strip().rpartition(b"$")[2].partition(b"*")
     fields = re.split(
         "[, ]", body.decode("ascii", "replace"), maxsplit=2
-    )  # a person may type spaces for the commas
+    )  # people may type spaces instead of commas
     known = (
         fields[:2] == ["PPLP", name]
         and name in robot_link.COMMANDS
@@ -206,7 +205,7 @@ def _is_command(line: bytes, name: str) -> bool:
 
 
 def _answer(parsed: robot_link.Command) -> None:
-    """The sentence that answers a command has all its fields, whatever stood in the line."""
+    """The sentence that answers a command has all its fields, whatever the line contained."""
     line = sentences.sentence("ANS", parsed.name, "error" if parsed.error else "ok", parsed.error)
     assert len(line) <= LINE
     body, given = line.removeprefix(b"$").removesuffix(b"\r\n").split(b"*")

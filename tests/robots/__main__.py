@@ -1,9 +1,9 @@
-"""`python -m tests.robots`: from a verdict in the box to the robot's program, by each connection,
-side by side in one run.
+"""`python -m tests.robots`: time from a verdict in the box to the robot's program, for all
+connections side by side.
 
-Two boxes sweep simulated tubes in real time: one with a serial line and the bridges on its feed,
-one behind `bridge tcp`. Needs ROS 2 (python -m tests.campaigns ros). On a machine with other work: chrt -f 10 python -m
-tests.robots.
+Two boxes sweep simulated tubes in real time: the first has a serial line and the bridges on its
+feed, the second `bridge tcp` on its line. Needs ROS 2 (python -m tests.campaigns ros). On a machine
+with other work: chrt -f 10 python -m tests.robots.
 """
 
 from __future__ import annotations
@@ -44,32 +44,32 @@ from tests.robots import page
 RESULTS = ROOT / "docs" / "data" / "robots-latency.json"
 POLL_S = 0.01
 Seen = Callable[[int], None]
-"""Takes the number of a sweep whose answer is there now."""
+"""Called with the number of each sweep whose answer has arrived."""
 
 
 class Times:
-    """When each sweep was judged, and when each connection had the answer, in ns of the monotonic
-    clock."""
+    """The time of each verdict, and the time at which each connection had it, in ns of the
+    monotonic clock."""
 
     def __init__(self) -> None:
         self._judged: dict[tuple[str, int], int] = {}
         self._there: defaultdict[tuple[str, str], dict[int, int]] = defaultdict(dict)
 
     def judged(self, box: str, line: dict) -> None:
-        """A verdict line of the box's feed."""
+        """Handle a verdict line of the box's feed."""
         self._judged[box, line["sweep"]] = line["time_ns"]
 
     def seen(self, connection: str, box: str) -> Seen:
-        """For a connection to note its answers."""
+        """A function with which a connection notes its answers."""
         self._there[connection, box] = {}
         return lambda sweep: self.note(connection, box, sweep, time.monotonic_ns())
 
     def note(self, connection: str, box: str, sweep: int, at_ns: int) -> None:
-        """A connection had the answer to a sweep at this time."""
+        """Record that a connection had the answer to a sweep at this time."""
         self._there[connection, box].setdefault(sweep, at_ns)
 
     def done(self, sweeps: int) -> bool:
-        """Whether each connection has so many answers."""
+        """Whether each connection has this many answers."""
         there = {*self._there} >= {
             ("serial", "A"),
             ("tcp", "B"),
@@ -80,7 +80,7 @@ class Times:
         return there and min(map(len, self._there.values())) >= sweeps
 
     def latencies_ms(self) -> dict[str, list[float]]:
-        """By connection."""
+        """Latencies in ms of each connection."""
         return {
             connection: [
                 (at - self._judged[box, sweep]) / 1e6
@@ -117,7 +117,7 @@ def box(port: str, feed: Path) -> Iterator[None]:
 
 
 def follow(path: Path, name: str, times: Times, ending: threading.Event) -> None:
-    """Read the feed of a box: when it judged, and when the feed had it."""
+    """Read the feed of a box, and note when it judged and when the feed had the verdict."""
     seen = times.seen("feed", name) if name == "A" else lambda sweep: None
     with Feed(path) as feed:
         while not ending.is_set():
@@ -198,7 +198,7 @@ def run(sweeps: int) -> dict[str, list[float]]:
 
 
 def main() -> int:
-    """Measure, write the results, and the table of the page."""
+    """Measure; write the results and the page's table."""
     parser = argparse.ArgumentParser(prog="python -m tests.robots", description=__doc__)
     parser.add_argument("--sweeps", type=int, default=30, help="of each connection (%(default)s)")
     args = parser.parse_args()

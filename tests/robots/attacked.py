@@ -1,11 +1,13 @@
 """The load of bridges on the box, and bridges under attack: `python -m tests.robots.attacked
---minutes 2`. In: minutes for each case. Out: a table, docs/data/robots-attacked.json; exit code 1
-if a frame, a sentence or an answer was lost.
+--minutes 2`, minutes for each case.
 
-One box (`palpate run --sim skin`, in real time) meets all cases in turns of SLOT_S, so that all had
-the same machine: no bridge; Modbus and ROS 2 on its feed and TCP on its line; the same with peers
-that flood Modbus and TCP bridge with requests, noise and connections. Box and listener run with
-real-time priority where `chrt` may be used.
+Prints a table and writes docs/data/robots-attacked.json; the exit code is 1 if a frame, a sentence
+or an answer was lost.
+
+One box (`palpate run --sim skin`, in real time) goes through all cases in turns of SLOT_S, so that
+all run on the same machine: no bridge; Modbus and ROS 2 on its feed and TCP on its line; the same
+with peers that flood the Modbus and TCP bridges with requests, noise and connections. Box and
+listener run with real-time priority if `chrt` may be used.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ CASES = {
 
 
 def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
-    """Hostile peers; they end with their input, and report their counts."""
+    """Start hostile peers; they end with their input, and then report their counts."""
     command, pipe = (
         [sys.executable, "-m", "tests.robots.attackers", kind, str(port)],
         subprocess.PIPE,
@@ -46,12 +48,12 @@ def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
 
 
 def said(attackers: subprocess.Popen[bytes]) -> dict[str, int]:
-    """End them; what they count."""
+    """End the peers; returns their counts."""
     return dict(json.loads(attackers.communicate(b"\n", timeout=30)[0]))
 
 
 def slot(name: str, feed: Path, box: SharedLine, listener: LatencyListener, kind: Kind) -> None:
-    """One turn of a case: bridges and peers come, the box is watched, they go."""
+    """One turn of a case: start bridges and peers, watch the box, end them."""
     with ExitStack() as stack:
         attackers = []
         if name != "0":
@@ -75,7 +77,7 @@ def slot(name: str, feed: Path, box: SharedLine, listener: LatencyListener, kind
 
 
 def measure(minutes: float, before: list[str]) -> dict[str, Any]:
-    """Figures by case, see `feed_load.result`."""
+    """Figures of each case, see `feed_load.result`."""
     kinds = {name: Kind() for name in CASES}
     with ExitStack() as stack:
         feed = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
@@ -83,7 +85,7 @@ def measure(minutes: float, before: list[str]) -> dict[str, Any]:
         stack.callback(box.close)
         box.start(1, sweeps)
         listener = LatencyListener(box, sweeps)
-        listener.listen(30.0, Kind())  # the start, and the first sweeps
+        listener.listen(30.0, Kind())  # until the box has started and answered the first sweeps
         rss_kib = box.process()[0]
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
             for name, kind in kinds.items():
@@ -99,18 +101,21 @@ def measure(minutes: float, before: list[str]) -> dict[str, Any]:
 def table(figures: dict[str, Any]) -> str:
     """The figures in Markdown."""
     rows = [
-        "| | share of a core | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost | the peers |"
+        "| | share of a core | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 "
+        "| answers | frames lost | the peers |"
     ]
     rows.append("|---|---|---|---|---|---|---|")
     for name, one in figures.items():
         late, within, peers = one["late_ms"], one["latency_ms"], one["lines"]
         bore = (
-            f"{peers['attempts']} connections, {peers['answers of the bridge']} answers to good ones"
+            f"{peers['attempts']} connections, "
+            f"{peers['answers of the bridge']} answers to good ones"
             if peers
             else ""
         )
         rows.append(
-            f"| {CASES[name]} | {100 * one['share']:.2f} % | {late['p50']:.1f} / {late['p99']:.1f} ms | {within['p50']:.2f} / "
+            f"| {CASES[name]} | {100 * one['share']:.2f} % "
+            f"| {late['p50']:.1f} / {late['p99']:.1f} ms | {within['p50']:.2f} / "
             f"{within['p99']:.2f} ms | {one['answers']} | {one['frames_lost']} | {bore} |"
         )
     return "\n".join(rows)
@@ -127,7 +132,7 @@ def main() -> int:
     real_time = (
         subprocess.run([*REAL_TIME, "true"], check=False, capture_output=True).returncode == 0
     )
-    if real_time:  # this process alone, which listens: bridges and peers are ordinary programs
+    if real_time:  # only this process, which listens; bridges and peers have normal priority
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
     figures = measure(args.minutes, [*REAL_TIME] if real_time else [])
     content = {"commit": commit(), "real_time": real_time, "cases": figures}

@@ -1,9 +1,9 @@
-"""Hostile peers of a bridge or of the page: `python -m tests.robots.attackers KIND PORT` until its
-input ends. In: modbus, tcp or page, and where it listens on loopback. Out: one line of JSON with
-the number of connections and the answers of a good peer.
+"""Hostile peers of a bridge or of the page: `python -m tests.robots.attackers KIND PORT`, until
+standard input ends.
 
-All are in one process of low priority, which pauses between its rounds, so that it takes less than
-a core.
+KIND is modbus, tcp or page, PORT its port on loopback. Prints a line of JSON with the number of
+connections and the answers that a good peer got. All peers are in one process of low priority. It
+pauses between its rounds, so it takes less than a core.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ FLOODS = {
         ASK.replace(b"/", b"/events", 1) + b"Authorization: Bearer wrong\r\n\r\n",
     ),
 }
-"""What is sent without end: requests, refused ones, endless ones, wrong ones."""
+"""Bytes that are sent without end: valid, refused, endless and wrong requests."""
 HALVES = {"modbus": READ[:7], "tcp": b"$PPLP,STA", "page": ASK[:20]}
 GOOD = {"modbus": READ, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
 BURST = 2
 
 
 def deaf(there: Address, ask: bytes) -> Act:
-    """One that asks and never reads; it comes again when it is closed."""
+    """A peer that asks and never reads; it connects again when it is closed."""
     held = [connected(there)]
 
     def act() -> None:
@@ -67,7 +67,7 @@ def deaf(there: Address, ask: bytes) -> Act:
 
 
 def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
-    """A good peer, and all that is bad."""
+    """A good peer, and all hostile peers of a kind."""
     bad: Counter[str] = Counter()
     floods = [
         talker(there, bad, partial(bytes, said), reads=reads)
@@ -93,7 +93,7 @@ def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
 
 
 def main(kind: str, port: int) -> None:
-    """Until standard input ends."""
+    """Run until standard input ends."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(19)
     seen: Counter[str] = Counter()

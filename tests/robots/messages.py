@@ -1,9 +1,9 @@
 """`build/ros/bin/python tests/robots/messages.py`: builds palpate_msgs into the virtual environment
-that runs this, as colcon does it in an installation of ROS 2. Needs the extras `ros` and
-`ros-build`, cmake, a C++ compiler and Python's headers.
+of this Python, as colcon does in an installation of ROS 2. Needs the extras `ros` and `ros-build`,
+cmake, a C++ compiler and Python's headers.
 
-The wheels were built elsewhere: their CMake files name that machine's headers of Python and numpy,
-and no prefix is set.
+The wheels were built elsewhere: their CMake files contain the paths of Python's and numpy's headers
+on the machine that built them, and no prefix is set.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy
 
 SOURCE = Path(__file__).resolve().parents[2] / "appliance" / "bridges" / "palpate_msgs"
 BUILDER = "/opt/python/cp311-cp311"
-"""Where the wheels were built."""
+"""Folder of Python on the machine that built the wheels."""
 
 
 def mend(prefix: Path) -> None:
-    """Let the wheels' CMake files name this machine's headers."""
+    """Replace these paths in the wheels' CMake files by this machine's."""
     headers = {
         f"{BUILDER}/include/python3.11": sysconfig.get_path("include"),
         f"{BUILDER}/lib/python3.11/site-packages/numpy/_core/include": numpy.get_include(),

@@ -1,5 +1,4 @@
-"""The tables of docs/robots/README.md. In: figures, texts. Out: the lines between the markers, and
-no other."""
+"""Writes the tables of docs/robots/README.md between their markers; other lines stay."""
 
 from __future__ import annotations
 
@@ -26,14 +25,19 @@ def table(found: Mapping[str, Any]) -> str:
     for name, text in NAMES.items():
         one = found["connections"][name]
         rows.append(
-            f"| {text.format(poll=found['poll_ms'])} | {one['median_ms']} ms | {one['longest_ms']} ms | {one['n']} |"
+            f"| {text.format(poll=found['poll_ms'])} | {one['median_ms']} ms "
+            f"| {one['longest_ms']} ms | {one['n']} |"
         )
     wire = len(SENTENCE) * BITS / BAUD * 1000
     return "\n".join(
         [
-            f"Measured by `python -m tests.robots`, all but the first at the same time, on {found['cores']} cores ({found['machine']}), which",
-            f"other work shares: load average {found['load']:.1f}, scheduling class {found['scheduler']}; commit {found['commit'][:12]}. From the verdict to the robot's",
-            f"program. On a wire at {BAUD} baud a RES of {len(SENTENCE)} characters takes {wire:.1f} ms more; networks add their own time.",
+            "Measured by `python -m tests.robots`, all but the first at the same time, "
+            f"on {found['cores']} cores ({found['machine']}), which",
+            f"other work shares: load average {found['load']:.1f}, "
+            f"scheduling class {found['scheduler']}; commit {found['commit'][:12]}. "
+            "From the verdict to the robot's",
+            f"program. On a wire at {BAUD} baud a RES of {len(SENTENCE)} characters "
+            f"takes {wire:.1f} ms more; networks add their own time.",
             "",
             *rows,
         ]
@@ -41,7 +45,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 
 def write(path: Path, marker: str, text: str) -> None:
-    """Put a text between the markers of this name."""
+    """Replace the text between the markers of this name."""
     page = path.read_text("utf-8")
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     path.write_text(

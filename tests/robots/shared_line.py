@@ -1,8 +1,7 @@
-"""A box whose serial line is heard here and by a bridge. In: the script of sweeps. Out: as
-ThisMachine, and the bridge's end.
+"""A box whose serial line is read here and by a bridge.
 
-The box's sentences are noted here first, in a process of real-time priority where that is allowed,
-and then passed on. So a box with a bridge on its line is measured like a box without.
+The box's sentences are first read and timed here, with real-time priority if that is allowed, and
+then passed on. So a box with a bridge on its line is measured like a box without.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from tests.rig.soak_boxes import ThisMachine
 
 
 class SharedLine(ThisMachine):
-    """line: what `bridge tcp --port` opens, once the box is started."""
+    """A ThisMachine with a bridge on its line. line: the port for `bridge tcp --port`, once the box
+    is started."""
 
     line = ""
 
@@ -26,7 +26,7 @@ class SharedLine(ThisMachine):
         super().launch(*options)
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """As BoxUnderTest; passes on commands of the bridge meanwhile."""
+        """As BoxUnderTest; also passes on commands of the bridge."""
         ready = select.select([self._far, self._bridge], [], [], wait_s)[0]
         if self._bridge in ready:
             with suppress(BlockingIOError):
@@ -35,6 +35,6 @@ class SharedLine(ThisMachine):
 
     def _said(self) -> bytes:
         data = super()._said()
-        with suppress(BlockingIOError):  # nobody has opened its end yet
+        with suppress(BlockingIOError):  # no bridge has opened its end yet
             os.write(self._bridge, data)
         return data

@@ -1,11 +1,13 @@
 """A box with everything attached and attacked, beside a box with nothing: `python -m
-tests.robots.side_by_side --minutes 5`. In: minutes. Out: docs/data/robots-side-by-side.json and the
-table of docs/robots/README.md; exit code 1 if the attacked box was worse off.
+tests.robots.side_by_side --minutes 5`.
+
+Writes docs/data/robots-side-by-side.json and the table of docs/robots/README.md; the exit code is 1
+if the attacked box was worse off.
 
 Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this
 machine. The page, the TCP bridge (on its serial line), the Modbus bridge and readers (on its feed)
-are attached to the first; each of these four has hostile peers. Boxes and listeners run with
-real-time priority where that is allowed, all else does not.
+are attached to the first; each of these four has hostile peers. Only boxes and listeners run with
+real-time priority, if that is allowed.
 """
 
 from __future__ import annotations
@@ -40,13 +42,12 @@ from tests.robots.shared_line import SharedLine
 from tests.skins.load import BOX, hurry
 
 START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
-"""Time for the boxes to start, for what is attached to come, and between two looks at the
-processes."""
+"""Time for the boxes to start, for programs to attach, and between two samples of the processes."""
 RESULTS = ROOT / "docs" / "data" / "robots-side-by-side.json"
 SWEEP_S = 3.0
-"""The robot sweeps no more often."""
+"""Shortest time between two sweeps of the robot."""
 SHARE = 0.03
-"""Most additional share of a core: one hundredth for the feed's readers, two for fifty questions a
+"""Largest additional share of a core: one percent for the feed's readers, two for fifty requests a
 second over TCP, which the box answers."""
 MIB = 2.0
 
@@ -63,14 +64,14 @@ class BoxSide:
     before_kib: int = 0
 
     def look(self) -> None:
-        """Note the resources that the process has used."""
+        """Record the resources that the process has used."""
         used = self.box.process()
         self.looks.append((time.monotonic(), used[2], used[0]))
 
     def figures(self) -> dict[str, Any]:
-        """latency_ms: in the box. way_ms: from the verdict to the robot's end of the line. edge_ms:
-        from the stop edge to there, less the median: when the script began is not known outside the
-        box; both boxes have the same sweeps."""
+        """latency_ms: inside the box. way_ms: from the verdict to the robot's end of the line.
+        edge_ms: from the stop edge to the robot's end, minus the median, because the start of the
+        script is not known outside the box; both boxes have the same sweeps."""
         kind = self.kind
         at_s, stop = np.array(kind.answers).T
         edge_s = at_s - stop / skin.FORMAT.rate_hz
@@ -98,7 +99,7 @@ class BoxSide:
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, 99th percentile and the largest."""
+    """Median, 99th percentile and maximum."""
     return {
         name: round(float(np.percentile(values, q)), 2)
         for name, q in (("p50", 50), ("p99", 99), ("max", 100))
@@ -108,16 +109,14 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 def sides(
     stack: ExitStack, feed: Path, seed: int, sweeps_n: int, before: Sequence[str]
 ) -> dict[str, BoxSide]:
-    """Both boxes, started."""
+    """Start both boxes."""
     found = {}
     for name, box in (
         ("alone", ThisMachine(before, ["store.runtime="])),
         ("attacked", SharedLine(before, [f"store.runtime={feed.parent}"])),
     ):
         sweeps = Script(seed)
-        sweeps[
-            sweeps_n
-        ]  # worked out now: later it would keep a listener from noting when a sentence comes
+        sweeps[sweeps_n]  # computed now: later it would delay a listener
         stack.callback(box.close)
         box.start(seed, sweeps)
         found[name] = BoxSide(box, LatencyListener(box, sweeps))
@@ -125,15 +124,15 @@ def sides(
 
 
 def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
-    """Hear both boxes so long, each in a thread that goes before all else; look at their processes
-    meanwhile."""
+    """Read both boxes for this long, each in a thread of high priority, and sample their
+    processes."""
     failed: list[BaseException] = []
 
     def one(side: BoxSide) -> None:
         hurry(BOX)
         try:
             side.listener.listen(seconds, side.kind if measured else Kind())
-        except BaseException as e:  # to be raised where it is waited for
+        except BaseException as e:  # raised by the thread that joins
             failed.append(e)
 
     threads = [threading.Thread(target=one, args=(side,), daemon=True) for side in both.values()]
@@ -153,7 +152,7 @@ def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
 
 @contextmanager
 def page_of(feed: Path) -> Iterator[int]:
-    """The page of the box with this feed; its port."""
+    """Start the page of the box with this feed; returns its port."""
     command = [
         sys.executable,
         "-m",
@@ -174,7 +173,7 @@ def page_of(feed: Path) -> Iterator[int]:
 
 @contextmanager
 def readers(feed: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Good and bad readers of the feed."""
+    """Start good and bad readers of the feed."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(feed), "attacked"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
@@ -244,11 +243,14 @@ def table(content: dict[str, Any]) -> str:
     """The measurements in Markdown."""
     boxes, peers = content["boxes"], content["peers"]
     rows = [
-        f"Measured by `python -m tests.robots.side_by_side`, both boxes at the same time for {boxes['alone']['seconds']} s, on "
+        "Measured by `python -m tests.robots.side_by_side`, both boxes at the same time "
+        f"for {boxes['alone']['seconds']} s, on "
         f"{content['machine']}{', with real-time priority' * content['real_time']};",
         f"load average {content['load']:.1f}; commit {content['commit'][:12]}.",
         "",
-        "| box | frames lost | answers | in the box, p50 / p99 / most | verdict to line, p50 / p99 / most | edge to answer, later than the median: p99 / most | share of a core | memory: before, most |",
+        "| box | frames lost | answers | in the box, p50 / p99 / most "
+        "| verdict to line, p50 / p99 / most | edge to answer, later than the median: p99 / most "
+        "| share of a core | memory: before, most |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, one in boxes.items():
@@ -258,8 +260,8 @@ def table(content: dict[str, Any]) -> str:
         )
         edge = "{p99:.1f} / {max:.1f} ms".format(**one["edge_ms"])
         rows.append(
-            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} | {edge} | {100 * one['share']:.2f} % | "
-            f"{one['before_mib']}, {one['most_mib']} MiB |"
+            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} | {edge} "
+            f"| {100 * one['share']:.2f} % | {one['before_mib']}, {one['most_mib']} MiB |"
         )
     bore = [f"{kind} {seen['attempts']:,}" for kind, seen in peers.items()]
     good = [
@@ -269,7 +271,8 @@ def table(content: dict[str, Any]) -> str:
     ]
     rows += [
         "",
-        f"Hostile connections: {', '.join(bore)}. Meanwhile one good peer of each got answers: {', '.join(good)}.",
+        f"Hostile connections: {', '.join(bore)}. "
+        f"Meanwhile one good peer of each got answers: {', '.join(good)}.",
     ]
     return "\n".join(rows)
 

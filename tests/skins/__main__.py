@@ -1,9 +1,9 @@
-"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins; docs/data/skins.json,
-tables of docs/skins.md.
+"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins, for
+docs/data/skins.json and the tables of docs/skins.md.
 
-way: record, describe, fit, export and run with each. noise: wrong frames on a bad cable. load:
-share of a core, lost frames and time to the answer, with the bundles of `way`. Without a word all
-of them, then the page.
+way: record, describe, fit, export and run with each skin. noise: wrong frames on a bad cable. load:
+share of a core, lost frames and time to the answer, with the bundles of `way`. Without an argument
+all of them, then the page.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""The load of a skin on the box at its full rate, in real time. In: the name of a profile, its
-bundle, seconds. Out: figures.
+"""The load of a skin on the box at its full rate, in real time.
 
-The emulator plays in a process of its own, and each frame carries its number in two taxels, so that
-lost frames are seen with every skin, up to 10,000 of them at once: ten seconds at 1 kHz. The box
-classifies one sweep after the other. Both run under real-time scheduling where that is allowed: so
+The emulator runs in a process of its own. Each frame carries its number in two taxels, so lost
+frames are detected with every skin, up to 10,000 at once, or ten seconds at 1 kHz. The box
+classifies one sweep after the other. Both run under real-time scheduling if that is allowed, so
 other programs of the machine are not measured.
 """
 
@@ -47,24 +46,24 @@ from appliance.tools.bench_process import drain
 from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0
-"""Time before figures are taken: the skin is found, its rate measured."""
+"""Time before the measurement, in which the skin is found and its rate measured."""
 PAUSE_S, LEAD_S = 1.0, 0.5
-"""Time between two sweeps, and by how much each is longer than the window at its ends together."""
+"""Time between two sweeps, and the time by which each is longer than the window."""
 NUMBERS = 100
-"""Frames are numbered by so many numbers in each of two taxels, the lower part first."""
+"""Each of the two taxels has this many values of the frame's number, the lower part first."""
 EMULATOR, BOX = 20, 10
-"""Real-time priorities; a skin does not wait for the box."""
+"""Real-time priorities: a skin does not wait for the box."""
 DRAIN = 50
-"""Turns between two looks at the far end of the serial line, which is no part of the box."""
+"""Turns between two reads of the far end of the serial line, which is not part of the box."""
 START_S = 20
 """Longest wait for the emulator."""
 SEED = 7
-"""Of the simulated sweep that is played."""
+"""Seed of the simulated sweep that is played."""
 
 
 class Sliding:
-    """A finger that slides without end: the middle of a simulated sweep, again and again, with
-    numbers in two taxels."""
+    """A finger that slides without end: the middle of a simulated sweep, repeated, with numbers in
+    two taxels."""
 
     def __init__(self, name: str, profile: SkinProfile, format: SweepFormat) -> None:
         self._profile = profile
@@ -80,22 +79,23 @@ class Sliding:
 
 
 class FrameCheck(Observer):
-    """Notes what comes. came, missing: how many frames, and how many numbers between them.
-    answer_ms: from each stop edge to the sentence at the port. statuses: of all answers."""
+    """An observer of frames and answers. came, missing: number of frames, and of the numbers
+    missing between them. answer_ms: from each stop edge to the sentence at the port. statuses: of
+    all answers."""
 
     def __init__(self, clock: Clock) -> None:
         self.clear()
         self._clock = clock
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Start again from zero."""
         self.came = self.missing = 0
         self._last: NDArray[np.int64] = np.empty(0, np.int64)
         self.answer_ms: list[float] = []
         self.statuses: list[str] = []
 
     def frames(self, frames: Frames) -> None:
-        """Frames of one turn."""
+        """Count the frames of one turn."""
         low, high = frames.taxels.reshape(len(frames), -1)[:, :2].astype(np.int64).T
         numbers = low + NUMBERS * high
         self.came += len(numbers)
@@ -103,14 +103,14 @@ class FrameCheck(Observer):
         self._last = numbers[-1:]
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """The sentence is out before observers get the sweep."""
+        """Note an answer; its sentence is sent before observers get the sweep."""
         self.answer_ms.append((self._clock.now_ns() - sweep.stop_ns) / 1e6)
         self.statuses.append(str(verdict.status))
 
 
 class PromptClock(SystemClock):
-    """The real clock. latest_ns: the most that a sleep ended late: so long the machine let nobody
-    run."""
+    """The real clock. latest_ns: the largest delay at the end of a sleep, during which the machine
+    let no process run."""
 
     latest_ns = 0
 
@@ -121,7 +121,7 @@ class PromptClock(SystemClock):
 
 
 def hurry(priority: int) -> bool:
-    """Schedule this process before all usual processes; False if that is not allowed."""
+    """Schedule this process before all normal processes; False if that is not allowed."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
@@ -130,7 +130,7 @@ def hurry(priority: int) -> bool:
 
 
 def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
-    """Let a box with the bundle in `folder` run so long on the skin `name`. Ends the program where
+    """Run a box with the bundle in `folder` for this long on the skin `name`. Ends the program if
     the skin was lost."""
     current, clock = bundle.load(folder), SystemClock()
     check = FrameCheck(clock)
@@ -176,7 +176,7 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def sets(name: str, format: SweepFormat, link: Path) -> list[str]:
-    """Settings of a box with this skin and no lines."""
+    """Settings of a box with this skin and without GPIO lines."""
     chosen = {
         "skin.profile": name,
         "skin.port": link,
@@ -187,7 +187,7 @@ def sets(name: str, format: SweepFormat, link: Path) -> list[str]:
 
 
 def times(format: SweepFormat) -> list[str]:
-    """Options of `palpate run` for sweeps by the clock that hold a window of this format."""
+    """Options of `palpate run` for timed sweeps that hold a window of this format."""
     sweep_s = format.window / format.rate_hz + LEAD_S
     return ["--sweep", str(sweep_s), "--every", str(sweep_s + PAUSE_S)]
 
@@ -201,7 +201,7 @@ def _turns(box: Box, far_end: int, seconds: float) -> None:
 
 
 def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
-    """The emulator in a process of its own, once its terminal is there."""
+    """Run the emulator in a process of its own; starts when its terminal exists."""
     command = [sys.executable, "-m", "tests.skins.load", name, str(rate_hz), str(link)]
     player = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     until = time.monotonic() + START_S
@@ -214,8 +214,8 @@ def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
 
 
 def play(name: str, rate_hz: float, link: Path) -> None:
-    """Play a skin at `link` until SIGTERM; prints how many bytes nobody took, and how late it was
-    itself at most."""
+    """Play a skin at `link` until SIGTERM; prints the number of bytes that nobody read, and its own
+    largest delay."""
     stop = Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     profile = replace(skin_profile.load(name, [PROFILES]), rate_hz=rate_hz)

@@ -1,8 +1,8 @@
-"""How often a bad cable makes a wrong frame. In: the bytes of each skin, faults. Out: counts.
+"""Counts how often a bad cable makes a wrong frame of each skin.
 
-A frame is wrong if the box takes it and no such frame was sent. A skin with a checksum has none of
-them. A skin without a checksum cannot distinguish a changed number from a measured number. Its
-promise is that lost and added bytes invent no frame.
+A frame is wrong if the box accepts it although no such frame was sent. A skin with a checksum has
+no wrong frames. A skin without a checksum cannot distinguish a changed number from a measured
+number. Its promise is that lost and added bytes invent no frame.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from appliance.io.skin_codecs import Rest, codec
 from tests.skins.subjects import Subject
 
 READ_BYTES = 701
-"""Bytes of one read: no multiple of any frame."""
+"""Bytes of one read: not a multiple of any frame."""
 APART = 6
-"""One frame in so many is damaged, so that a skin is understood again in between."""
+"""One frame in this many is damaged, so that a codec finds the next frames again."""
 
 Fault = Callable[[bytes, Generator], bytes]
 
@@ -52,8 +52,8 @@ FAULTS: tuple[Fault, ...] = (lost, changed, added, twice)
 
 @dataclass(frozen=True, slots=True)
 class NoiseCount:
-    """faults: how many. taken: frames that the box took. wrong: those of them that were not sent.
-    sent: frames sent."""
+    """faults: number of faults. taken: frames that the box accepted. wrong: accepted frames that
+    were not sent. sent: frames sent."""
 
     faults: int
     sent: int

@@ -1,5 +1,4 @@
-"""The tables of docs/skins.md. In: docs/data/skins.json. Out: the page with each table between its
-markers."""
+"""Writes the tables of docs/skins.md from docs/data/skins.json, each between its markers."""
 
 from __future__ import annotations
 
@@ -15,8 +14,8 @@ Json = dict[str, Any]
 
 
 def write(path: Path, results: Json) -> None:
-    """Put each table and the header into the page. Raises FormatError where a pair of markers is
-    not there once."""
+    """Put each table and the header into the page. Raises FormatError unless each pair of markers
+    occurs once."""
     text = path.read_text("utf-8")
     for part, table in TABLES.items():
         text = marked_text.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))
@@ -28,13 +27,19 @@ def _percent(share: float) -> str:
 
 
 def _way(found: dict[str, Json]) -> Iterator[str]:
-    yield "| skin | as recorded | chosen by `fit` | named rightly, at other positions | 95 % interval | frames lost | bundle |"
+    yield (
+        "| skin | as recorded | chosen by `fit` | named rightly, at other positions "
+        "| 95 % interval | frames lost | bundle |"
+    )
     yield "|---|---|---|---|---|---|---|"
     for name, row in found.items():
         low, high = map(_percent, row["interval"])
         right = f"{row['right']} of {row['total']}: {_percent(row['right'] / row['total'])}"
         described = f"{row['sweeps']} sweeps, {row['format']}"
-        yield f"| {name} | {described} | {row['chosen']} | {right} | {low} to {high} | {row['lost']} | {row['bundle_kb']} kB |"
+        yield (
+            f"| {name} | {described} | {row['chosen']} | {right} | {low} to {high} "
+            f"| {row['lost']} | {row['bundle_kb']} kB |"
+        )
 
 
 def _noise(found: dict[str, Json]) -> Iterator[str]:
@@ -54,7 +59,8 @@ def _noise(found: dict[str, Json]) -> Iterator[str]:
 
 
 def _rate(wrong: int, faults: int) -> str:
-    """Wrong frames in so many faults; without any, the rule of three gives their highest rate."""
+    """Wrong frames in this many faults; if there are none, their highest rate by the rule of
+    three."""
     if not wrong:
         return f"0 of {faults:,} (below {3 / faults:.2%})"
     return f"{wrong:,} of {faults:,} ({wrong / faults:.2%})"
@@ -64,9 +70,13 @@ def _load(found: dict[str, Json]) -> Iterator[str]:
     yield "| skin | frames | share of a core | edge to sentence | time | frames that came | lost |"
     yield "|---|---|---|---|---|---|---|"
     for name, row in found.items():
-        times = f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms (n = {row['answers']})"
+        times = (
+            f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms "
+            f"(n = {row['answers']})"
+        )
         yield (
-            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} | {row['seconds']:.0f} s | {row['came']:,} "
+            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} "
+            f"| {row['seconds']:.0f} s | {row['came']:,} "
             f"| {row['missing']} |"
         )
 

@@ -1,5 +1,5 @@
-"""The skins that are measured. In: the name of a delivered profile. Out: its profile, its emulator,
-and numbered frames."""
+"""The skins that are measured: the profile, the emulator and numbered frames of a delivered
+profile."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ NAMES = tuple(WIRES)
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A skin that sends frames of random content. frames: [n, *shape], sent again and again."""
+    """A skin that sends frames of random content. frames: [n, *shape], repeated."""
 
     name: str
     profile: SkinProfile
     frames: NDArray[np.generic]
 
     def wire(self) -> Wire:
-        """A new emulator of it."""
+        """A new emulator of this skin."""
         return wire(self.name, self.profile.rate_hz)
 
     def sent(self, skin: Wire, i: int) -> bytes:
@@ -41,8 +41,8 @@ class Subject:
 
 @lru_cache
 def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
-    """The skin with this name. Its numbers fill the range of the type, so that every marker occurs
-    among them.
+    """The skin with this name. Its numbers fill the range of the type, so every marker occurs among
+    them.
 
     rows, cols: the grid on the wire, by default the profile's.
     """
@@ -50,9 +50,8 @@ def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
     profile = replace(profile, rows=rows or profile.rows, cols=cols or profile.cols)
     format, rng = profile.format, np.random.default_rng(sum(name.encode()))
     if format.dtype == "float32":
-        values = (
-            rng.integers(-4000, 4000, (n, *format.shape)) / 4
-        )  # what two digits after the point can hold
+        # multiples of 0.25 are exact with two decimals
+        values = rng.integers(-4000, 4000, (n, *format.shape)) / 4
     else:
         most = 0xF9FF if name == "xela-can" else np.iinfo(format.dtype).max
         values = rng.integers(0, most + 1, (n, *format.shape))

@@ -1,8 +1,7 @@
 """The whole way with a skin, by the commands that a person types: record, describe, fit, export,
 run.
 
-In: the name of a profile, a folder. Out: the answers of the last command to sweeps at positions
-that no recording has.
+The result is the answers of the last command to sweeps at positions that no recording has.
 """
 
 from __future__ import annotations
@@ -18,20 +17,21 @@ from appliance.core.statistics import wilson
 from appliance.sim import skin
 
 TRAINED, TESTED = range(1, 7), range(101, 105)
-"""Seeds of the positions at which the skin sits: of recordings, and of the last command."""
+"""Seeds of the skin's positions, in recordings and in the last command."""
 RECORDED, PLAYED = 6, 30
-"""Sweeps of a material at a position; sweeps at a position in the last command."""
+"""Number of sweeps of a material at a position in recordings; number of sweeps at a position in the
+last command."""
 LIMIT_S = 600
 """Longest time of a command."""
 
 
 def box(*arguments: object) -> str:
-    """`palpate ARGUMENTS`; what it printed."""
+    """Run `palpate ARGUMENTS`; returns its output."""
     return _command("appliance", *arguments)
 
 
 def desktop(*arguments: object) -> str:
-    """`palpate-train ARGUMENTS`; what it printed."""
+    """Run `palpate-train ARGUMENTS`; returns its output."""
     return _command("train", *arguments)
 
 
@@ -46,8 +46,7 @@ def _command(package: str, *arguments: object) -> str:
 
 
 def go(name: str, folder: Path) -> dict[str, Any]:
-    """Record, describe, fit, export and run with the skin `name`; everything made lies in
-    `folder`."""
+    """Record, describe, fit, export and run with the skin `name`; all files are in `folder`."""
     sweeps, fit, bundle = folder / "sweeps", folder / "fit.npz", folder / "bundle"
     chosen = ("--skin", name, "--virtual")
     for seed in TRAINED:
