@@ -69,8 +69,7 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
         page = command[-1] / "soak" / "index.html"
         page.parent.mkdir(parents=True)
         page.write_text(
-            '<title>Soak</title><a href="../../README.md"><a href="../../docs/skins.md#load">'
-            '<img src="soak.svg">'
+            '<a href="../../README.md"><a href="../../docs/skins.md#load"><img src="soak.svg">'
         )
         page.with_name("soak.svg").write_text("<svg/>")
 
@@ -78,7 +77,7 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
     sources, site = tmp_path / "src", tmp_path / "site"
     build.results(sources)
     listed = (sources / build.RESULTS).read_text()
-    assert '- <a href="results/soak/index.html">Soak</a>' in listed
+    assert f'<a href="results/soak/index.html">{build.RESULT_PAGES["soak"]}</a>' in listed
     build.take_over(Path("results/soak/index.html"), sources, site)
     shown = (site / "results" / "soak" / "index.html").read_text()
     assert re.findall(r'href="([^"]+)"', shown) == [

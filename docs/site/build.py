@@ -26,7 +26,15 @@ HERE = Path(__file__).resolve().parent
 
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
 RESULTS, SOAK = "results.md", "docs/data/soak.json"
-TITLE = re.compile(r"<title>([^<]*)</title>")
+RESULT_PAGES = {
+    "development": "Speed and accuracy: our methods and their peers, test by test",
+    "paper": "The paper's experiment, run again (simulated)",
+    "stress": "Robustness: accuracy on corrupted sweeps (simulated)",
+    "certainty": "Calibration, unknown materials, several sweeps, enrolment (simulated)",
+    "soak": "Hours of sweeps without a pause",
+    "chart": "Earlier networks: accuracy against all costs",
+}
+"""Pages of studies, by their folders, the most telling first."""
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
 CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
 CHAPTERS = {
@@ -102,13 +110,12 @@ def results(out: Path) -> None:
     ):
         command = [sys.executable, "-m", *words]
         subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
-    written = sorted(pages.glob("*/index.html"))
-    titles = {page: TITLE.search(page.read_text("utf-8")) for page in written}
-    links = (
-        f'- <a href="results/{page.relative_to(pages)}">{title[1] if title else page.stem}</a>'
-        for page, title in titles.items()
-    )
-    text = ["# Result pages", "", "The studies make these pages from their results.", "", *links]
+    names = [page.parent.name for page in sorted(pages.glob("*/index.html"))]
+    links = [
+        f'- <a href="results/{name}/index.html">{RESULT_PAGES.get(name, name)}</a>'
+        for name in sorted(names, key=[*RESULT_PAGES, *names].index)
+    ]
+    text = ["# Result pages", "", "The studies draw these pages from their results.", "", *links]
     (out / RESULTS).write_text("\n".join([*text, ""]), "utf-8")
 
 
