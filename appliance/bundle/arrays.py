@@ -1,8 +1,6 @@
-"""Arrays in the files of a bundle: .npz in and out, sweeps packed as their changes, the form of
-class means.
+"""Reads, writes and checks the arrays in the files of a bundle.
 
-In: bytes, arrays. Out: arrays, bytes; a BundleError where they are not as they must be. Nothing is
-unpickled.
+Wrong content raises a BundleError. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -22,23 +20,27 @@ from appliance.core.types import UNREADABLE, SweepFormat
 
 
 def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
-    """Arrays of the .npz `data` by name, `names` among them; pickled objects are refused. Raises
-    BundleError naming `file`."""
+    """The arrays of the .npz `data` by name.
+
+    names: arrays that must be there. Pickled objects are refused. Raises a BundleError that names
+    `file`.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as packed:
             size = sum(entry.file_size for entry in packed.infolist())
         if size > MOST_BYTES:
             raise BundleError(
-                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with fewer sweeps"
+                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with "
+                "fewer sweeps"
             )
         with np.load(io.BytesIO(data), allow_pickle=False) as z:
             arrays = dict(z.items())
         for name, values in arrays.items():
             if not isinstance(
                 values, np.ndarray
-            ):  # numpy gives what does not begin as an array does as it is
+            ):  # numpy returns a member without an array's header as bytes
                 raise BundleError(
-                    f"{file} cannot be read: {name!r} is no array; export the bundle again"
+                    f"{file} cannot be read: {name!r} is not an array; export the bundle again"
                 )
         return {name: arrays[name] for name in names} | arrays
     except (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
@@ -53,11 +55,11 @@ def packed(**arrays: NDArray[Any]) -> bytes:
 
 
 def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
-    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as whole numbers
-    of the same bits: of all changes first the lowest byte, then the next one, [bytes, G, T, R, C]
-    or [bytes, G, T, R, C, A].
+    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as bytes [B, G, T,
+    R, C] or [B, G, T, R, C, A] for values of B bytes.
 
-    These pack better than the numbers, and not a bit of them is lost.
+    The values' bits are read as whole numbers. The lowest bytes of all changes come first, then the
+    next bytes. This compresses better than the values themselves and is lossless.
     """
     bits = np.ascontiguousarray(samples).view(f"<u{samples.itemsize}")
     steps = np.diff(bits, axis=1, prepend=np.zeros_like(bits[:, :1]))
@@ -68,8 +70,8 @@ def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
-    """Sweeps from the bytes of their changes [bytes, G, T, R, C] or [bytes, G, T, R, C, A]: the
-    inverse of `changes`. Raises BundleError naming `file`."""
+    """Sweeps from the bytes of their changes [B, G, T, R, C] or [B, G, T, R, C, A]: the inverse of
+    `changes`. Raises a BundleError that names `file`."""
     size = f.numpy_type.itemsize
     if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (
         size,
@@ -84,8 +86,8 @@ def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
 
 
 def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
-    """Raises BundleError if an array of means.npz has another type or shape than `n` labels have,
-    or a number out of range."""
+    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels,
+    or has a number out of range."""
     rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
     rows = {
         "means": (n, rank),
@@ -106,11 +108,13 @@ def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
             wanted = (n, shape[1], shape[1])
         if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
             raise BundleError(
-                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} {list(wanted)} is wanted, a row a label"
+                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} "
+                f"{list(wanted)} is wanted, a row a label"
             )
         if not np.isfinite(values).all():
             raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
     if not (arrays["spread"] > 0).all():
         raise BundleError(
-            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the bundle again"
+            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the "
+            "bundle again"
         )

@@ -1,20 +1,20 @@
-"""The model bundle. In: a folder. Out: a checked Bundle. No file is used before its hash and form
-were checked.
+"""Reads and checks a model bundle. No file is used before its hash and content were checked.
 
 A bundle is `manifest.json`, `model.onnx`, `golden.npz` and, if the manifest has `known`,
 `means.npz`. The graph takes the sensor's raw counts as `sweep` [1, T, R, C], or [1, T, R, C, A]
-where a taxel has several axes (or float32 features [1, n] as `features`, if the manifest's input is
-one of features.KINDS); all scaling is inside it. Its outputs by name:
+for several axes. If the manifest's input is one of features.KINDS, it takes float32 features [1, n]
+as `features`. All scaling is inside the graph. Its outputs by name:
 
 - `logits` float32 [1, K0] for the K0 labels of training;
-- `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of the window;
-- `embedding` float32 [1, r], optional: a linear projection in which the sweeps of each material have covariance 1.
+- `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of
+  the window;
+- `embedding` float32 [1, r], optional: a linear projection in which the sweeps of each material
+  have covariance 1.
 
 Golden sweeps are test sweeps with the logits that were computed at export, or by the box at
 enrolment.
 
-A box that enrols a label leaves these files as they are, byte for byte, and puts `enrolment.npz`
-beside them (enrolled.py).
+Enrolment on a box does not change these files; it adds `enrolment.npz` (enrolled.py).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from appliance.bundle.onnx_check import check
 from appliance.core.errors import BundleError
 from appliance.signal import features
 
-try:  # not from hashlib: it loads OpenSSL, 4 MB, for a function that Python has built in
+try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
 except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
@@ -86,14 +86,13 @@ __all__ = [
 ]
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
 MOST_SMALL = 1 << 20
-"""Largest size in bytes of a manifest or a signature, which are read before anything is known about
-them."""
+"""Largest size in bytes of a manifest or a signature, whose sizes are not given elsewhere."""
 SIGNATURE, ENROLMENT_SIGNATURE = MANIFEST + ".sig", ENROLMENT + ".sig"
 OPTIONAL = {SIGNATURE: MOST_SMALL, ENROLMENT: MOST_BYTES, ENROLMENT_SIGNATURE: MOST_SMALL}
 """Files that a manifest does not name, with the largest size of each in bytes."""
 GOLDEN_TOLERANCE = 0.02
-"""Largest allowed difference of a golden sweep's probability between export and this machine;
-labels must be equal."""
+"""Largest allowed difference of a golden sweep's probability between export and this machine.
+Labels must be equal."""
 
 
 def file_entry(data: bytes) -> dict[str, Any]:
@@ -102,7 +101,7 @@ def file_entry(data: bytes) -> dict[str, Any]:
 
 
 def digest(data: bytes) -> str:
-    """The sha256 in hexadecimal."""
+    """The sha256 of `data` in hexadecimal."""
     return str(sha256(data).hexdigest())
 
 
@@ -113,20 +112,20 @@ def identity(named_by: bytes) -> str:
 
 
 def name(files: Mapping[str, bytes]) -> str:
-    """A bundle's name in the store: the sha256 of what names all its other files, in
-    hexadecimal."""
+    """A bundle's name in the store: the sha256, in hexadecimal, of its enrolment.npz or else of its
+    manifest."""
     return digest(files.get(ENROLMENT, files[MANIFEST]))
 
 
 def load(folder: Path) -> Bundle:
-    """Read and check the bundle in `folder`. Raises BundleError if a file is missing, altered or of
-    another form."""
+    """Read and check the bundle in `folder`. Raises BundleError if a file is missing, altered or
+    has unexpected content."""
     return from_files(files(folder), str(folder))
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The files of the bundle in `folder` by name: the manifest, the files that it names, and those
-    of OPTIONAL that are there.
+    """The files of the bundle in `folder` by name: the manifest, the files that it names, and the
+    files of OPTIONAL that exist.
 
     Other files are ignored. Links are not followed, and no file is read beyond the size in the
     manifest. Raises BundleError if a file cannot be read or is larger.
@@ -135,7 +134,7 @@ def files(folder: Path) -> dict[str, bytes]:
         found = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
         raise BundleError(
-            f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of one"
+            f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of a bundle"
         ) from e
     for name, size in _named(found[MANIFEST]).items():
         try:
@@ -158,8 +157,8 @@ def _named(manifest: bytes) -> dict[str, int]:
 
 
 def _read(path: Path, most: int) -> bytes:
-    """Bytes of a regular file, at most one more than `most`: no link, no device, no pipe that would
-    block."""
+    """Bytes of a regular file, at most `most` + 1. Links, devices and pipes, which could block, are
+    refused."""
     with os.fdopen(
         os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb"
     ) as f:
@@ -172,8 +171,8 @@ def _read(path: Path, most: int) -> bytes:
 
 
 def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
-    """The checked bundle of `files` by name. where: their origin, for messages. Raises BundleError
-    as `load`."""
+    """The checked bundle of `files`, which are given by name. where: their origin, for messages.
+    Raises BundleError as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
     samples, logits = _golden(golden, manifest)
@@ -210,14 +209,14 @@ def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: s
 
 
 def golden_file(samples: NDArray[Any], logits: NDArray[Any]) -> bytes:
-    """golden.npz of sweeps [G, T, R, C] or [G, T, R, C, A], as `arrays.changes`, and their logits
-    [G, K]."""
+    """The bytes of golden.npz for sweeps [G, T, R, C] or [G, T, R, C, A], packed by
+    `arrays.changes`, and their logits [G, K]."""
     return arrays.packed(changes=arrays.changes(samples), logits=logits)
 
 
 def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
     """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]. Older files hold
-    `samples` as they are."""
+    `samples`, the sweeps without packing."""
     f = manifest.format
     held = arrays.read(data, GOLDEN, "logits")
     if not held.keys() & {"samples", "changes"}:
@@ -234,7 +233,8 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
         )
     if logits.shape != (len(samples), len(manifest.labels)):
         raise BundleError(
-            f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, {len(manifest.labels)} labels"
+            f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, "
+            f"{len(manifest.labels)} labels"
         )
     return samples, logits.astype(np.float32)
 
@@ -252,11 +252,13 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
     sweeps = held["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
         raise BundleError(
-            f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled ones after"
+            f"{MEANS} holds sweeps {sweeps.tolist()}; trained labels (0) come first, enrolled "
+            "labels after"
         )
     if manifest.early and sweeps.any():
         raise BundleError(
-            "manifest has `early`, whose heads do not know the enrolled labels; enrol again from the original"
+            "manifest has `early`, whose heads do not know the enrolled labels; enrol again from "
+            "the original"
         )
     return Classes(
         held["means"],

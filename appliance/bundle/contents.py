@@ -1,5 +1,5 @@
-"""What a bundle holds once it was read and checked: manifest, model, golden sweeps, class means,
-enrolled labels."""
+"""Types for the checked content of a bundle: manifest, model, golden sweeps, class means, enrolled
+labels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from appliance.core.types import SweepFormat
 
 @dataclass(frozen=True, slots=True)
 class DisplacedClasses:
-    """The classes for sweeps whose contact is displaced, in the embedding turned so that these
+    """The classes for sweeps whose contact is displaced, in a turned embedding in which these
     sweeps have covariance 1.
 
-    turn: float32 [r, r], embedding @ turn is the turned one. means: float32 [K, r]; shapes: float16
-    [K, b, b], see Classes.
+    turn: float32 [r, r]; embedding @ turn is the turned embedding. means: float32 [K, r]. shapes:
+    float16 [K, b, b], see Classes.
     """
 
     turn: NDArray[np.float32]
@@ -31,14 +31,16 @@ class DisplacedClasses:
 class Classes:
     """Content of means.npz: the class means in the embedding, in the order of the labels.
 
-    means: float32 [K, r]. bias: float32 [K], added to the product of mean and embedding. sweeps:
-    int64 [K], number of sweeps that a label was enrolled from; 0 for a trained label. spread:
-    float32 [K], variance of the label's sweeps per direction of the embedding; 1 for a trained
-    label, and for all labels if the file has no such array. shapes: float16 [K, b, b], how the
-    label's sweeps scatter in the last b directions of the embedding: what a difference from the
-    mean is multiplied by before it is squared; 1 for an enrolled label, b = 0 if the file has no
-    such array. displaced: the same for sweeps whose contact is displaced, None if the manifest has
-    no rule for these.
+    means: float32 [K, r].
+    bias: float32 [K], added to the product of mean and embedding.
+    sweeps: int64 [K], number of sweeps that a label was enrolled from; 0 for a trained label.
+    spread: float32 [K], variance of the label's sweeps per direction of the embedding; 1 for a
+        trained label, and for all labels if the file has no such array.
+    shapes: float16 [K, b, b], scatter of the label's sweeps in the last b directions of the
+        embedding: a difference from the mean is multiplied by this matrix before it is squared. The
+        identity for an enrolled label; b = 0 if the file has no such array.
+    displaced: the same for sweeps whose contact is displaced, None if the manifest has no rule for
+        these.
     """
 
     means: NDArray[np.float32]
@@ -49,7 +51,8 @@ class Classes:
     displaced: DisplacedClasses | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of means.npz by name. Those of `displaced` are named moved_* in the file."""
+        """The arrays of means.npz by name. In the file the arrays of `displaced` are named
+        moved_*."""
         own = {name: getattr(self, name) for name in self.__slots__ if name != "displaced"}
         return own | (
             {f"moved_{name}": getattr(self.displaced, name) for name in self.displaced.__slots__}
@@ -60,14 +63,17 @@ class Classes:
 
 @dataclass(frozen=True, slots=True)
 class AddedLabels:
-    """Content of enrolment.npz: the labels that a box has enrolled into a bundle, in the order in
-    which it did.
+    """Content of enrolment.npz: the labels that a box has enrolled into a bundle, in the order of
+    enrolment.
 
-    base: sha256 of the manifest of that bundle, hexadecimal. labels: [n]. means: float32 [n, r], of
-    each label's sweeps in the embedding; sweeps: int64 [n], how many these were; spread: float32
-    [n], as in Classes. golden: raw counts [n, T, R, C] or [n, T, R, C, A], one sweep of each label.
-    logits: float32 [G + n, K + n] of the base's G golden sweeps and these, for its K labels and
-    these.
+    base: sha256 of the bundle's manifest, hexadecimal.
+    labels: [n].
+    means: float32 [n, r], of each label's sweeps in the embedding.
+    sweeps: int64 [n], number of each label's sweeps.
+    spread: float32 [n], as in Classes.
+    golden: raw counts [n, T, R, C] or [n, T, R, C, A], one sweep of each label.
+    logits: float32 [G + n, K + n] of the bundle's G golden sweeps followed by `golden`, for the
+        bundle's K labels followed by `labels`.
     """
 
     base: str
@@ -83,12 +89,15 @@ class AddedLabels:
 class Bundle:
     """A bundle whose files agree with its manifest.
 
-    id: the first eight hexadecimal digits of `bundle.named_by`. model: the bytes of model.onnx.
-    golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K]. classes: the
-    class means, None if the manifest has no `known`. added: labels that a box has enrolled;
-    manifest, golden sweeps and classes have them, too. None where there are none. base: sha256 of
-    manifest.json as it is in the folder, "" where it was not read from one. memory: bytes that the
-    model needs at most, by the account of onnx_check.
+    id: see `bundle.identity`.
+    model: the bytes of model.onnx.
+    golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K].
+    classes: the class means, None if the manifest has no `known`.
+    added: labels that a box has enrolled, None if there are none. Manifest, golden sweeps and
+        classes include them.
+    base: sha256 of manifest.json in the bundle's folder, "" for a bundle that was not read from a
+        folder.
+    memory: upper bound of the bytes that the model needs, computed by onnx_check.
     """
 
     manifest: Manifest

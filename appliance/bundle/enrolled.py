@@ -1,10 +1,9 @@
-"""Labels that a box has enrolled into a bundle by itself. In: the bundle, the bytes of
-enrolment.npz. Out: the bundle with these labels, or a BundleError.
+"""Applies enrolment.npz, the labels that a box has enrolled into a bundle by itself.
 
-Nothing of the bundle is changed: its files stay as they are, and its own signature covers them. The
-file holds, of each label, the mean of its sweeps in the embedding, their number and spread, and a
-golden sweep; all that a class has besides (bias, shape, mean where the contact is displaced) is
-computed from these. So a label is all that an enrolment can add.
+The files of the bundle do not change, and its signature still covers them. For each label
+enrolment.npz holds the mean of its sweeps in the embedding, their number and spread, and a golden
+sweep. Bias, shape and the mean of displaced sweeps are computed from these. So an enrolment can add
+labels and nothing else.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from appliance.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"
 ARRAYS = ("base", "labels", "means", "sweeps", "spread", "changes", "logits")
-"""In the file; `changes` are those of the golden sweeps (arrays.changes)."""
+"""Arrays in the file; `changes` are the packed golden sweeps (arrays.changes)."""
 MOST_SWEEPS = 1_000_000
-"""Largest number of sweeps that a label may claim to come from."""
+"""Largest number of sweeps for a label that the file may give."""
 AGAIN = "enrol again (palpate enrol)"
 
 
 def file(added: AddedLabels) -> bytes:
-    """The bytes of enrolment.npz; the same for the same labels."""
+    """The bytes of enrolment.npz; equal content gives equal bytes."""
     return arrays.packed(
         base=np.array(added.base),
         labels=np.array(added.labels),
@@ -42,8 +41,8 @@ def file(added: AddedLabels) -> bytes:
 
 
 def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
-    """`bundle` with the labels of `data`, under this id. Raises BundleError where `data` is not the
-    enrolment of this bundle, or of another form."""
+    """`bundle` with the labels of `data`, under this id. Raises BundleError if `data` is malformed
+    or is the enrolment of another bundle."""
     added = _read(bundle, data)
     for k, label in enumerate(added.labels):
         bundle = with_label(
@@ -67,11 +66,10 @@ def with_label(
     spread: float,
     golden: NDArray[Any],
 ) -> Bundle:
-    """`bundle` with one more label, by the mean [r] of so many sweeps in the embedding, and one
-    golden sweep [T, R, C] or [T, R, C, A]; logits of golden sweeps and id are still those of
-    before.
+    """`bundle` with one more label, from the mean [r] of its sweeps in the embedding, and one
+    golden sweep [T, R, C] or [T, R, C, A]. The id and the logits of golden sweeps do not change.
 
-    The early heads do not know the label, and the figures of `bundle` no longer hold: both are
+    The early heads do not have the label, and the figures of `bundle` no longer hold, so both are
     removed. Raises BundleError for a label that is taken or cannot be sent.
     """
     assert bundle.classes
@@ -96,9 +94,9 @@ def with_label(
 def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -> Classes:
     """`classes` with one more label, whose `sweeps` have this mean [r] in the embedding.
 
-    Its bias is -|m|^2 / 2 + r / (2 n), since |m|^2 of a mean of n sweeps is on average larger than
-    that of the true mean, by r / n. Its shape is that of all materials together. A displacement is
-    assumed to change its mean as it changes those of the trained labels on average.
+    The bias is -|m|^2 / 2 + r / (2 n): on average |m|^2 of a mean of n sweeps exceeds |m|^2 of the
+    true mean by r / n. The shape is the identity, the scatter of all materials together. A
+    displacement is assumed to change the mean by its average change for trained labels.
     """
     row, displaced = mean.astype(np.float32).astype(np.float64), classes.displaced
     if displaced:
@@ -108,7 +106,7 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
         ].mean(axis=0)
         means = np.vstack([displaced.means, row @ displaced.turn + change]).astype(np.float32)
         displaced = DisplacedClasses(displaced.turn, means, _one_more(displaced.shapes))
-    with np.errstate(over="ignore"):  # what is not finite then is refused
+    with np.errstate(over="ignore"):  # values that are not finite are refused below
         bias = -(row @ row) / 2 + len(row) / (2 * sweeps)
         return Classes(
             np.vstack([classes.means, row]).astype(np.float32),
@@ -121,12 +119,12 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
 
 
 def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
-    """`shapes` [K, b, b] with that of all materials together as the last one [K + 1, b, b]."""
+    """`shapes` [K, b, b] followed by the shape of all materials together: [K + 1, b, b]."""
     return np.concatenate([shapes, np.eye(shapes.shape[1], dtype=np.float16)[None]])
 
 
 def _read(bundle: Bundle, data: bytes) -> AddedLabels:
-    """The content of `data`, checked by what `bundle` is. Raises BundleError."""
+    """The content of `data`, checked against `bundle`. Raises BundleError."""
     held = arrays.read(data, ENROLMENT, *ARRAYS)
     base, labels = held["base"], held["labels"]
     if (
@@ -139,11 +137,13 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
         raise BundleError(f"{ENROLMENT} names no bundle and its labels; {AGAIN}")
     if base.item() != bundle.base:
         raise BundleError(
-            f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files beside it are those of {bundle.id}; {AGAIN}"
+            f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files beside it are those "
+            f"of {bundle.id}; {AGAIN}"
         )
     if bundle.classes is None or not bundle.manifest.known:
         raise BundleError(
-            f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the file"
+            f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the "
+            "file"
         )
     _check(held, bundle, len(labels))
     golden = arrays.summed(held["changes"], bundle.format, ENROLMENT)
@@ -159,8 +159,8 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
 
 
 def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
-    """Raises BundleError where an array has another type, shape or range than `n` labels for
-    `bundle` have."""
+    """Raises BundleError if an array has a wrong type, shape or range for `n` labels of
+    `bundle`."""
     assert bundle.classes
     f, golden = bundle.format, len(bundle.golden) + n
     wanted = {
@@ -174,7 +174,8 @@ def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
         values = held[name]
         if values.dtype != kind or values.shape != shape:
             raise BundleError(
-                f"{ENROLMENT} holds {name} {values.dtype} {list(values.shape)}; {kind} {list(shape)} is wanted: {AGAIN}"
+                f"{ENROLMENT} holds {name} {values.dtype} {list(values.shape)}; {kind} "
+                f"{list(shape)} is wanted: {AGAIN}"
             )
         if not np.isfinite(values).all():
             raise BundleError(f"{ENROLMENT} holds {name} that are not finite; {AGAIN}")

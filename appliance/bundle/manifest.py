@@ -1,8 +1,4 @@
-"""The manifest of a bundle. In: the bytes of manifest.json. Out: a checked Manifest, and the bytes
-of one.
-
-The dataclasses are its schema. What was read can be computed with, printed and written again.
-"""
+"""Reads, checks and writes the manifest of a bundle. The dataclasses are its schema."""
 
 from __future__ import annotations
 
@@ -24,21 +20,21 @@ from appliance.signal.contact import ContactPositions
 from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
-"""Version that is written. Versions 1 (without `early`, `known`), 2 (without `runtime`, `counter`,
-`place`) and 3 (without `moved`) are read."""
+"""Schema version that is written. Also read are 1 (without `early`, `known`), 2 (without `runtime`,
+`counter`, `place`) and 3 (without `moved`)."""
 FILE_KEYS = {"displacement": "moved", "contact": "place"}
-"""Fields of Manifest whose keys in manifest.json have other names. Signed bundles hold these keys,
-so the file keeps them; messages name the keys, too."""
+"""Fields of Manifest whose keys in manifest.json have other names. Signed bundles have these keys,
+so the file keeps them. Messages use the keys, too."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
-"""Form of a label. It is sent in sentences, so it has no comma, star or dollar sign and at most 24
-characters."""
+"""Pattern of a label. Labels are sent in sentences, so they have at most 24 characters and no
+comma, star or dollar sign."""
 UNSURE = 0.5
-"""Least probability for status ok where a bundle names none."""
+"""Least probability for status ok if the bundle does not set it."""
 MOST_BYTES = 64 << 20
-"""Largest file. The largest of our models, the paper's network in int8, has 16 MB; what a model may
-need in memory is checked by onnx_check."""
+"""Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
+a model needs is checked by onnx_check."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
@@ -57,8 +53,8 @@ class Thresholds(WindowLimits):
 class Early:
     """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
 
-    least: [D], the probability that a label must reach at each step; above 1 a step never answers.
-    agree: number of steps in a row, including the newest, that must name the same label.
+    least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
+    number of steps in a row, including the newest, that must give the same label.
     """
 
     least: tuple[float, ...]
@@ -93,9 +89,9 @@ class DisplacementRule:
     """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
     number out of range.
 
-    limit: as that of Known, for distances between displaced sweeps. temperature: divisor of logits that
-    are calibrated for sweeps in place. unsure: least probability for status ok; above 1 no such
-    sweep is ok by itself.
+    limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
+    are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
+    a single displaced sweep is never ok.
     """
 
     limit: float
@@ -120,13 +116,18 @@ def _positive(value: object) -> bool:
 class Manifest:
     """The manifest of a bundle. Raises BundleError for values out of range.
 
-    input: "raw" or a feature set. files: name -> sha256 and size. figures: results by evaluation
-    protocol. made: commit, seed and machine of the export. early, known: rules for
-    early answers and unknown materials. contact: contact positions of training. displacement: rule
-    for contacts elsewhere. Each is None if the bundle does not support it. unloaded: raw counts of the skin without
-    contact, the values of a frame in their order; () where they are not known, which `json` omits.
-    runtime: least version of the box that can run it. counter: increases with each signed bundle,
-    so that an older one cannot be installed unnoticed; 0 was never signed.
+    input: "raw" or a feature set.
+    files: name -> sha256 and size.
+    figures: results by evaluation protocol.
+    made: commit, seed and machine of the export.
+    early, known: rules for early answers and unknown materials; None if not supported.
+    contact: contact positions in training; None if unknown.
+    displacement: rule for contacts elsewhere; None if not supported.
+    runtime: least version of the program that can run the bundle.
+    counter: increases with each signed bundle, so that an older bundle cannot be installed
+        unnoticed; 0 for a bundle that was never signed.
+    unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
+        unknown, then `json` omits it.
     """
 
     name: str
@@ -150,7 +151,8 @@ class Manifest:
     def __post_init__(self) -> None:
         if type(self.schema) is not int or not 1 <= self.schema <= SCHEMA:
             raise BundleError(
-                f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: update one of them"
+                f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: "
+                "update one of them"
             )
         if self.input not in INPUTS:
             raise BundleError(
@@ -172,16 +174,18 @@ class Manifest:
             )
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
-                f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have {self.format.channels}; "
-                "export the bundle again"
+                f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have "
+                f"{self.format.channels}; export the bundle again"
             )
         if self.early and self.input != "raw":
             raise BundleError(
-                f"manifest has `early`, but input {self.input!r} needs the whole window; export it without"
+                f"manifest has `early`, but input {self.input!r} needs the whole window; export it "
+                "without"
             )
         if type(self.counter) is not int or not 0 <= self.counter < 1 << 53:
             raise BundleError(
-                f"manifest counter {self.counter!r} must be a whole number from 0 on; sign the bundle again"
+                f"manifest counter {self.counter!r} must be a whole number from 0 on; sign the "
+                "bundle again"
             )
         version(self.runtime)
         _check_labels(self.labels)
@@ -196,14 +200,14 @@ class Manifest:
 
     @property
     def tare(self) -> NDArray[np.float64]:
-        """Raw counts of the unloaded skin, of the shape of a frame, from which the box starts; 0
-        where they are not known."""
+        """Raw counts of the unloaded skin in the shape of a frame, the first tare of the box; 0 if
+        unknown."""
         return np.array(self.unloaded or (0.0,) * self.format.channels).reshape(self.format.shape)
 
     @classmethod
     def parse(cls, text: bytes) -> Manifest:
-        """Read a manifest. Raises BundleError naming what is missing, unknown or of the wrong
-        type."""
+        """Read a manifest. Raises BundleError if a key is missing or unknown, or a value has the
+        wrong type."""
         try:
             made = typed(cls, _by_field(json.loads(text)))
             made.json()  # raises if it is nested too deeply to be written again after enrolment
@@ -224,8 +228,8 @@ def _by_field(raw: Any) -> Any:
 
 
 def version(text: object) -> tuple[int, ...]:
-    """A version as a tuple of numbers, for comparison. Raises BundleError if it is not of the form
-    1.2.3."""
+    """A version such as 1.2.3 as a tuple of numbers, for comparison. Raises BundleError for other
+    text."""
     if not isinstance(text, str) or not _VERSION.fullmatch(text):
         raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
     return tuple(map(int, text.split(".")))
@@ -239,14 +243,15 @@ def _check_age(m: Manifest) -> None:
         )
     if m.schema < 3 and (m.contact or m.counter or m.runtime != "0.0.0"):
         raise BundleError(
-            f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle again"
+            f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle "
+            "again"
         )
     if m.schema < 4 and m.displacement:
         raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
 
 
 def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises BundleError for a file that no bundle has, or an entry without sha256 and size."""
+    """Raises BundleError for an unknown file, or an entry without sha256 and size."""
     for name, entry in files.items():
         if name not in (MODEL, GOLDEN, MEANS):
             raise BundleError(
@@ -259,16 +264,19 @@ def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
             or not _SHA256.fullmatch(hashed)
         ):
             raise BundleError(
-                f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the bundle again"
+                f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the "
+                "bundle again"
             )
         if type(size) is not int or not 0 <= size <= MOST_BYTES:
             raise BundleError(
-                f"manifest gives {name} {size!r} bytes; 0 to {MOST_BYTES} are allowed: export a smaller model"
+                f"manifest gives {name} {size!r} bytes; 0 to {MOST_BYTES} are allowed: export a "
+                "smaller model"
             )
 
 
 def _check_labels(labels: tuple[str, ...]) -> None:
-    """Raises BundleError if labels are too few, equal, or cannot be sent."""
+    """Raises BundleError for fewer than two labels, equal labels, and labels that cannot be
+    sent."""
     if len(labels) < 2 or len(set(labels)) < len(labels):
         raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
     for label in labels:

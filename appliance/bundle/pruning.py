@@ -1,8 +1,7 @@
-"""What of a model some of its outputs need. In: the bytes of a model that onnx_check has accepted,
-names of outputs. Out: the bytes of a model with these outputs alone.
+"""Removes outputs from a model that onnx_check has accepted, with all nodes that only they need.
 
-onnxruntime computes every node of a graph, whichever outputs are requested. Fields are copied as
-they stand in the file or left out, so that nothing runs that was not checked.
+onnxruntime computes every node of a graph, whichever outputs are requested. Each field of the file
+is either copied unchanged or left out, so nothing runs that was not checked.
 """
 
 from __future__ import annotations
@@ -16,15 +15,14 @@ from appliance.core.errors import BundleError
 GRAPH = 7
 """Number of the field `graph` of a model; all others are copied."""
 HELD = {1: "node", 5: "initializer", 12: "output", 13: "value_info"}
-"""By number: the fields of a graph of which some are left out."""
+"""Fields of a graph that may be left out, by number."""
 
 
 def prune(model: bytes, outputs: Collection[str]) -> bytes:
-    """`model` without the outputs that are not in `outputs`, and without the nodes and constants
-    that only they need.
+    """`model` with the outputs `outputs` alone, and with the nodes and constants that they need.
 
-    It is returned as it is where it has no others. Raises BundleError where it does not give one of
-    them, or is no ONNX file.
+    A model without other outputs is returned unchanged. Raises BundleError if an output is missing
+    or `model` is not an ONNX file.
     """
     graph = reader.read(model).graph
     given = {output.name for output in graph.output} if graph else set()
@@ -54,8 +52,8 @@ def prune(model: bytes, outputs: Collection[str]) -> bytes:
 
 
 def _needed(nodes: Iterable[Message], outputs: Collection[str]) -> set[str]:
-    """Names of the values that `outputs` are computed from, and their own. Nodes stand in the order
-    of computing."""
+    """Names of `outputs` and of the values from which they are computed. nodes: in the order of
+    computing."""
     needed = set(outputs)
     for node in reversed(list(nodes)):
         if needed.intersection(node.output):
@@ -64,8 +62,8 @@ def _needed(nodes: Iterable[Message], outputs: Collection[str]) -> set[str]:
 
 
 def _without(graph: bytes, names: dict[str, list[list[str]]], needed: set[str]) -> bytes:
-    """`graph` without the fields of HELD that name nothing of `needed`. names: of each of them, in
-    the file's order."""
+    """`graph` without the fields of HELD that have no name in `needed`. names: the names of each
+    field, in the file's order."""
     left = {field: iter(of) for field, of in names.items()}
     kept = bytearray()
     for number, whole, _ in reader.fields(graph):

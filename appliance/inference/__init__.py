@@ -1,1 +1,1 @@
-"""From a sweep to a verdict: network, novelty detection, early exit; enrolment of new materials."""
+"""Classifies sweeps: network, novelty detection and early exit; enrols new materials."""

@@ -1,8 +1,8 @@
-"""Classifies sweeps. In: a Bundle and Sweeps. Out: Verdicts; the window is checked, classified, and
-fused with the other sweeps of its object.
+"""Classifies the sweeps of a bundle's format.
 
-The graph takes the raw counts; nothing is scaled here. A faulty window, or a material unlike all
-that were trained or enrolled, gets a status with the reason instead of a label.
+Each window is checked, classified, and fused with the other sweeps of its object. The graph takes
+the raw counts; nothing is scaled here. A faulty window or an unknown material gets a status with
+the reason instead of a label.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
     """Fuse the probabilities float64 [K] of several sweeps of one object into one array [K].
 
     fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper,
-    sec. V.D): the most frequent label wins, of equally frequent ones the first, so that with two
-    sweeps the first decides.
+    sec. V.D): the most frequent label wins. If two labels are equally frequent, the label
+    that occurred first wins, so with two sweeps the first decides.
     """
     if fusion == "product":
         return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
@@ -61,18 +61,19 @@ def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
 class Classifier:
     """Runs one bundle in one thread.
 
-    Sweeps with the same `object` number above 0 are fused; without NEW OBJECT each sweep is
-    answered by itself. A sweep whose contact is displaced is judged by the bundle's rule for it, where
-    there is one: its own distances, limit and temperature, and at least its probability. They are a
-    sequential test: `unsure` asks for one more sweep of the object, until the probability is at
-    least `min_probability` (ok) or `max_sweeps` were fused (undecided, the final answer). If the
-    robot continues all the same, the same rule applies to all sweeps of the object, since no
-    evidence is discarded. An unknown sweep is not fused: it has no probabilities, and one touch
-    beside the object must not invalidate what its other sweeps showed.
+    Sweeps with the same `object` number above 0 are fused. Without NEW OBJECT each sweep is
+    answered by itself. The sweeps of an object are a sequential test: `unsure` asks for one more
+    sweep, until the probability is at least `min_probability` (ok) or `max_sweeps` were fused
+    (undecided, the final answer). If the robot continues after the final answer, further sweeps are
+    fused by the same rule, because no evidence is discarded.
 
-    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 takes the bundle's
+    If the contact is displaced and the bundle has a rule for displacement, the rule's distances,
+    limit, temperature and least probability apply. An unknown sweep is not fused: it has no
+    probabilities, and one touch beside the object must not invalidate the other sweeps.
+
+    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 means the bundle's
     thresholds.unsure. max_sweeps: 0 means no limit. Raises BundleError if onnxruntime refuses the
-    model; its inputs and outputs were compared with the manifest by `bundle.load`.
+    model. `bundle.load` has compared its inputs and outputs with the manifest.
     """
 
     def __init__(
@@ -102,13 +103,13 @@ class Classifier:
         self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (
             self._means is not None
         )
-        # with logits always, which the self-test needs; early heads get a session of their own
+        # always with logits, which the self-test needs; early heads get a session of their own
         self._model = ModelRunner(bundle.model, *{"logits", *self._outputs})
 
     @property
     def rule(self) -> dict[str, Any]:
-        """The classifier's settings under their names in the site file. Sidecars hold them, and a
-        replay applies them again."""
+        """The classifier's settings under their names in the site file. They are written to
+        sidecars, and a replay applies them again."""
         return {
             "fuse": self._fusion,
             "min_probability": self.min_probability,
@@ -117,16 +118,14 @@ class Classifier:
 
     @property
     def format(self) -> SweepFormat:
-        """The format of the sweeps that it takes."""
         return self.bundle.format
 
     @property
     def model(self) -> str:
-        """The bundle's id."""
         return self.bundle.id
 
     def about(self) -> dict[str, Any]:
-        """For sidecars, so that a replay judges by the same rule. tare: [R, C] raw counts."""
+        """Entries for sidecars, so that a replay applies the same rule. tare: [R, C] raw counts."""
         return {"tare": self.tare.tolist(), "bundle": self.bundle.id, "rule": self.rule}
 
     def describe(self) -> list[object]:
@@ -139,7 +138,7 @@ class Classifier:
         ]
 
     def set_tare(self, taxels: NDArray[Any]) -> str:
-        """Take the mean of frames [n, R, C] as the unloaded skin, for the checks of contact."""
+        """Set the tare to the mean of frames [n, R, C], raw counts of the unloaded skin."""
         self.tare = taxels.mean(axis=0, dtype=np.float64)
         return f"largest {self.tare.max():.1f} raw counts"
 
@@ -151,7 +150,8 @@ class Classifier:
         """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C,
         A]; the model must have this output.
 
-        Frames that have not come yet may have any value: rows that depend on them are meaningless.
+        Frames that have not arrived yet may have any value; rows that depend on them are
+        meaningless.
         """
         return self._run(("early",), taxels)[0]
 
@@ -169,8 +169,10 @@ class Classifier:
         return f"{len(self.bundle.golden)} golden sweeps differ by {self.self_test():.2g}"
 
     def self_test(self) -> float:
-        """Run the golden sweeps; returns the largest difference of a probability. Raises
-        BundleError if a label differs or the difference is above GOLDEN_TOLERANCE."""
+        """Run the golden sweeps; returns the largest difference of a probability.
+
+        Raises BundleError if a label differs or the difference is above GOLDEN_TOLERANCE.
+        """
         computed = softmax(np.stack([self.logits(g) for g in self.bundle.golden]))
         expected = softmax(self.bundle.golden_logits)
         worst = float(np.abs(computed - expected).max())
@@ -185,8 +187,8 @@ class Classifier:
         return worst
 
     def _test_means(self, means: ClassDistances) -> None:
-        """Raises BundleError if the class means do not belong to the model: they give a golden
-        sweep another label than the model's own logits."""
+        """Raises BundleError if the class means and the model's own logits give a golden sweep
+        different labels: then they do not belong together."""
         for golden in self.bundle.golden:
             logits, z = self._run(("logits", "embedding"), golden)
             by_logits, by_means = (
@@ -196,12 +198,13 @@ class Classifier:
             if by_logits != by_means:
                 labels = self.bundle.manifest.labels
                 raise BundleError(
-                    f"{MEANS} and the model's own logits call a golden sweep {labels[by_means]!r} and "
-                    f"{labels[by_logits]!r}: they are not of one training; export the bundle again"
+                    f"{MEANS} and the model's own logits call a golden sweep {labels[by_means]!r} "
+                    f"and {labels[by_logits]!r}: they are not of one training; export the bundle "
+                    "again"
                 )
 
     def __call__(self, sweep: Sweep) -> Verdict:
-        """The verdict on one sweep. A sweep whose status is not ok keeps it and is not
+        """The verdict on one sweep. A sweep with another status than ok keeps it and is not
         classified."""
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
@@ -220,7 +223,10 @@ class Classifier:
         self, sweep: Sweep, scores: NDArray[np.float64], displaced: str | None = None
     ) -> Verdict:
         """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with the
-        other sweeps of the object. displaced: result of `_displacement`; None: it is computed here."""
+        other sweeps of the object.
+
+        displaced: result of `_displacement`; None: it is computed here.
+        """
         displaced = self._displacement(sweep) if displaced is None else displaced
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
             return self._verdict(
@@ -238,8 +244,8 @@ class Classifier:
         return self._verdict(sweep, Finding(status), scores, fused, own, displaced)
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
-        """As `conclude` if that gives ok; otherwise None, and the sweep, which is still going on,
-        is not counted."""
+        """The verdict of `conclude` on an unfinished sweep if its status is ok; otherwise None, and
+        the sweep is not counted."""
         before = self._object, self._scores
         verdict = self.conclude(sweep, scores)
         if verdict.status is Status.OK:
@@ -248,7 +254,7 @@ class Classifier:
         return None
 
     def _run(self, outputs: tuple[str, ...], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
-        """These outputs of the graph for one window, without the leading axis of length 1."""
+        """The named outputs of the graph for one window, without the leading axis of length 1."""
         graph_input = features.graph_input(
             self.bundle.manifest.input, taxels, self.bundle.format.rate_hz
         )
@@ -257,11 +263,11 @@ class Classifier:
     def _classify(
         self, taxels: NDArray[Any], displaced: bool = False
     ) -> tuple[NDArray[np.float32], str]:
-        """Logits [K] of one window, and its distance from known materials; "" if it is like one of
-        them.
+        """Logits [K] of one window, and a message with its distance from the known materials, ""
+        if the material is known.
 
-        displaced: whether the contact is displaced. The changes that a displacement causes then do
-        not make a material unknown.
+        displaced: whether the contact is displaced. Changes caused by a displacement then do not
+        make a material unknown.
         """
         values = self._run(self._outputs, taxels)
         means = self._displaced_means if displaced and self._displaced_means else self._means
@@ -271,7 +277,8 @@ class Classifier:
         return logits, means.novelty(values[-1])
 
     def _displacement(self, sweep: Sweep) -> str:
-        """Distance of the contact from its positions in training, "" if it is at one of them."""
+        """A message with the distance of the contact from its positions in training, "" if it is
+        at one of them."""
         m = self.bundle.manifest
         if m.contact is None or m.thresholds.contact is None:
             return ""
@@ -288,7 +295,7 @@ class Classifier:
     ) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
-            order = np.argsort(-scores, kind="stable")  # of equal ones the first, as argmax
+            order = np.argsort(-scores, kind="stable")  # the first of equal scores, as argmax does
             label, best, second = (
                 self.bundle.manifest.labels[order[0]],
                 scores[order[0]],

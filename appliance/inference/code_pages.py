@@ -1,9 +1,8 @@
-"""Gives back the memory of a library's code that only starting needed. In: the library's file. Out:
-how many bytes.
+"""Releases memory with library code that only the start of the program needed.
 
-Opening a model runs through most of onnxruntime's code once, to register its operators: 15 MiB that
-stay resident as long as memory is not short. The processor's next access to a page that is given
-back reads it again from the file.
+Opening a model runs through most of onnxruntime's code once, to register its operators. These
+15 MiB stay resident while memory is not short. A released page is read from the file again when
+the processor next needs it.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ import os
 from pathlib import Path
 
 MADV_DONTNEED = 4
-"""Of <sys/mman.h>: on all architectures the same."""
+"""From <sys/mman.h>; the same on all architectures."""
 MAPS = Path("/proc/self/maps")
 
 
 def give_back(library: str, maps: Path = MAPS) -> int:
-    """Unmap the pages of code of the file `library` until they are run again; 0 where it has none,
-    or Linux refuses.
+    """Release the code pages of the file `library` until they run again; returns the bytes, 0 if it
+    has none or Linux refuses.
 
-    Only what is executable and not writable: it is as it stands in the file, so nothing can be
+    Only executable pages that are not writable are released: they equal the file, so nothing can be
     lost.
     """
     madvise = ctypes.CDLL(None).madvise

@@ -1,8 +1,7 @@
-"""Early exit: an answer while the finger still slides. In: a sweep so far. Out: a Verdict of status
-ok, or None.
+"""Early exit: answers with status ok while the finger still slides.
 
-The bundle's graph has a head for each tenth of the window; the manifest holds the probability from
-which each may answer.
+The bundle's graph has a head for each step of the window. The manifest holds the least probability
+at which each head may answer.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ def decides(scores: NDArray[np.float64], rule: Early) -> bool:
     """Whether `scores` float64 [d + 1, K], the probabilities of steps 0 to d, allow an answer at
     step d.
 
-    They do if the last `rule.agree` steps name the same label, with at least the probability
+    This needs the same label at the last `rule.agree` steps, and a probability of at least
     `rule.least[d]` at step d.
     """
     labels = scores[-rule.agree :].argmax(axis=1)
@@ -34,8 +33,7 @@ def decides(scores: NDArray[np.float64], rule: Early) -> bool:
 
 
 class EarlyExit:
-    """Answers sweeps that are still going on. steps: number of times in a window at which it can
-    answer.
+    """Answers unfinished sweeps. steps: number of times in a window at which it can answer.
 
     Raises BundleError if the bundle has no early heads.
     """
@@ -44,20 +42,21 @@ class EarlyExit:
         manifest = classifier.bundle.manifest
         if manifest.early is None:
             raise BundleError(
-                f"bundle {manifest.name} {manifest.version} has no early heads, but classifier.early is true; "
-                "set classifier.early = false, or name a bundle that was exported with them"
+                f"bundle {manifest.name} {manifest.version} has no early heads, but "
+                "classifier.early is true; set classifier.early = false, or name a bundle that was "
+                "exported with them"
             )
         self._classifier, self._manifest, self._rule = classifier, manifest, manifest.early
         self.steps = len(self._rule.least)
         classifier.prepare_early()
 
     def __call__(self, sweep: Sweep) -> Verdict | None:
-        """The verdict on a sweep with share < 1, or None if the rest of it is needed; then nothing
-        was counted.
+        """The verdict on a sweep with share < 1, or None if the rest of the sweep is needed; then
+        the sweep is not counted.
 
-        The frames are checked like a whole window, and no answer is given to what would be refused.
-        For the graph the window is completed by repeating the last frame; the heads up to this step
-        do not depend on these frames.
+        The frames are checked like a whole window, and a faulty sweep is not answered early. For
+        the graph the window is completed by repeating the last frame; the heads up to this step do
+        not depend on the repeated frames.
         """
         taxels = sweep.frames.taxels
         if (
@@ -73,7 +72,7 @@ class EarlyExit:
         )
 
     def scores(self, sweep: Sweep) -> NDArray[np.float64]:
-        """Probabilities float64 [d, K] at the steps up to that of a sweep with share < 1."""
+        """Probabilities float64 [d, K] at the steps that a sweep with share < 1 has reached."""
         taxels = sweep.frames.taxels
         rest = self._manifest.format.window - len(taxels)
         step = round(sweep.share * (self.steps + 1))  # counted from 1

@@ -1,9 +1,8 @@
-"""Enrolment: the box learns a material without training. In: a bundle, a label, one to ten sweeps.
-Out: enrolment.npz.
+"""Enrolment: the box learns a material from one to ten sweeps, without training.
 
 In the embedding the sweeps of every material have covariance 1 around their mean. A new material
-therefore needs only a mean, that of its sweeps; everything that was trained stays as it is, and so
-do the files of the bundle (bundle/enrolled.py).
+therefore needs only the mean of its sweeps. The trained model and the files of the bundle do not
+change; the new mean is stored in enrolment.npz (bundle/enrolled.py).
 """
 
 from __future__ import annotations
@@ -31,8 +30,11 @@ from appliance.inference.novelty import ClassDistances
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """A bundle with one more label, and its enrolment.npz. warnings: for the person who enrols.
-    disagreement: why the sweeps may not be of one material, "" if they agree."""
+    """A bundle with one more label, and its enrolment.npz.
+
+    warnings: for the person who enrols. disagreement: why the sweeps may not be of one material, ""
+    if they agree.
+    """
 
     bundle: Bundle
     file: bytes
@@ -53,8 +55,9 @@ def admit(old: Bundle, label: str) -> None:
         )
     if old.classes is None:
         raise BundleError(
-            f"bundle {old.manifest.name} {old.manifest.version} has no embedding and no class means, so nothing can be "
-            "enrolled; pack it again with a method that gives them (palpate-train)"
+            f"bundle {old.manifest.name} {old.manifest.version} has no embedding and no class "
+            "means, so nothing can be enrolled; pack it again with a method that gives them "
+            "(palpate-train)"
         )
 
 
@@ -62,10 +65,10 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n,
     T, R, C, A]. Deterministic.
 
-    The early heads do not know the label, so that the new bundle gives no early answers; the
-    figures of `old` no longer hold and are removed. Other problems are told in what is returned and
-    do not prevent the enrolment. Raises BundleError as `admit`, FormatError if `sweeps` do not have
-    the bundle's format or give no embedding.
+    The early heads do not have the label, so the new bundle gives no early answers. The figures of
+    `old` no longer hold and are removed. Further problems do not prevent the enrolment; they are
+    listed in the result. Raises BundleError as `admit`, FormatError if `sweeps` do not have the
+    bundle's format or give no embedding.
     """
     admit(old, label)
     m, f = old.manifest, old.format
@@ -93,7 +96,8 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
         warnings.append(close)
     if m.early:
         warnings.append(
-            f"early answers end with this bundle: their heads do not know {label!r}; set classifier.early = false"
+            f"early answers end with this bundle: their heads do not know {label!r}; set "
+            "classifier.early = false"
         )
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
 
@@ -101,10 +105,10 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
 def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
     """`classes` with one more label, from the embeddings `z` float64 [n, r] of its sweeps.
 
-    Its mean is that of the sweeps. Its spread is computed from the sweeps and one assumed sweep at
-    squared distance r, the average of trained labels, and is at least 1, that of trained labels:
-    the embedding of materials that were not in training scatters more. For the rest see
-    `enrolled.extended`.
+    The new mean is the mean of the sweeps. The spread is computed from the sweeps and one assumed
+    sweep at squared distance r, the average for trained labels. It is at least 1, the spread of
+    trained labels, because materials that were not in training scatter more in the embedding. For
+    the other values see `enrolled.extended`.
     """
     n, r = z.shape
     mean = z.mean(axis=0)
@@ -115,8 +119,8 @@ def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
 def _added(
     old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
 ) -> tuple[Bundle, bytes]:
-    """`old` with the last label of `classes`, and the enrolment.npz that makes it of the bundle
-    that was signed."""
+    """`old` with the last label of `classes`, and the enrolment.npz that adds all enrolled labels
+    to the signed bundle."""
     before, mean, sweeps, spread = (
         old.added,
         classes.means[-1:],
@@ -140,9 +144,11 @@ def _added(
 
 
 def _median(scores: NDArray[np.float64]) -> int:
-    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K]: the one
-    with the median probability of the last label among those that get it, or among all. As at
-    export: a fault changes its label, a rounding error does not.
+    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K].
+
+    It has the median probability of the last label among the sweeps that get this label, or among
+    all sweeps if none gets it. As at export, a fault changes the label of such a sweep and a
+    rounding error does not.
     """
     correct = np.flatnonzero(scores.argmax(axis=1) == scores.shape[1] - 1)
     pick = correct if len(correct) else np.arange(len(scores))
@@ -150,8 +156,8 @@ def _median(scores: NDArray[np.float64]) -> int:
 
 
 def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
-    """The files of the enrolled bundle: those of the one that it was made from as they are, and its
-    enrolment, with its signature where it has one."""
+    """The files of the enrolled bundle: the unchanged files of the original bundle, the enrolment,
+    and the enrolment's signature if there is one."""
     kept = {
         name: data
         for name, data in old.items()
@@ -168,9 +174,9 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
     """Why the sweeps with the embeddings `z` [n, r] may not be of one material, "" where they
     agree.
 
-    The threshold is the limit beyond which a sweep is of an unknown material. Measured with five
-    sweeps each of simulated materials that were left out of training: one set in eleven disagrees,
-    and four in five of the sets that contain a sweep of another material.
+    The threshold is the limit beyond which a sweep is of an unknown material. It was tested on sets
+    of five sweeps of simulated materials that were left out of training: of sets of one material
+    one in eleven disagrees, of sets with a sweep of another material four in five.
     """
     n, r = z.shape
     away = ((z - z.mean(axis=0)) ** 2).sum(axis=1)
@@ -178,14 +184,15 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
     if spread <= means.limit:
         return ""
     return (
-        f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; those of a trained "
-        f"material {r}, limit {means.limit:.1f}), number {away.argmax() + 1} most of all; take others"
+        f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; those "
+        f"of a trained material {r}, limit {means.limit:.1f}), number {away.argmax() + 1} most of "
+        "all; take others"
     )
 
 
 def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
-    """Which label of `means` the sweeps with the embeddings `z` [n, r] will be taken for, "" for
-    none."""
+    """A warning if the sweeps with the embeddings `z` [n, r] will be confused with a label of
+    `means`, "" if not."""
     n, r = z.shape
     to_old = (
         means.distances(z.mean(axis=0)) - r / n
@@ -208,7 +215,6 @@ class SweepCollector(Observer):
 
     @property
     def enough(self) -> bool:
-        """True once the wanted number of sweeps was collected."""
         return len(self._windows) >= self._wanted
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
@@ -225,15 +231,15 @@ class SweepCollector(Observer):
         """The raw counts [n, T, R, C]. Raises ApplianceError if there are too few."""
         if not self.enough:
             raise ApplianceError(
-                f"{len(self._windows)} of {self._wanted} good sweeps had come when it ended; nothing was written: "
-                "enrol again"
+                f"{len(self._windows)} of {self._wanted} good sweeps had come when it ended; "
+                "nothing was written: enrol again"
             )
         return np.stack(self._windows)
 
 
 def check_target(target: Path, swap: bool) -> None:
-    """Raises BundleError if no bundle may be written to `target`; called before the robot sweeps,
-    too.
+    """Raises BundleError if no bundle may be written to `target`. It is also called before the
+    robot sweeps.
 
     swap: a bundle that exists there may be replaced.
     """
@@ -243,19 +249,20 @@ def check_target(target: Path, swap: bool) -> None:
         )
     if target.exists() and not (target / bundle.MANIFEST).is_file():
         raise BundleError(
-            f"{target} is no bundle and will not be replaced; name another folder with --out"
+            f"{target} is not a bundle and will not be replaced; name another folder with --out"
         )
     if not os.access(target.resolve().parent, os.W_OK):
         raise BundleError(
-            f"{target.resolve().parent} is no folder that you may write to; name another with --out"
+            f"{target.resolve().parent} is not a folder that you may write to; name another with "
+            "--out"
         )
 
 
 def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
     """Write the bundle of `files` to the folder `target`, after its self-test has passed.
 
-    At every moment, also after a loss of power, `target` is the old or the complete new bundle
-    (`storage.folder`). Raises BundleError.
+    At every moment, and after a power failure, `target` is either the old or the complete new
+    bundle (`storage.folder`). Raises BundleError.
     """
     check_target(target, swap)
     target = target.resolve()

@@ -1,9 +1,8 @@
-"""Distances of a sweep to the known materials. In: a bundle's class means, an embedding. Out:
-distances, logits, and whether the material is unknown.
+"""Distances of a sweep from the known materials, and whether its material is unknown.
 
 The embedding is scaled so that the sweeps of all materials together have covariance 1 around their
 means. A squared distance in it is therefore a squared Mahalanobis distance, and the nearest mean
-names the material. An enrolled material is one more mean; nothing is trained for it.
+gives the label. An enrolled material is one more mean; nothing is trained for it.
 """
 
 from __future__ import annotations
@@ -23,8 +22,9 @@ Array = NDArray[np.float64]
 def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     """Squared distances [..., K] of differences `away` [..., K, r] from the class means.
 
-    In the last b directions each material scatters in its own way, and its difference is multiplied
-    by its matrix of `shapes` [K, b, b] first; in the others all have variance 1.
+    In the last b directions each material has its own scatter, so the difference is first
+    multiplied by the material's matrix of `shapes` [K, b, b]. In the other directions all materials
+    have variance 1.
     """
     common = away.shape[-1] - shapes.shape[-1]
     own = np.einsum("...kb,kbc->...kc", away[..., common:], shapes)
@@ -33,10 +33,10 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
 
 
 class ClassDistances:
-    """Computes distances and logits from a bundle's class means. labels: those of the means, [K].
+    """Computes distances and logits from a bundle's class means. labels: of the means, [K].
 
-    displacement: the rule for sweeps whose contact is displaced. The distances are then computed in
-    `classes.displaced`, where directions that a displacement changes count for little.
+    displacement: rule for sweeps whose contact is displaced. The distances are then computed in
+    `classes.displaced`, where directions that a displacement changes have little weight.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class ClassDistances:
     ) -> None:
         self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
         self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
-        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; computed
-        # from distances, logits do not suffer the cancellation of large products
+        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
+        # are computed from distances do not suffer from the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
         shapes = classes.shapes
         if displacement and classes.displaced:
@@ -72,8 +72,7 @@ class ClassDistances:
     def distances(self, embedding: NDArray[Any]) -> Array:
         """Squared distances float64 [..., K] from embeddings [..., r] to the class means; no unit.
 
-        The scatter is that of all materials together, so that the nearest mean is the one that LDA
-        names.
+        The scatter is that of all materials together, so the nearest mean is the result of LDA.
         """
         result: Array = (self._away(embedding) ** 2).sum(axis=-1)
         return result
@@ -87,12 +86,12 @@ class ClassDistances:
         return result
 
     def novelty(self, embedding: NDArray[Any]) -> str:
-        """The distance to the nearest material if it is beyond the limit, as text; "" for a known
-        material.
+        """A message with the distance to the nearest material if it is beyond the limit; "" for a
+        known material.
 
-        embedding: [r]. The scatter is each material's own. The distance to an enrolled label is
-        multiplied by n / (n + 1) / spread, so that about as many of its sweeps are accepted as of a
-        trained label, for which the embedding was optimised.
+        embedding: [r]. Each material has its own scatter. The embedding was optimised for trained
+        labels, so the distance to an enrolled label is multiplied by n / (n + 1) / spread. About
+        the same share of sweeps is then accepted for both.
         """
         scaled = shaped_distances(self._away(embedding), self._shapes) * self._share
         k = int(scaled.argmin())

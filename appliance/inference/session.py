@@ -1,6 +1,6 @@
-"""Runs onnxruntime as the box does. In: the bytes of a model that onnx_check has accepted, and
-input arrays. Out: a session and its outputs. Errors of onnxruntime become BundleErrors. What is not
-requested is not computed.
+"""Runs onnxruntime as the box does, on a model that onnx_check has accepted.
+
+Errors of onnxruntime become BundleErrors. Only the outputs that are requested are computed.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from appliance.inference.code_pages import give_back
 
 
 def session(model: bytes) -> ort.InferenceSession:
-    """A session with one thread, no spinning, logging of errors only and no telemetry, since the
-    sensor shares its core.
+    """A session with one thread and without spinning, since the sensor shares its core. It logs
+    errors only and sends no telemetry.
 
     Raises BundleError if onnxruntime refuses the model.
     """
@@ -31,17 +31,17 @@ def session(model: bytes) -> ort.InferenceSession:
     options.enable_cpu_mem_arena = False
     try:
         return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as e:  # onnxruntime raises its own classes, which share no base but Exception
+    except Exception as e:  # the classes of onnxruntime have no other base in common
         raise BundleError(
             f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}"
         ) from e
 
 
 class ModelRunner:
-    """Runs one model, with a session for each group of outputs that are requested together; it has
-    only the nodes that these outputs need.
+    """Runs one model, with a session for each group of outputs that are requested together. A
+    session has only the nodes that its outputs need.
 
-    outputs: the group to begin with. Raises BundleError if onnxruntime refuses the model.
+    outputs: the first group. Raises BundleError if onnxruntime refuses the model.
     """
 
     def __init__(self, model: bytes, *outputs: str) -> None:
@@ -50,8 +50,8 @@ class ModelRunner:
         self._input: str = self.prepare(*outputs).get_inputs()[0].name
 
     def prepare(self, *outputs: str) -> ort.InferenceSession:
-        """The session for `outputs`: one that gives them already, or a new one. Raises BundleError
-        as the class."""
+        """The session for `outputs`: an open session that has them, or a new session. Raises
+        BundleError as the class."""
         able = (opened for group, opened in self._sessions.items() if set(group) >= set(outputs))
         opened = next(able, None)
         if opened is None:
@@ -61,7 +61,7 @@ class ModelRunner:
         return opened
 
     def __call__(self, outputs: tuple[str, ...], given: NDArray[Any]) -> list[NDArray[Any]]:
-        """These outputs for one input `given`, without the leading axis of length 1. Raises
+        """The named outputs for one input `given`, without the leading axis of length 1. Raises
         BundleError as `run`."""
         opened = self._sessions.get(outputs) or self.prepare(*outputs)
         return [out[0] for out in run(opened, outputs, {self._input: given[None]})]

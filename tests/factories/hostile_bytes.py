@@ -111,7 +111,7 @@ def misfits() -> Models:
     yield (
         "a number that does not fit",
         model([node("Add", ["x", "w"], ["y"])], {"w": off}),
-        "no int8",
+        "not int8",
     )
     off = TensorProto(name="w", data_type=1, dims=[4], float_data=[1.0, 2.0])
     yield "too few floats", model([node("Add", ["x", "w"], ["y"])], {"w": off}), "2 numbers, not 4"
@@ -179,7 +179,7 @@ def broken() -> Models:
         "a number is cut off",
     )
     yield "floats that are none", part(7, part(5, part(4, b"\0" * 5))), "5 bytes are no floats"
-    yield "a version of 64 bits", part(1, 8 + 2**32) + good[2:], "no code or version"
+    yield "a version of 64 bits", part(1, 8 + 2**32) + good[2:], "not a code or version"
     deep = b""
     for _ in range(1000):  # a graph in a setting of a node of a graph ...
         deep = part(1, part(5, part(6, deep)))

@@ -335,7 +335,7 @@ def dangerous() -> Models:
             model([*ints, node("Mod", ["i", "d"], ["j"]), back], {"d": by}),
             "divisors",
         )
-    yield "rest of a sweep", model([*ints, node("Mod", ["i", "i"], ["j"]), back]), "no constant"
+    yield "rest of a sweep", model([*ints, node("Mod", ["i", "i"], ["j"]), back]), "not a constant"
     yield (
         "quotient of integers",
         model([*ints, node("Div", ["i", "d"], ["j"]), back], {"d": [0]}),
@@ -357,8 +357,8 @@ def dangerous() -> Models:
         )
     yield "no kernel", model([node("MaxPool", ["x"], ["y"], kernel_shape=[0, 0])]), "kernel_shape"
     yield "k of all", model([node("TopK", ["x", "k"], ["y", "at"])], {"k": [3]}), "cannot be chosen"
-    yield "k of a sweep", model([*ints, node("TopK", ["x", "i"], ["y", "at"])]), "no constant"
-    yield "shape of a sweep", model([*ints, node("Reshape", ["x", "i"], ["y"])]), "no constant"
+    yield "k of a sweep", model([*ints, node("TopK", ["x", "i"], ["y", "at"])]), "not a constant"
+    yield "shape of a sweep", model([*ints, node("Reshape", ["x", "i"], ["y"])]), "not a constant"
     yield "place beyond", model([node("Gather", ["x", "n"], ["y"])], {"n": [1]}), "out of 1"
     pick = node("ArrayFeatureExtractor", ["t", "i"], ["j"], domain="ai.onnx.ml")
     yield "places of a sweep", model([*ints, pick, back], {"t": [1, 2]}), "TopK or ArgMax"

@@ -1,1 +1,1 @@
-"""What the box demands of a model file before onnxruntime may open it."""
+"""Checks a model file before onnxruntime may open it."""

@@ -1,7 +1,7 @@
-"""Decides whether onnxruntime may open a model. In: the bytes of an ONNX file, and what its bundle
-has beside it. Out: nothing, or a BundleError that names node, tensor and value. What passes can
-neither read beside its arrays nor take more memory or time than the caps below: each node is
-followed by its shapes, and every size is a constant of the file.
+"""Decides whether onnxruntime may open a model; a BundleError gives the node, tensor and value.
+
+A model that passes can neither read beside its arrays nor take more memory or time than the caps
+below. The shape of every value is computed node by node, and every size is a constant of the file.
 """
 
 from __future__ import annotations
@@ -32,49 +32,54 @@ if TYPE_CHECKING:
     from appliance.bundle.manifest import Manifest
 
 VERSIONS = {"": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
-"""Of the operators of each domain: what train/ writes, and the next, in which the operators here
-hardly differ."""
+"""Versions of the operators of each domain: the version that train/ writes, and the next, whose
+operators hardly differ."""
 FORMATS = range(8, 10)
-"""Of the file (IR version), likewise."""
+"""Versions of the file (IR version), likewise."""
 NOTES = ("onnx.infer", "onnx.quant.pre_process")
 """Metadata that onnxruntime's quantization writes into a model."""
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
-"""Three times MiniRocket's, the longest of our own; onnxruntime takes a kilobyte or two for
-each."""
+"""Largest numbers of nodes and constants: three times those of MiniRocket, our largest graph.
+onnxruntime takes a kilobyte or two for each."""
 MOST_TENSOR = 64 << 20
-"""Bytes of one tensor. The largest of our own are the weights of the paper's CNN in int8, 63 MB
-once they are floats."""
+"""Bytes of one tensor. Our largest are the weights of the paper's CNN in int8, 63 MB after
+conversion to floats."""
 MOST_MEMORY = 160 << 20
-"""Bytes of all of a model by the account of `_Cost`. Our own largest: the paper's CNN in int8 151
-MB, MiniRocket 93 MB. onnxruntime never took more than this account, and 9 MB for itself; so the
-service stays below its MemoryMax of 256 MB."""
+"""Bytes of a whole model as `_Cost` counts them. Our largest: the paper's CNN in int8 151 MB,
+MiniRocket 93 MB. onnxruntime never took more than this count and 9 MB for itself, so the service
+stays below its MemoryMax of 256 MB."""
 COPIES = 3
-"""Of a constant in memory: in the parsed file, as a tensor, and laid out for the processor."""
+"""Copies of a constant in memory: in the parsed file, as a tensor, and laid out for the
+processor."""
 MOST_WORK = 2_000_000_000
-"""Products, and TOUCH for every number read or written: seconds on a small board. At 1500 frames of
-16 taxels MiniRocket needs 0.96e9, the paper's CNN in int8 0.88e9."""
+"""Largest number of products, plus TOUCH for every number read or written: seconds on a small
+board. At 1500 frames of 16 taxels MiniRocket needs 0.96e9, the paper's CNN in int8 0.88e9."""
 TOUCH = 8
-"""Products that take as long as reading or writing a number, in the slowest operators."""
+"""Number of products that take as long as reading or writing one number in the slowest
+operators."""
 MOST_LETTERS = 400
-"""Of what is wrong: names and lists come from the file."""
+"""Longest error text in a message; its names and lists come from the file."""
 Form = Sequence[int | None]
-"""A shape, None standing for any number."""
+"""A shape; None means any number."""
 CONSTANTS = ("float32", "uint8", "int8", "int16", "int32", "int64")
-"""Types of constants; the others only come in by the sweep, or out of a comparison."""
+"""Types of constants. Values of other types only come from the sweep or from a comparison."""
 
 
 @dataclass(slots=True)
 class _Cost:
-    """What a model costs. bytes: of the file, COPIES of each constant and of what comes of
-    constants alone, all that a sweep moves, as if nothing were ever given back, and the largest
-    workspace of a node. work: see MOST_WORK."""
+    """Memory and work of a model.
+
+    bytes: the file, COPIES of each constant and of each value computed from constants alone, and
+    all values computed from the sweep, as if no memory were reused. workspace: the largest
+    workspace of a node, in bytes. work: see MOST_WORK.
+    """
 
     bytes: int
     work: int = 0
     workspace: int = 0
 
     def add(self, name: str, call: Call, made: list[Value]) -> None:
-        """One node more. Raises BundleError beyond a cap."""
+        """Add one node. Raises BundleError beyond a cap."""
         products, workspace = operators.work(name, call, made[0].shape)
         self.work += products + TOUCH * sum(prod(v.shape) for v in (*call.inputs, *made))
         self.workspace = max(self.workspace, workspace)
@@ -99,12 +104,13 @@ def check(
     enrolled: int = 0,
     rank: int | None = None,
 ) -> int:
-    """Bytes of memory that `model` needs at most, by the account of MOST_MEMORY. Raises BundleError
-    where it is not an ONNX file that the box may run as the model of a bundle like this. No other
-    place looks at inputs and outputs.
+    """Upper bound of the bytes of memory that `model` needs, counted as for MOST_MEMORY.
 
-    features: numbers of the input, where it is not raw counts. enrolled: how many of the labels the
-    model does not know. rank: numbers of the embedding. None stands for any number above 0.
+    Raises BundleError if the box must not run `model` in a bundle with this manifest. Inputs and
+    outputs are checked here alone.
+
+    features: number of features of the input if it is not raw counts. enrolled: number of labels
+    that the model does not have. rank: length of the embedding. None means any number above 0.
     """
     try:
         need(len(model) <= MOST_MEMORY, f"it has {len(model)} bytes (limit {MOST_MEMORY})")
@@ -128,7 +134,7 @@ def _bytes(value: Value) -> int:
 
 
 def _versions(read: Message) -> None:
-    """The versions of file and operators, and nothing of another domain."""
+    """Raises BundleError for other versions of the file or its operators, and for other domains."""
     need(read.ir_version in FORMATS, f"IR version {read.ir_version} is none of {list(FORMATS)}")
     domains = [opset.domain for opset in read.opset_import]
     need(
@@ -146,7 +152,7 @@ def _versions(read: Message) -> None:
 
 
 def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
-    """The one input is what the manifest has."""
+    """Raises BundleError unless the only input is the input of the manifest."""
     need(len(graph.input) == 1, f"it has {len(graph.input)} inputs instead of one")
     kind, shape = _declared(graph.input[0])
     f = manifest.format
@@ -160,8 +166,8 @@ def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
 
 
 def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
-    """All values of the graph by name: the input, the constants, what each node gives; and its
-    cost. size: bytes of the file."""
+    """All values of the graph by name (input, constants, outputs of nodes), and its cost. size:
+    bytes of the file."""
     for what, have, most in (
         ("nodes", graph.node, MOST_NODES),
         ("constants", graph.initializer, MOST_CONSTANTS),
@@ -192,7 +198,7 @@ def _fits(shape: Shape, form: Form) -> bool:
 
 
 def _constant(tensor: Message, name: str) -> Value:
-    """A constant, whose numbers stay in the file."""
+    """The Value of a constant; its numbers are not copied from the file where that is possible."""
     kind = KINDS.get(tensor.data_type, "")
     need(
         kind in CONSTANTS,
@@ -225,12 +231,12 @@ def _constant(tensor: Message, name: str) -> Value:
     if kind != "float32":
         limits = np.iinfo(kind)
         fits = limits.min <= min(typed) and max(typed) <= limits.max
-        need(fits, f"constant {name!r} has a number that is no {kind}")
+        need(fits, f"constant {name!r} has a number that is not {kind}")
     return replace(value, numbers=np.asarray(typed, kind).reshape(value.shape))
 
 
 def _bounded(name: str, value: Value) -> Value:
-    """A tensor with a name, and of a size that may be."""
+    """`value`. Raises BundleError if it has no name or a size that is not allowed."""
     need(
         name != "" and len(value.shape) <= MOST_RANK,
         f"{name[:80]!r} has {len(value.shape)} dimensions or no name",
@@ -248,7 +254,7 @@ def _bounded(name: str, value: Value) -> Value:
 
 
 def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
-    """Adds what a node gives to `known`, and what it takes to `cost`."""
+    """Adds the outputs of a node to `known`, and its memory and work to `cost`."""
     operator = OPERATORS.get((node.domain, node.op_type))
     if operator is None:
         raise BundleError(f"there is no such operator of domain {node.domain[:80]!r} for a bundle")
@@ -275,7 +281,8 @@ def _follow(node: Message, known: dict[str, Value], cost: _Cost) -> None:
 
 
 def _settings(node: Message, allowed: Mapping[str, int]) -> dict[str, Any]:
-    """A node's settings by name, each of the type that it must have."""
+    """A node's settings by name. Raises BundleError for a setting or a type that is not in
+    `allowed`."""
     found: dict[str, Any] = {}
     for a in node.attribute:
         name, code = a.name[:80], a.type
@@ -305,7 +312,7 @@ def _settings(node: Message, allowed: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _declared(declared: Message) -> tuple[str, Shape]:
-    """Type and shape of a value as the file names them."""
+    """Type and shape of a value as the file declares them."""
     held = declared.type.tensor_type if declared.type else None
     if held is None or held.shape is None or held.elem_type not in KINDS:
         raise BundleError(f"{declared.name[:80]!r} has no type and shape of a tensor")
@@ -318,18 +325,22 @@ def _declared(declared: Message) -> tuple[str, Shape]:
 
 
 def _agree(declared: Message, known: dict[str, Value]) -> None:
-    """What the file says of a value is what comes of its nodes; quantization leaves notes on values
-    that are gone."""
+    """Raises BundleError if the declared type or shape of a value differs from the computed one.
+    Quantization leaves declarations of values that no longer exist."""
     if declared.name in known:
         (kind, shape), have = _declared(declared), known[declared.name]
-        what = f"{declared.name[:80]!r} is declared as {kind} {list(shape)} and is {have.kind} {list(have.shape)}"
-        need((kind, shape) == (have.kind, have.shape), what)
+        need(
+            (kind, shape) == (have.kind, have.shape),
+            f"{declared.name[:80]!r} is declared as {kind} {list(shape)} and is {have.kind} "
+            f"{list(have.shape)}",
+        )
 
 
 def _gives(
     names: list[str], known: dict[str, Value], manifest: Manifest, enrolled: int, rank: int | None
 ) -> None:
-    """The outputs are those that the manifest needs, and no other than may be, each of its form."""
+    """Raises BundleError unless the outputs are all that the manifest needs, and every output is
+    allowed and has the right shape."""
     early, labels = manifest.early, len(manifest.labels)
     trained = labels - enrolled
     forms: dict[str, Form] = {
@@ -353,7 +364,8 @@ def _gives(
             and have.depends_on_sweep
             and have.shape[:1] == (1,)
             and len(have.shape) == axes,
-            f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the first 1",
+            f"{name} is {have.kind} {list(have.shape)}, not float32 with {axes} dimensions, the "
+            "first 1",
         )
     classes = known["logits"].shape[1]
     new = f", {enrolled} of them enrolled" if enrolled else ""

@@ -1,6 +1,7 @@
-"""The operators that a bundle's model may use: those that the exporters of train/ write, with the
-settings and types that they write. In: domain and name. Out: the operator's rule (shapes.py) and
-what it takes; for a node its work and workspace.
+"""The operators that a bundle's model may use, with the settings and types that are allowed.
+
+They are the operators that the exporters of train/ write. shapes.py has the rules for their
+outputs.
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ ANY, F, L, B, U8 = tuple(KINDS.values()), ("float32",), ("int64",), ("bool",), (
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """What a bundle's model may do with one operator. rule: what it gives. kinds: types of its
-    inputs in their order, the last of them for all that follow. least, most: how many inputs.
-    settings: code of the type of each."""
+    """Allowed use of one operator.
+
+    rule: computes the type and shape of its outputs. kinds: allowed types of its inputs in order;
+    the last entry applies to all further inputs. least, most: number of inputs. settings: code of
+    the type of each setting.
+    """
 
     rule: Rule
     kinds: tuple[tuple[str, ...], ...]
@@ -38,9 +42,9 @@ def _op(
 
 
 def work(name: str, call: Call, out: Shape) -> tuple[int, int]:
-    """What a node takes that gives `out`: products (a number), workspace (bytes)."""
+    """Number of products and bytes of workspace of a node with the output `out`."""
     first, given = call.inputs[0].shape, call.given
-    if name == "Conv":  # a window is laid out for each place before it is multiplied
+    if name == "Conv":  # onnxruntime copies each window before it multiplies
         taps = prod(call.inputs[1].shape[1:])
         return prod(out) * taps, 4 * taps * prod(out[2:])
     if name == "GRU":
@@ -51,9 +55,9 @@ def work(name: str, call: Call, out: Shape) -> tuple[int, int]:
         return prod(out) * first[0 if given.get("transA") else 1], 0
     if name in ("MatMul", "MatMulInteger", "CDist"):
         return prod(out) * first[-1], 0
-    if name in ("TopK", "ScatterElements"):  # a place of eight bytes for each number
+    if name in ("TopK", "ScatterElements"):  # an index of eight bytes for each number
         return 0, 8 * prod(call.inputs[0].shape)
-    if name == "SVMClassifier":  # its tables are copied, unlike constants, from settings
+    if name == "SVMClassifier":  # its tables are settings and are copied
         numbers = len(given["support_vectors"]) + len(given["coefficients"])
         return numbers, 16 * numbers
     return 0, 0
@@ -123,5 +127,4 @@ OPERATORS: dict[tuple[str, str], Operator] = {
     ("ai.onnx.ml", "Scaler"): _op(shapes.scale, F, offset=FLOATS, scale=FLOATS),
     ("com.microsoft", "CDist"): _op(shapes.distances, F, F, metric=TEXT),
 }
-"""By domain and name. Constants that only decide shapes and places are int64, and so are those
-here."""
+"""Operators by domain and name. Inputs that only decide shapes or indices are int64."""

@@ -1,6 +1,7 @@
-"""Reads the bytes of an ONNX file. In: bytes. Out: the model as a Message, with the fields that a
-bundle's model may have. Anything that two readers could take for two things is refused with a
-BundleError. Constants stay where they are in the file.
+"""Reads the bytes of an ONNX file into a Message with the fields that a bundle's model may have.
+
+Anything that two readers could interpret differently is refused with a BundleError. Constants are
+not copied.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError
 
 MOST_VALUES = 50_000
-"""Fields and single numbers that are read one by one, counted before anything is made of them:
-protobuf's own library makes 1 GB of 20 MB of empty nodes. MiniRocket, the longest of our own, has a
-sixth. An array of weights counts as one."""
+"""Largest number of fields and single numbers, counted before objects are made: protobuf's own
+library makes 1 GB of 20 MB of empty nodes. MiniRocket, our largest graph, has a sixth. An array of
+weights counts once."""
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5
-"""Wire types of protobuf that are in use; 1 had eight bytes, 3 and 4 were groups."""
+"""Wire types of protobuf that are in use. Not used: 1 (eight bytes), 3 and 4 (groups)."""
 REFUSED = "refused"
-"""In FIELDS: a field that deserves a name in the message of its refusal. One that is not in FIELDS
-is refused, too."""
+"""Marks a field in FIELDS whose name the error message gives. A field that is not in FIELDS is
+refused, too."""
 FIELDS: dict[str, dict[int, tuple[str, str]]] = {
     "model": {
         1: ("ir_version", "code"),
@@ -96,25 +97,27 @@ FIELDS: dict[str, dict[int, tuple[str, str]]] = {
     "shape": {1: ("dim", "dimension*")},
     "dimension": {1: ("dim_value", "signed"), 2: ("a name instead of a number", REFUSED)},
 }
-"""By message and number: the field's name and what it holds, with * where it may come again. No
-message holds one of its own kind, so nothing nests without end."""
+"""Name and content of each field, by message and number; * marks repeated fields. No message
+contains a message of its own kind, so the depth is limited."""
 
 
 class Message(SimpleNamespace):
-    """One message: an attribute for each of its FIELDS that is not REFUSED. A field that the file
-    leaves out is 0 (code), "" (text), () (with *) or else None; floats are float32 [n], bytes a
-    memoryview."""
+    """One message: an attribute for each of its FIELDS that is not REFUSED.
+
+    A field that the file leaves out is 0 (code), "" (text), () (with *) or else None. Floats are
+    float32 [n], bytes a memoryview.
+    """
 
 
 def read(data: bytes) -> Message:
-    """The model in the bytes of an ONNX file. Raises BundleError naming the message, the field and
-    the place."""
+    """The model in the bytes of an ONNX file. Raises a BundleError with the message, the field and
+    the position in the file."""
     return _Reader(data).message("model", 0, len(data))
 
 
 def fields(message: bytes) -> Iterator[tuple[int, slice, slice]]:
-    """The fields of a model or a graph that `read` has accepted, in their order: number, and where
-    in `message` the field and, without tag and length, its content stand."""
+    """The fields of a model or a graph that `read` has accepted, in order: number, slice of the
+    whole field, and slice of its content without tag and length."""
     reader, at = _Reader(message), 0
     while at < len(message):
         begin = at
@@ -129,7 +132,7 @@ def fields(message: bytes) -> Iterator[tuple[int, slice, slice]]:
 
 @cache
 def _absent(kind: str) -> dict[str, Any]:
-    """What a message has for each field that is not there."""
+    """The values of fields that a message leaves out, by name."""
     usual: dict[str, Any] = {"code": 0, "text": ""}
     fields = FIELDS[kind].values()
     return {
@@ -140,13 +143,13 @@ def _absent(kind: str) -> dict[str, Any]:
 
 
 class _Reader:
-    """Reads one file; counts what it has read."""
+    """Reads one file and counts its fields and values."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._view, self._left = data, memoryview(data), MOST_VALUES
 
     def message(self, kind: str, at: int, end: int) -> Message:
-        """The message between two places."""
+        """The message in the bytes from `at` to `end`."""
         found: dict[str, Any] = {}
         fields = FIELDS[kind]
         while at < end:
@@ -165,8 +168,8 @@ class _Reader:
         return Message(**(_absent(kind) | found))
 
     def _values(self, holds: str, tag: int, at: int, end: int) -> tuple[list[Any], int]:
-        """One of a field that may come again, or all of them packed, and where the next field
-        begins."""
+        """One value of a repeated field, or all its values if they are packed, and the position of
+        the next field."""
         if holds != "signed" or tag & 7 == VARINT:
             value, at = self._value(holds, tag, at, end)
             return [value], at
@@ -178,12 +181,12 @@ class _Reader:
         return found, end
 
     def _value(self, holds: str, tag: int, at: int, end: int) -> tuple[Any, int]:
-        """What a field holds, and where the next one begins. tag: the field's number and wire
-        type."""
+        """The content of a field, and the position of the next field. tag: the field's number and
+        wire type."""
         if holds in ("code", "signed") and tag & 7 == VARINT:
             number, at = self.varint(at, end)
-            if holds == "code" and number >> 31:  # onnxruntime would cut off what is beyond 31 bits
-                raise _wrong(at, f"{_signed(number)} is no code or version")
+            if holds == "code" and number >> 31:  # onnxruntime would cut off higher bits
+                raise _wrong(at, f"{_signed(number)} is not a code or version")
             return _signed(number), at
         if holds in ("float", "floats") and tag & 7 == FOUR_BYTES:
             return self._four_bytes(holds == "floats", tag, at, end)
@@ -204,7 +207,7 @@ class _Reader:
             raise _wrong(at, "a name is not UTF-8") from e
 
     def block(self, tag: int, at: int, end: int) -> tuple[int, int]:
-        """Where a block of bytes behind its length begins and ends."""
+        """Begin and end of a block of bytes that follows its length."""
         if tag & 7 != BYTES:
             raise _wrong(at, f"wire type {tag & 7} does not fit the field")
         size, at = self.varint(at, end)
@@ -215,7 +218,8 @@ class _Reader:
     def _four_bytes(
         self, many: bool, tag: int, at: int, end: int
     ) -> tuple[float | NDArray[Any], int]:
-        """One float; or all that stand one after another, each behind its tag, as one array."""
+        """One float, or one array of consecutive floats that each follow their tag; and the
+        position of the next field."""
         if end - at < 4:
             raise _wrong(at, "a number is cut off")
         if not many:
@@ -226,7 +230,7 @@ class _Reader:
         return np.frombuffer(self._data, each, (stop - at + 1) // 5, at - 1)["value"], stop
 
     def varint(self, at: int, end: int) -> tuple[int, int]:
-        """A number of up to 64 bits, seven in each byte, and where the next field begins."""
+        """A number of up to 64 bits, seven in each byte, and the position of the next field."""
         self._left -= 1
         if self._left < 0:
             raise _wrong(at, f"more than {MOST_VALUES} values")
@@ -246,8 +250,8 @@ class _Reader:
 
 @cache
 def _runs(tag: int) -> re.Pattern[bytes]:
-    """As many floats as follow each other, each behind its tag of one byte; possessive, so that
-    nothing is remembered."""
+    """Pattern of consecutive floats that each follow their tag of one byte. It is possessive, so it
+    needs no memory for backtracking."""
     return re.compile(b"(?:" + re.escape(bytes([tag])) + b".{4})++", re.DOTALL)
 
 

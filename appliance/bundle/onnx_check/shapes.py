@@ -1,7 +1,8 @@
-"""The rules of the operators. In: a node's inputs and settings. Out: type and shape of each output;
-BundleError where they do not fit. The rules are those of the ONNX operator documents
-(https://onnx.ai/onnx/operators/), within bounds under which onnxruntime neither reads beside an
-array nor divides by zero. Whatever decides a size must be a constant of the file.
+"""Computes type and shape of an operator's outputs; inputs that do not fit raise a BundleError.
+
+The rules are those of the ONNX operator documents (https://onnx.ai/onnx/operators/), within bounds
+in which onnxruntime neither reads beside an array nor divides by zero. Every input that decides a
+size must be a constant of the file. Each rule's docstring lists its operators.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ KINDS = {
     7: "int64",
     9: "bool",
 }
-"""Types of tensors by ONNX's code; there are no others in a bundle's model."""
+"""Types of tensors in a bundle's model, by ONNX's code."""
 MOST_RANK = 8
-"""Dimensions of a tensor; our own have up to five."""
+"""Most dimensions of a tensor; those of our models have up to five."""
 MOST_WINDOW_RANK = 3
-"""Dimensions of a convolution or a pool, besides samples and channels."""
+"""Most dimensions of a convolution or a pool, besides samples and channels."""
 MOST_STEP = 1 << 16
 """Largest stride, dilation and kernel."""
 INDEX = "index"
-"""Type of an output that is an int64 and numbers a place, so is never negative: onnxruntime does
-not check it everywhere."""
+"""Type of an int64 output that is an index and never negative. onnxruntime does not check indices
+everywhere."""
 
 Shape = tuple[int, ...]
 Out = tuple[str, Shape]
@@ -43,8 +44,8 @@ Out = tuple[str, Shape]
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A tensor: its type (of KINDS) and shape; its numbers, where it is a constant of the file.
-    place: an int64 that is never negative."""
+    """A tensor. kind: type, of KINDS. numbers: of a constant of the file. index: an int64 that is
+    never negative."""
 
     kind: str
     shape: Shape
@@ -61,11 +62,10 @@ class Call:
     given: Mapping[str, Any]
 
     def numbers(self, at: int, rank: int | None = 1) -> list[int]:
-        """The numbers of an input that must be a constant of `rank` dimensions (None: any). Raises
-        BundleError."""
+        """The numbers of an input, which must be a constant of `rank` dimensions (None: any)."""
         value = self.inputs[at]
         if value.numbers is None:
-            raise BundleError(f"input {at + 1} decides a size, but is no constant of the file")
+            raise BundleError(f"input {at + 1} decides a size, but is not a constant of the file")
         need(
             value.numbers.size <= MOST_RANK,
             f"input {at + 1} has {value.numbers.size} numbers (limit {MOST_RANK})",
@@ -78,7 +78,7 @@ class Call:
         return found
 
     def axis(self, rank: int, usual: int | None = None) -> int:
-        """The setting `axis` as a number from 0 on."""
+        """The setting `axis`, counted from 0."""
         return axes([self.given.get("axis", usual)], rank)[0]
 
     def flag(self, name: str, usual: int) -> bool:
@@ -99,13 +99,13 @@ class Call:
 
 
 def need(holds: bool, otherwise: str) -> None:
-    """Raises BundleError where something does not hold."""
+    """Raises BundleError with the message `otherwise` unless `holds`."""
     if not holds:
         raise BundleError(otherwise)
 
 
 def axes(given: Iterable[Any], rank: int) -> list[int]:
-    """Axes as numbers from 0 on, each of them once."""
+    """Axes, counted from 0. Raises BundleError if an axis is repeated."""
     named = list(given)
     need(
         all(type(a) is int and -rank <= a < rank for a in named),
@@ -117,7 +117,7 @@ def axes(given: Iterable[Any], rank: int) -> list[int]:
 
 
 def together(*shapes: Shape) -> Shape:
-    """The shape once they are broadcast over each other."""
+    """The shape of tensors that are broadcast over each other."""
     found = []
     for sizes in zip_longest(*(reversed(s) for s in shapes), fillvalue=1):
         need(len(set(sizes) - {1}) < 2, f"shapes {[list(s) for s in shapes]} do not go together")
@@ -131,7 +131,7 @@ def same(call: Call) -> Out:
 
 
 def spread(call: Call) -> Out:
-    """Add, Div, Max, Mul, Sub: number by number of tensors that are broadcast over each other."""
+    """Add, Div, Max, Mul, Sub, with broadcasting."""
     kinds = {x.kind for x in call.inputs}
     need(len(kinds) == 1, f"types {sorted(kinds)} do not go together")
     return kinds.pop(), together(*(x.shape for x in call.inputs))
@@ -148,8 +148,7 @@ def choose(call: Call) -> Out:
 
 
 def rest(call: Call) -> Out:
-    """Mod: on some processors a division by zero, or of the least number by -1, ends the
-    program."""
+    """Mod. On some processors dividing by zero, or the least number by -1, ends the program."""
     need(all(n > 0 for n in call.numbers(1, None)), "divisors must be above 0")
     return spread(call)
 
@@ -174,7 +173,7 @@ def along(call: Call) -> Out:
 
 
 def reduce(call: Call) -> Out:
-    """ReduceMax and its like; up to opset 17 most have the axes as a setting."""
+    """ReduceMax and similar operators. Up to opset 17 the axes are a setting for most of them."""
     x = call.inputs[0]
     need(len(call.inputs) == 1 or "axes" not in call.given, "axes are given twice")
     named = (
@@ -241,12 +240,9 @@ def gather(call: Call) -> Out:
 
 
 def _within(at: Value, size: int) -> None:
-    """Where the places are constants: each is there. Else onnxruntime looks, sweep by sweep."""
-    if at.numbers is not None:
-        need(
-            bool(-size <= at.numbers.min() and at.numbers.max() < size),
-            f"an index is out of {size}",
-        )
+    """Raises BundleError for a constant index out of range. onnxruntime checks all others."""
+    n = at.numbers
+    need(n is None or bool(-size <= n.min() and n.max() < size), f"an index is out of {size}")
 
 
 def gather_each(call: Call) -> Out:
@@ -269,7 +265,8 @@ def scatter(call: Call) -> Out:
 
 
 def _beside(call: Call, x: Value, at: Value) -> None:
-    """Places lie in the tensor: as many dimensions, and none larger but along the axis."""
+    """Raises BundleError unless `at` has as many dimensions as `x`, and none is larger than in `x`
+    except along the axis."""
     axis = call.axis(len(x.shape), 0)
     fits = len(x.shape) == len(at.shape) and all(
         i == axis or a <= n for i, (a, n) in enumerate(zip(at.shape, x.shape, strict=True))
@@ -279,7 +276,7 @@ def _beside(call: Call, x: Value, at: Value) -> None:
 
 
 def extract(call: Call) -> Out:
-    """ArrayFeatureExtractor: onnxruntime reads before the array where a place is negative."""
+    """ArrayFeatureExtractor. For a negative index onnxruntime reads before the array."""
     x, at = call.inputs
     need(at.index, "indices must come from TopK or ArgMax")
     need(x.shape != (), "nothing to choose from")
@@ -292,7 +289,7 @@ def reshape(call: Call) -> Out:
     need(call.given.get("allowzero", 0) == 0, "allowzero must be 0")
     need(
         all(n > 0 or n == -1 or (n == 0 and i < len(x.shape)) for i, n in enumerate(wanted)),
-        f"{wanted} is no shape",
+        f"{wanted} is not a shape",
     )
     shape = [n or x.shape[i] for i, n in enumerate(wanted)]
     if -1 in shape:
@@ -330,7 +327,7 @@ def transpose(call: Call) -> Out:
     order = call.given.get("perm", list(range(len(x.shape)))[::-1])
     need(
         sorted(order) == list(range(len(x.shape))),
-        f"perm {order} is no order of {len(x.shape)} dimensions",
+        f"perm {order} is not an order of {len(x.shape)} dimensions",
     )
     return x.kind, tuple(x.shape[i] for i in order)
 
@@ -338,7 +335,7 @@ def transpose(call: Call) -> Out:
 def expand(call: Call) -> Out:
     """Expand."""
     wanted = call.numbers(1)
-    need(all(n > 0 for n in wanted), f"{wanted} is no shape")
+    need(all(n > 0 for n in wanted), f"{wanted} is not a shape")
     return call.inputs[0].kind, together(call.inputs[0].shape, tuple(wanted))
 
 
@@ -360,7 +357,7 @@ def count(call: Call) -> Out:
 
 
 def windows(call: Call, kernel: Shape) -> Shape:
-    """How often a kernel fits along each of the last dimensions."""
+    """Number of positions of a kernel along each of the last dimensions."""
     size, n = call.inputs[0].shape[2:], len(kernel)
     need(0 < n == len(size) <= MOST_WINDOW_RANK, f"a kernel of {list(kernel)} on {list(size)}")
     strides, dilations = call.steps("strides", n, 1, 1), call.steps("dilations", n, 1, 1)
@@ -447,11 +444,11 @@ def quantize(call: Call) -> Out:
 
 
 def dequantize(call: Call) -> Out:
-    """DequantizeLinear, with one step or one for each place along an axis."""
+    """DequantizeLinear, with one step or one step for each index along an axis."""
     x, step, zero = call.inputs
     each = (1,) if prod(step.shape) == 1 else (x.shape[call.axis(len(x.shape), 1)],)
     fits = step.shape in ((), each) and zero.shape == step.shape
-    need(fits, "as many steps and zeros are wanted as there are places")
+    need(fits, f"steps and zeros of {list(step.shape)} do not fit {list(x.shape)}")
     need(zero.kind == x.kind, f"zeros of {zero.kind} for {x.kind}")
     return "float32", x.shape
 
@@ -476,7 +473,7 @@ def distances(call: Call) -> Out:
 
 
 def machine(call: Call) -> list[Out]:
-    """SVMClassifier: onnxruntime takes the lengths of its tables for granted."""
+    """SVMClassifier. onnxruntime does not check the lengths of its tables."""
     x, given = call.inputs[0].shape, call.given
     need(len(x) == 2 and x[0] == 1, f"one row of features is wanted, not {list(x)}")
     classes, each = (

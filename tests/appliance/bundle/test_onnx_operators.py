@@ -44,7 +44,7 @@ def of(*shape: int, kind: str = "float32") -> Value:
 
 WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
     ("dimensions instead of 1", "Expand", [of(3), fixed(3, shape=())], {}),
-    ("is no shape", "Expand", [of(3), fixed(0, 3)], {}),
+    ("is not a shape", "Expand", [of(3), fixed(0, 3)], {}),
     ("must be 0 or 1", "ReduceMax", [of(3)], {"keepdims": 2}),
     ("axis .3. of 2", "ReduceMax", [of(3, 3)], {"axes": [3]}),
     ("each once", "ReduceMax", [of(3, 3)], {"axes": [0, -2]}),
@@ -71,11 +71,11 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
         {},
     ),
     ("allowzero", "Reshape", [of(3), fixed(3)], {"allowzero": 1}),
-    ("is no shape", "Reshape", [of(3), fixed(-2, 3)], {}),
+    ("is not a shape", "Reshape", [of(3), fixed(-2, 3)], {}),
     ("cannot become", "Reshape", [of(3), fixed(2, -1)], {}),
     ("cannot become", "Reshape", [of(4), fixed(-1, -1)], {}),
     ("axis 2 of 1", "Flatten", [of(3)], {"axis": 2}),
-    ("is no order", "Transpose", [of(3, 3)], {"perm": [0, 0]}),
+    ("is not an order", "Transpose", [of(3, 3)], {"perm": [0, 0]}),
     ("one float", "ConstantOfShape", [fixed(3)], {"value": Value("float32", (2,))}),
     ("one float", "ConstantOfShape", [fixed(3)], {"value": Value("int64", (1,))}),
     (
@@ -106,13 +106,13 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
     ("weights of", "GRU", [of(4, 1, 2), of(1, 6, 2), of(1, 6, 2), of(1, 11)], {"hidden_size": 2}),
     ("single numbers", "QuantizeLinear", [of(3), of(3), of(3, kind="uint8")], {}),
     (
-        "as many steps",
+        "steps and zeros of",
         "DequantizeLinear",
         [of(3, kind="int8"), of(2), of(2, kind="int8")],
         {"axis": 0},
     ),
     (
-        "as many steps",
+        "steps and zeros of",
         "DequantizeLinear",
         [of(3, kind="int8"), of(3), of(kind="int8")],
         {"axis": 0},

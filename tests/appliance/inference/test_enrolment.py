@@ -313,9 +313,9 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path: Path, made: dict[str, byt
     (tmp_path / "home").mkdir()
     (tmp_path / "file").write_text("")
     for place, hint in (
-        ("home", "is no bundle"),
-        ("file", "is no bundle"),
-        ("none/new", "is no folder that you may"),
+        ("home", "is not a bundle"),
+        ("file", "is not a bundle"),
+        ("none/new", "is not a folder that you may"),
     ):
         with pytest.raises(BundleError, match=hint):
             enrolment.write(made, tmp_path / place, True)
@@ -501,7 +501,7 @@ def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.Monk
     ("more", "trouble", "hint"),
     [
         (["--set", "classifier.bundle=/nowhere"], BundleError, "no bundle at /nowhere"),
-        (["--out", "/nowhere/new"], BundleError, "/nowhere is no folder that you may write to"),
+        (["--out", "/nowhere/new"], BundleError, "/nowhere is not a folder that you may write to"),
         (["--sim", "world"], ConfigError, "--sim world is unknown"),
     ],
 )
