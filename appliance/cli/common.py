@@ -14,9 +14,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
-from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError
-from appliance.core.types import SweepFormat
 from appliance.runtime import assembly
 
 if TYPE_CHECKING:
@@ -24,9 +22,6 @@ if TYPE_CHECKING:
 
 Facts = Mapping[str, Callable[[], object]]
 """Additional facts of status and feed, by name. A text is shown to a person."""
-OpenDevices = Callable[[Callable[[], SweepFormat] | None], Devices]
-"""Opens the devices. Its argument gives the format that a simulated skin has to send; None for
-whatever its script has."""
 
 
 def load_settings(args: argparse.Namespace) -> Config:

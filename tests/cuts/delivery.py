@@ -38,7 +38,7 @@ from tests.factories.paths import ROOT
 
 STORE, INCOMING = "store", "store/incoming"
 ENROLMENT = "enrolment"
-"""Folder of the box's own key, beside the shop's bundles."""
+"""Folder of this box's key, beside the shop's bundles."""
 APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
 """Copies before they are installed, and contents of incomplete folders: nobody reads these."""
 PROBATION = 2
@@ -66,7 +66,7 @@ it syncs nothing."""
 @dataclass(frozen=True, slots=True)
 class Shop:
     """A folder beside the box with its deliveries: bundles with these NAMES and rising counters,
-    signed by one key. It also holds the box's own key for enrolments."""
+    signed by one key. It also holds this box's key for enrolments."""
 
     folder: Path
 
