@@ -1,4 +1,4 @@
-"""Bridges as processes of their own, as they run beside a box, and their clients."""
+"""Bridges as separate processes, as they run beside a box, and their clients."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ LONG_S = 30.0
 
 
 def page_blocks(page: str, language: str) -> list[str]:
-    """The blocks in this language of a page in docs/robots."""
+    """The code blocks in this language on a page in docs/robots."""
     return re.findall(
         rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S
     )
 
 
 def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
-    """Wait for something that another process does; fails where it never comes."""
+    """Wait until another process has made `there` true; fails after `limit_s`."""
     for _ in range(round(limit_s / 0.02)):
         if there():
             return
@@ -37,7 +37,7 @@ def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
-    """A running bridge; where it listens."""
+    """Run a bridge; yields its address."""
     command = [
         sys.executable,
         "-m",
@@ -64,13 +64,13 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
             process.terminate()
             try:
                 process.wait(LONG_S)
-            except subprocess.TimeoutExpired:  # else closing its pipe would wait forever
+            except subprocess.TimeoutExpired:  # otherwise closing its pipe waits forever
                 process.kill()
                 raise
 
 
 class RawModbus:
-    """A Modbus TCP client of bytes that are put together here, from the specification alone."""
+    """A Modbus TCP client that builds its bytes from the specification alone."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self.socket = socket.create_connection(address, timeout=LONG_S)
@@ -82,21 +82,19 @@ class RawModbus:
         self.socket.close()
 
     def send(self, pdu: bytes, transaction: int = 1, unit: int = 255) -> None:
-        """Send a request."""
         self.socket.sendall(struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu)
 
     def receive(self) -> bytes:
-        """The next reply, as it came."""
+        """The bytes of the next reply."""
         head = self._exactly(6)
         return head + self._exactly(int.from_bytes(head[4:], "big"))
 
     def ask(self, pdu: bytes) -> bytes:
-        """Send a request; the reply's function and data."""
+        """Send a request. Returns the function code and the data of the reply."""
         self.send(pdu)
         return self.receive()[7:]
 
     def registers(self, address: int, count: int, function: int = 4) -> list[int]:
-        """Read registers."""
         data = self.ask(struct.pack(">BHH", function, address, count))
         assert data[:2] == bytes([function, 2 * count]), data.hex()
         return list(struct.unpack(f">{count}H", data[2:]))

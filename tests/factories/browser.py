@@ -1,4 +1,4 @@
-"""A real browser for the tests of pages, and a page as a person sees it in one."""
+"""A real browser for the tests of pages, and the page that it shows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WAIT_S = 10
 
 @contextmanager
 def launched() -> Iterator[Any]:
-    """A browser of this system, else that of playwright; skips the test if there is none."""
+    """The system's browser, otherwise playwright's. Skips the test if there is none."""
     api = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (make test installs it)"
     )
@@ -31,7 +31,8 @@ def launched() -> Iterator[Any]:
         path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
         if not Path(path).exists():
             pytest.skip(
-                "no browser: apt-get install chromium-headless-shell, or playwright install chromium"
+                "no browser: apt-get install chromium-headless-shell, "
+                "or playwright install chromium"
             )
         one = tool.chromium.launch(executable_path=path)
         yield one
@@ -51,22 +52,26 @@ COLOURS = """() => {
   const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   for (let node = walk.nextNode(); node; node = walk.nextNode()) {
     const one = node.parentElement, style = getComputedStyle(one);
-    if (!node.textContent.trim() || !one.checkVisibility() || ["SCRIPT", "TITLE", "title"].includes(one.tagName)) continue;
+    if (!node.textContent.trim() || !one.checkVisibility()) continue;
+    if (["SCRIPT", "TITLE", "title"].includes(one.tagName)) continue;
     if (one.closest("svg .skin, .spoken") || one.classList.contains("count")) continue;
     let behind = one;
-    while (behind && (rgb(getComputedStyle(behind).backgroundColor)[3] ?? 1) === 0) behind = behind.parentElement;
+    while (behind && (rgb(getComputedStyle(behind).backgroundColor)[3] ?? 1) === 0)
+      behind = behind.parentElement;
     const text = one instanceof SVGElement ? style.fill : style.color;
-    found.push([node.textContent.trim(), rgb(text).slice(0, 3), rgb(getComputedStyle(behind ?? document.body).backgroundColor).slice(0, 3)]);
+    const paper = getComputedStyle(behind ?? document.body).backgroundColor;
+    found.push([node.textContent.trim(), rgb(text).slice(0, 3), rgb(paper).slice(0, 3)]);
   }
   return found;
 }"""
-"""Each text that is seen, with its colour and that behind it; but counts of taxels, whose colour
-changes."""
+"""Each visible text, its colour and its background.
+
+Counts on taxels are left out, because their colours change.
+"""
 
 
 class BrowsedPage:
-    """The page as a person sees it. errors: messages of the browser. requests: addresses that it
-    asked for."""
+    """A page in the browser. errors: the browser's messages. requests: the requested addresses."""
 
     def __init__(self, context: Any, address: str) -> None:
         self.page, self.errors, self.requests = context.new_page(), [], []
@@ -76,15 +81,15 @@ class BrowsedPage:
         self.page.goto(address)
 
     def state(self, wanted: str) -> None:
-        """Wait for this state of the page."""
+        """Wait until the page shows this state."""
         until(lambda: self.page.evaluate("document.body.dataset.state") == wanted)
 
     def text(self, where: str) -> str:
-        """The text of an element, with plain spaces."""
+        """The text of an element, without non-breaking spaces."""
         return str(self.page.inner_text(where)).replace("\xa0", " ")
 
     def legibility(self) -> tuple[int, list[tuple[str, float]]]:
-        """The number of texts, and those whose contrast is below 4.5 (WCAG 2.1, 1.4.3), with it."""
+        """The number of texts, and the texts with a contrast below 4.5 (WCAG 2.1, 1.4.3)."""
         texts = [
             (text, round(contrast(front, back), 2))
             for text, front, back in self.page.evaluate(COLOURS)
@@ -93,7 +98,7 @@ class BrowsedPage:
 
 
 def luminance(colour: Sequence[float]) -> float:
-    """Relative luminance of red, green and blue of 0 to 255 (WCAG 2.1): 0 to 1."""
+    """Relative luminance [0, 1] of red, green and blue [0, 255] (WCAG 2.1)."""
     parts = [part / 255 for part in colour]
     linear = [
         part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
@@ -102,6 +107,6 @@ def luminance(colour: Sequence[float]) -> float:
 
 
 def contrast(one: Sequence[float], other: Sequence[float]) -> float:
-    """Contrast of two colours (WCAG 2.1): 1 to 21."""
+    """Contrast of two colours, 1 to 21 (WCAG 2.1)."""
     dark, light = sorted((luminance(one), luminance(other)))
     return (light + 0.05) / (dark + 0.05)

@@ -1,4 +1,4 @@
-"""What `fit_calibration` is fitted to, without augmented copies where none are given."""
+"""Inputs of `fit_calibration` for tests, without augmented copies."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ def plain_inputs(
     fixed: int = 0,
     faulty: np.ndarray | None = None,
 ) -> CalibrationInputs:
-    """Features [N, D + 1, F] and the labels of these sweeps; disturbed: None without disturbed
-    sweeps."""
+    """Inputs from features [N, D + 1, F] and their labels. faulty: by default no sweep is
+    faulty.
+    """
     none = AugmentedCopies(prefixes[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
     return CalibrationInputs(
         prefixes,

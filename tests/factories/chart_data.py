@@ -1,4 +1,4 @@
-"""A small chart for tests: dots as chart.json lists them, with a front that is known."""
+"""A small chart for tests: dots as in chart.json, with a known front."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 def dot(
     method: str, precision: str, ms: float, speed: float, lopo: float | None = None, **more: Any
 ) -> dict[str, Any]:
-    """One dot with an interval of two points each way; bigger where it is slower."""
+    """A dot whose intervals are two points wide each way. The slower it is, the larger is its
+    model.
+    """
     accuracy = {
         key: {
             "mean": mean,
@@ -52,7 +54,8 @@ DOTS = [
     dot("minirocket", "float", 9.0, 0.96, runtime="aeon", runs_on_box=False, family="MiniRocket"),
 ]
 FRONT = {"speed": [0, 2, 6], "lopo": [0, 2, 3]}
-"""Numbers of the dots on the front over ms_p50, cheapest first."""
+"""Indices of the dots on the front over ms_p50, cheapest first."""
 SHOWN = [0, 2, 4, 3, 6]
-"""Numbers of the dots that stand for a network over ms_p50 and speed, cheapest first: each network
-where it costs least."""
+"""Indices of the dots that represent a network over ms_p50 and speed, cheapest first. Each network
+is represented by its cheapest dot.
+"""

@@ -1,5 +1,4 @@
-"""Made-up choices of a model, as choice.json holds them: one reaches the target, the other does
-not."""
+"""Invented contents of choice.json: a choice that reaches the target, and one that misses it."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ def _curve(kind: str, points: list[Json], kept: str, **more: Any) -> Json:
 
 
 def choice(**more: Any) -> Json:
-    """Four models and all curves; the target is reached."""
+    """Four models with all curves. They reach the target."""
     curves = [
         _curve(
             "window",
@@ -132,8 +131,7 @@ def choice(**more: Any) -> Json:
 
 
 def missed() -> Json:
-    """Only one model could be tried, it is not good enough, nothing was left out, and no budget was
-    set."""
+    """A single model that misses the target, with no data held out and no budget."""
     alone = [_model("compact-1k", 0.08, 0.512, 0.0)]
     return choice(
         chosen="compact-1k",

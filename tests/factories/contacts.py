@@ -1,4 +1,4 @@
-"""Contacts on a skin of 4 x 4 taxels, for tests: loads, frames, trained positions."""
+"""Contacts on a skin of 4 x 4 taxels for tests: loads, frames and trained positions."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ def counts(load: Any) -> np.ndarray:
 
 
 def patch(row: float, col: float) -> np.ndarray:
-    """Loads of a round contact with its centre there, in taxels; 1.2 taxels wide each way."""
+    """Loads of a round contact, 1.2 taxels wide each way. row, col: its centre in taxels."""
     r, c = np.mgrid[0:4, 0:4]
     return np.maximum(0, 100 * (1 - ((r - row) ** 2 + (c - col) ** 2) / 1.3**2))

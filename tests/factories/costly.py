@@ -28,7 +28,7 @@ COSTLY = {
 
 
 def quick_first(names: Iterable[str]) -> list[Any]:
-    """The names as parameters of a test; the costly ones are marked thorough."""
+    """The names as parameters of a test. The costly methods are marked thorough."""
     return [
         pytest.param(name, marks=pytest.mark.thorough) if name in COSTLY else name for name in names
     ]

@@ -1,5 +1,4 @@
-"""Bundles as they are delivered, for tests. In: a folder. Out: keys, signed bundles, a store that
-believes one signer."""
+"""Deliveries of bundles for tests: keys, signed bundles, a store that trusts one signer."""
 
 from __future__ import annotations
 
@@ -36,12 +35,14 @@ def key(folder: Path, name: str = "key", kind: str = "ed25519") -> Path:
 
 
 def line(key: Path, name: str = SIGNER, options: str = "") -> str:
-    """The line of a file of signers that believes this key."""
+    """The line of an allowed-signers file that trusts this key."""
     return f"{name} {options}{key.with_suffix('.pub').read_text()}"
 
 
 def files(counter: int, key: Path | None, **changes: object) -> dict[str, bytes]:
-    """The files of the default bundle with another counter, signed; changes: of its manifest."""
+    """The files of the default bundle with another counter, signed. changes: fields of its
+    manifest.
+    """
     held = {
         name: data
         for name, data in bundle.files(bundle.DEFAULT).items()
@@ -55,7 +56,7 @@ def files(counter: int, key: Path | None, **changes: object) -> dict[str, bytes]
 
 
 def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
-    """The files of a bundle with the manifest that they need, and its signature."""
+    """The files of a bundle with a matching manifest and its signature."""
     entries = {
         name: bundle.file_entry(data) for name, data in held.items() if name != bundle.MANIFEST
     }
@@ -66,8 +67,9 @@ def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
 def enrolled(
     held: dict[str, bytes], key: EnrolmentKey | None, label: str = "cork"
 ) -> dict[str, bytes]:
-    """The files of a bundle with one more label, learned from the first golden sweep, as the box
-    makes them."""
+    """The files of a bundle with one more label, as the box makes them from the first golden
+    sweep.
+    """
     made = bundle.from_files(held, "a test")
     new = enrolment.enrol(made, label, made.golden[:1])
     return enrolment.files(held, new, key.sign(new.file) if key else None)
@@ -82,7 +84,7 @@ def put(folder: Path, files: dict[str, bytes]) -> Path:
 
 
 class Delivery:
-    """A box's store, and somebody who delivers bundles to it."""
+    """A box's store, and the sender of its bundles."""
 
     def __init__(
         self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None
@@ -97,7 +99,7 @@ class Delivery:
         self._made = 0
 
     def made(self, counter: int, **changes: object) -> Path:
-        """A folder with a signed bundle, as deploy has copied it."""
+        """A folder with a signed bundle, as `deploy` copies it."""
         return self.copied(files(counter, self.key, **changes))
 
     def copied(self, held: dict[str, bytes]) -> Path:
@@ -106,16 +108,16 @@ class Delivery:
         return put(self.folder / "incoming" / str(self._made), held)
 
     def installed(self, counter: int) -> str:
-        """A bundle that was installed; its sha256."""
+        """Install a bundle; returns its sha256."""
         return self.store.install(self.made(counter))
 
     def start(self) -> str:
-        """A start of the box; the sha256 of the bundle that it runs, "" for the packaged bundle."""
+        """Start the box. Returns the sha256 of its bundle, or "" for the packaged bundle."""
         folder = self.store.choose().folder
         return "" if folder == bundle.DEFAULT else folder.name
 
     def committed(self, counter: int) -> str:
-        """A bundle that was installed and committed; its sha256."""
+        """Install and commit a bundle; returns its sha256."""
         sha = self.installed(counter)
         assert self.store.commit()
         return sha

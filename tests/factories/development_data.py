@@ -1,4 +1,4 @@
-"""Results for the development page: two cases, three methods, a learning curve."""
+"""Results for the page of development: two cases, three methods and a learning curve."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import Any
 
 
 def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
-    """One accuracy, its interval five points either way; `default` is in int8, and a point better
-    in float."""
+    """An accuracy with an interval of five points each way. `default` is in int8; its float
+    accuracy is a point higher.
+    """
     ends = {
         "mean": mean,
         "low": round(mean - 0.05, 4),
@@ -27,8 +28,10 @@ def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
 
 
 def figures(**changes: Any) -> dict[str, Any]:
-    """Two cases and three methods, one of them not fit for the second case; a learning curve of the
-    first."""
+    """Two cases, three methods and a learning curve of the first case.
+
+    The third method cannot run the second case.
+    """
     results = [
         entry("one", "default", 0.9),
         entry("one", "quick <b>", 0.8),

@@ -1,11 +1,10 @@
-"""Runs the classifier of the box on other processors. In: folders with bundles and sweeps. Out: its
-outputs there.
+"""Runs the classifier of the box on emulated processors and collects its outputs.
 
-`python -m tests.factories.emulated_machines` gets an arm64 userland, once, into
-~/.cache/palpate/machines: Debian's packages unpacked, the wheels of appliance/requirements.lock
-beside them. qemu's user mode runs it, and older x86 processors; nothing needs root, and nothing
-outside that folder is changed. With two arguments, FROM TO, the module is the program that runs on
-each machine, also here.
+`python -m tests.factories.emulated_machines` makes an arm64 userland once, in
+~/.cache/palpate/machines: unpacked packages of Debian and the wheels of
+appliance/requirements.lock. qemu's user mode runs it, and it emulates older x86 processors. It
+needs no root and changes nothing outside that folder. With two arguments, FROM TO, the module is
+the program that runs on each machine, this machine included.
 """
 
 from __future__ import annotations
@@ -32,8 +31,9 @@ MACHINES = {
     "Raspberry Pi 5": ("aarch64", "cortex-a76"),
     "Arm with all that qemu knows": ("aarch64", "max"),
 }
-"""Name: (architecture, processor as qemu calls it). The Pi 5 has dot products of eight bits, the Pi
-4 has not."""
+"""Name: (architecture, name of the processor in qemu). The Pi 5 has 8-bit dot products; the Pi 4
+does not.
+"""
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
 PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
@@ -49,56 +49,63 @@ CPUINFO = (
     "processor\t: 0\nFeatures\t: fp asimd\nCPU implementer\t: 0x41\n"
     "CPU architecture: 8\nCPU variant\t: 0x0\nCPU part\t: 0xd08\nCPU revision\t: 3\n"
 )
-"""onnxruntime counts cores there and crashes on an x86's; what the processor can do it asks the
-kernel, here qemu."""
+"""Replaces /proc/cpuinfo. onnxruntime counts cores there and crashes on an x86's file. It asks the
+kernel, here qemu, for the features of the processor.
+"""
 
 
 class Missing(Exception):
-    """What another machine needs is not available here."""
+    """A requirement of an emulated machine is not installed."""
 
 
 def folder() -> Path:
-    """The folder of the arm64 userland, which is another for another lock or Python."""
+    """The folder of the arm64 userland. It depends on the lock file and on the Python version."""
     name = hashlib.sha256(LOCK.read_bytes() + PYTHON.encode()).hexdigest()[:16]
     return HOME / name
 
 
 def qemu(kind: str) -> str:
-    """The emulator of an architecture: this machine's, else that of `set_up`. Raises Missing."""
+    """The emulator of an architecture: this machine's emulator, else that of `set_up`. Raises
+    Missing.
+    """
     for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
         if found := shutil.which(
             name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"
         ):
             return found
     raise Missing(
-        f"no qemu-{kind} here; apt-get install qemu-user-static, or run python -m tests.factories.emulated_machines"
+        f"no qemu-{kind} here; apt-get install qemu-user-static, "
+        "or run python -m tests.factories.emulated_machines"
     )
 
 
 def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
-    """Arguments and environment that run this file on one of MACHINES. Raises Missing."""
+    """Arguments and environment that run this file on a machine of MACHINES. Raises Missing."""
     kind, processor = MACHINES[name]
     if platform.machine() != "x86_64":
         raise Missing("other processors are compared with an x86")
     run = [qemu(kind), "-cpu", processor]
     kept = {
         name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")
-    }  # of this processor
+    }  # the features of this processor
     env = kept | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     if kind == platform.machine():
         return [*run, sys.executable, __file__, *map(str, args)], env
     usr = folder() / "root" / "usr"
     if not usr.exists():
         raise Missing(
-            "no arm64 userland here; run python -m tests.factories.emulated_machines (30 s, 300 MB in ~/.cache/palpate)"
+            "no arm64 userland here; run python -m tests.factories.emulated_machines "
+            "(30 s, 300 MB in ~/.cache/palpate)"
         )
     env |= {"PYTHONPATH": f"{folder() / 'site'}:{ROOT}", "PYTHONHOME": str(usr)}
     return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
 
 
 def whole(target: Path, make: Callable[[Path], None]) -> Path:
-    """The folder `target`. If it is missing, it is made whole or not at all: `make` fills an empty
-    folder beside it. Raises Missing with the output of the failed command.
+    """Return the folder `target`; if it is missing, `make` fills an empty folder that takes its
+    place.
+
+    So it is complete or missing. Raises Missing with the output of the failed command.
     """
     if target.exists():
         return target
@@ -107,11 +114,12 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
     part.chmod(0o755)
     try:
         make(part)
-        with suppress(OSError):  # somebody else was quicker
+        with suppress(OSError):  # another process was quicker
             part.rename(target)
     except subprocess.CalledProcessError as e:
         raise Missing(
-            f"{' '.join(map(str, e.cmd))[:200]} failed: {(e.stderr or e.stdout or '').strip()[-800:]}"
+            f"{' '.join(map(str, e.cmd))[:200]} failed: "
+            f"{(e.stderr or e.stdout or '').strip()[-800:]}"
         ) from e
     except FileNotFoundError as e:
         raise Missing(f"no {e.filename} here: this needs Debian's tools") from e
@@ -121,8 +129,9 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
 
 
 def set_up() -> Path:
-    """The folder of the arm64 userland, made if it is not there. Raises Missing if apt or pip
-    fail."""
+    """The folder of the arm64 userland, made if it is missing. Raises Missing if apt or pip
+    fail.
+    """
     return whole(folder(), _make)
 
 
@@ -142,7 +151,7 @@ def _make(part: Path) -> None:
 
 
 def _unpack(part: Path) -> None:
-    """Debian's Python for arm64, and qemu where this machine has none, with all they need."""
+    """Unpack Debian's Python for arm64, qemu if this machine has none, and their dependencies."""
     mine = run("dpkg", "--print-architecture").strip()
     wanted = {"root": [f"{name}:arm64" for name in PACKAGES]}
     try:
@@ -167,17 +176,20 @@ def _unpack(part: Path) -> None:
 
 
 def apt(part: Path, *known: str) -> tuple[str, str]:
-    """Words to put before a command of apt, so that it sees these architectures, takes nothing as
-    installed, and keeps its files in `part`. The lists are fetched here; apt checks their
-    signatures with this machine's keys.
+    """The start of a command of apt for these architectures.
+
+    That apt treats no package as installed and keeps its files in `part`. This function fetches the
+    lists; apt checks their signatures with this machine's keys.
     """
     for made in ("lists/partial", "archives/partial"):
         (part / made).mkdir(parents=True, exist_ok=True)
     (part / "status").write_bytes(b"")
     (part / "apt.conf").write_text(
-        f'APT::Architecture "{known[0]}"; APT::Architectures {{ {" ".join(f"{name};" for name in known)} }};\n'
+        f'APT::Architecture "{known[0]}"; '
+        f"APT::Architectures {{ {' '.join(f'{name};' for name in known)} }};\n"
         f'APT::Sandbox::User ""; Acquire::Languages "none";\n'
-        f'Dir::State::Lists "{part}/lists"; Dir::State::Status "{part}/status"; Dir::Cache "{part}";\n'
+        f'Dir::State::Lists "{part}/lists"; Dir::State::Status "{part}/status"; '
+        f'Dir::Cache "{part}";\n'
     )
     before = ("env", f"APT_CONFIG={part / 'apt.conf'}")
     run(*before, "apt-get", "-qq", "update")
@@ -185,13 +197,15 @@ def apt(part: Path, *known: str) -> tuple[str, str]:
 
 
 def _install(site: Path) -> None:
-    """The locked wheels for arm64."""
+    """Install the locked wheels for arm64."""
     run(*PIP, "install", *ARM_WHEELS, "--require-hashes", "-r", LOCK, "--target", site)
 
 
 def wheel(out: Path, source: Path) -> None:
-    """Build the box's wheel into `out`, in the empty folder `source`: setuptools would put
-    leftovers of an older build into the wheel, and leaves its own behind.
+    """Build the box's wheel into `out`.
+
+    source: an empty folder to build in. In the checkout, setuptools would add leftovers of older
+    builds to the wheel and leave its own there.
     """
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -202,16 +216,15 @@ def wheel(out: Path, source: Path) -> None:
 
 
 def run(*args: str | Path) -> str:
-    """A command's output; its errors go into the exception."""
+    """The output of a command. If it fails, its errors are in the exception."""
     return subprocess.run(args, check=True, capture_output=True, text=True).stdout
 
 
 def work(given: Path, target: Path) -> None:
-    """Run the models in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy,
-    into one .npz.
+    """Run the models in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy.
 
-    A bundle: NAME/golden and NAME/sweeps are its logits. A shown.onnx: NAME/shown [n, ...] are its
-    outputs for the sweeps, one after another.
+    The results are in one .npz: the logits of a bundle as NAME/golden and NAME/sweeps, the outputs
+    of a shown.onnx for the sweeps, one after another, as NAME/shown [n, ...].
     """
     import numpy as np
 

@@ -1,5 +1,4 @@
-"""Lines of the feed as the box writes them (PROTOCOL.md, part 4), of a shift that a test makes
-up."""
+"""Lines of the feed as the box writes them (PROTOCOL.md, part 4), for an invented shift."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def hello(
 
 
 def health(at_s: float, **other: Any) -> dict[str, Any]:
-    """The state of each second."""
+    """The state that the box sends each second."""
     return {
         "type": "health",
         "time_ns": round(at_s * SECOND),
@@ -87,7 +86,7 @@ def state(skin: str = "streaming", trouble: str = "", *, sweeping: bool = False)
 def verdict(
     sweep: int, at_s: float, label: str = "plastic rough", status: str = "ok", **other: Any
 ) -> dict[str, Any]:
-    """The answer to a sweep; the probability goes down with a status that is not ok."""
+    """The answer to a sweep. Its probability is lower if the status is not ok."""
     p = 0.962 if status == "ok" else 0.481
     scores = [p if name == label else (1 - p) / (len(LABELS) - 1) for name in LABELS]
     without = status not in ("ok", "unsure", "undecided")
@@ -113,7 +112,7 @@ def verdict(
 
 
 def load(row: float, col: float, strength: float = 120.0) -> NDArray[np.float64]:
-    """Counts [4, 4] of a contact whose centre is at this row and column, in taxels from 0."""
+    """Raw counts [4, 4] of a contact with its centre at this row and column, in taxels from 0."""
     rows, cols = np.mgrid[0:4, 0:4]
     away = ((rows - row) / 1.1) ** 2 + ((cols - col) / 1.4) ** 2
     return np.asarray(np.round(strength * np.exp(-away)))
@@ -125,7 +124,7 @@ def frame(at_s: float, taxels: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def sweep(number: int, hz: float = 55.0) -> dict[str, Any]:
-    """The window of a sweep: a contact that vibrates at `hz`."""
+    """The window of a sweep whose contact vibrates at `hz`."""
     t = np.arange(FRAMES)[:, None, None] / RATE_HZ
     counts = load(1.5, 1.5) * (1 + 0.15 * np.sin(2 * np.pi * hz * t) * np.sin(2 * np.pi * 0.7 * t))
     data = np.clip(np.round(counts), 0, 255).astype(np.uint8)

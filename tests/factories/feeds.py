@@ -66,7 +66,7 @@ def cut(format: SweepFormat = skin.FORMAT) -> Sweep:
 
 
 class FeedPeer:
-    """A reader as another program is one."""
+    """A reader of the feed, as a separate program would be."""
 
     def __init__(self, path: Path, *, wait_s: float = 5.0) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -75,15 +75,15 @@ class FeedPeer:
         self.ended, self._rest = False, b""
 
     def ask(self, text: str | bytes) -> None:
-        """Send a request, or something else."""
+        """Send a request or any other text."""
         self.socket.sendall(text.encode() + b"\n" if isinstance(text, str) else text)
 
     def lines(self) -> list[dict[str, Any]]:
-        """The lines so far; `ended` is set once the box has closed."""
+        """The lines so far. `ended` is set when the box has closed the connection."""
         while select.select([self.socket], [], [], 0)[0]:
             try:
                 data = self.socket.recv(1 << 16)
-            except ConnectionResetError:  # the box had not read all that was sent
+            except ConnectionResetError:  # the box had not read all sent bytes
                 data = b""
             if not data:
                 self.ended = True
@@ -110,18 +110,18 @@ class Offered:
     def turns(
         self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND
     ) -> None:
-        """Take turns, `step_s` apart: so that each is one in which the feed does its work."""
+        """Take `n` turns, `step_s` apart. By default the feed works in each of them."""
         for _ in range(n):
             self.feed.turn(health)
             self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
 
     def _spent(self) -> int:
-        """Asked before and after each look."""
+        """Processor time; the feed reads it before and after each look."""
         self._spent_ns += self.cost_ns
         return self._spent_ns
 
     def peer(self) -> FeedPeer:
-        """A connected reader that the box has taken up."""
+        """A connected reader that the box has accepted."""
         self.turns()
         peer = FeedPeer(self.path)
         self.turns(2)

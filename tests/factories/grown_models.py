@@ -1,6 +1,6 @@
-"""Random models: random operators on random tensors, as far as the rules of the box's check allow.
+"""Random models that the box's check accepts, as tests of onnxruntime itself.
 
-In: a generator. Out: a model that the check accepts, so that onnxruntime itself is tested.
+They have random operators on random tensors, as far as the rules of the check allow.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ SIZES = (1, 1, 1, 2, 2, 3, 4, 6, 8, 24, 96)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 3.0, 1e-39, 1e38, -1e38, 255.0, float("inf"), float("nan"))
 TRIES = 20
 MOST_NUMBERS = 50_000
-"""In one tensor: the campaign is about kinds of graphs, not about large ones."""
+"""Most numbers of one tensor. The campaign is about kinds of graphs, not about large tensors."""
 
 
 class Sprout:
-    """A graph that grows."""
+    """A graph under construction."""
 
     def __init__(self, rng: Random) -> None:
         self.rng, self.nodes, self.constants = rng, [], []
@@ -57,7 +57,7 @@ class Sprout:
         return name
 
     def shape(self, like: tuple[int, ...] = ()) -> tuple[int, ...]:
-        """Sizes at random, or those of a tensor, one of them changed perhaps."""
+        """Random sizes, or the sizes of `like`, possibly with one of them changed."""
         rng = self.rng
         if like and rng.random() < 0.7:
             found = list(like)
@@ -67,7 +67,7 @@ class Sprout:
         return tuple(rng.choice(SIZES) for _ in range(rng.randint(0, 4)))
 
     def input(self, kinds: tuple[str, ...], like: tuple[int, ...]) -> str:
-        """Something that is there, the newest most often, or a new constant."""
+        """An existing value, most often a recent one, or a new constant."""
         there = [name for name, value in self.known.items() if value.kind in kinds]
         if there and self.rng.random() < 0.6:
             return there[-1 - min(int(self.rng.expovariate(0.5)), len(there) - 1)]
@@ -75,7 +75,7 @@ class Sprout:
         if not made:
             return self.rng.choice(there) if there else ""
         kind = self.rng.choice(made)
-        if kind == "int64" and self.rng.random() < 0.8:  # what decides sizes
+        if kind == "int64" and self.rng.random() < 0.8:  # values that decide sizes
             return self.constant(
                 kind, self.rng.choice(((), (1,), (1,), (1,), (2,), (len(like) or 1,)))
             )
@@ -83,7 +83,7 @@ class Sprout:
         return self.constant(kind, shape if prod(shape) <= 4096 else ())
 
     def setting(self, name: str, code: int, first: Value) -> Any:
-        """A value for a setting."""
+        """A random value for an attribute of a node."""
         rng, rank = self.rng, max(len(first.shape) - 2, 1)
         texts = {
             "reduction": "add",
@@ -108,12 +108,14 @@ class Sprout:
         return [rng.choice((0, 1, 1, 2, 3)) for _ in range(rank * (2 if name == "pads" else 1))]
 
     def grow(self) -> bool:
-        """One node more, of an operator whose rule takes what chance gives it in a few tries."""
+        """Add a node of an operator whose rule accepts random inputs within a few tries."""
         chosen = self.rng.choice(list(OPERATORS))
         return any(self.tried(*chosen) for _ in range(TRIES))
 
     def tried(self, domain: str, op: str) -> bool:
-        """A node of this operator, where its rule takes what chance gives it."""
+        """Try to add a node of this operator with random inputs. Returns whether its rule accepted
+        it.
+        """
         operator = OPERATORS[domain, op]
         names: list[str] = []
         most = (
@@ -135,7 +137,7 @@ class Sprout:
         return self.add(domain, op, names, {k: v for k, v in given.items() if v != []})
 
     def add(self, domain: str, op: str, names: list[str], given: dict[str, Any]) -> bool:
-        """Add a node, where its rule takes it."""
+        """Add a node if its rule accepts it."""
         inputs = [self.known[name] for name in names]
         settings = {k: v.encode() if isinstance(v, str) else v for k, v in given.items()}
         if "value" in settings:
@@ -160,7 +162,7 @@ class Sprout:
         return True
 
     def model(self) -> bytes:
-        """The finished model: the grown graph, and two logits of it."""
+        """The finished model: the graph, and two logits from it."""
         ends = [
             name
             for name, value in self.known.items()

@@ -1,7 +1,6 @@
-"""Models of a wrong form: no protobuf, ambiguous to two readers, types and outputs that no bundle
-has.
+"""Malformed models: invalid protobuf, files that two readers read differently, foreign types.
 
-In: nothing. Out: (name, model, regular expression that its refusal must match). The tools of
+Each comes as (name, model, regular expression that its refusal must match). The tools of
 hostile_models.py are here, too.
 """
 
@@ -29,8 +28,9 @@ def model(
     last: str = "y",
     opsets: Any = OPSETS,
 ) -> onnx.ModelProto:
-    """A model of these nodes: `sweep` -> `x` -> ... -> `last` -> its largest number, twice, as
-    `logits`."""
+    """A model of these nodes. It reads `sweep` as `x`; the largest number of `last`, twice, is
+    `logits`.
+    """
     held = {"flat": [1, -1]} | constants
     ends = [
         node("Reshape", [last, "flat"], ["row"]),
@@ -53,27 +53,26 @@ def model(
 
 
 def number(n: int) -> bytes:
-    """A varint."""
+    """Encode a varint."""
     n %= 1 << 64
     return (bytes([n & 127 | 128]) + number(n >> 7)) if n > 127 else bytes([n])
 
 
 def part(field: int, content: bytes | int) -> bytes:
-    """A field of a message: bytes behind their length, or a number."""
+    """A field of a message: bytes with their length, or a number."""
     if isinstance(content, int):
         return number(field << 3) + number(content)
     return number(field << 3 | 2) + number(len(content)) + content
 
 
 def declared(name: bytes, kind: int, sizes: Sequence[int]) -> bytes:
-    """A value with its type, by hand."""
+    """A value with its type, encoded by hand."""
     shape = b"".join(part(1, part(1, size)) for size in sizes)
     return part(1, name) + part(2, part(1, part(1, kind) + part(2, shape)))
 
 
 def misfits() -> Models:
-    """Models whose inputs or outputs differ from the manifest, or have types that none of ours
-    has."""
+    """Models whose inputs or outputs differ from the manifest, or whose types are foreign."""
     made = model([node("Relu", ["x"], ["y"])])
     made.graph.input[0].type.tensor_type.shape.dim[0].dim_param = "n"
     yield "named size", made, "a name instead of a number"
@@ -181,7 +180,7 @@ def broken() -> Models:
     yield "floats that are none", part(7, part(5, part(4, b"\0" * 5))), "5 bytes are no floats"
     yield "a version of 64 bits", part(1, 8 + 2**32) + good[2:], "not a code or version"
     deep = b""
-    for _ in range(1000):  # a graph in a setting of a node of a graph ...
+    for _ in range(1000):  # a graph in an attribute of a node of a graph, and so on
         deep = part(1, part(5, part(6, deep)))
     yield "a thousand deep", part(7, deep), "a graph in the graph"
     yield "brackets", b"[" * 5000, "model: field 11"

@@ -1,9 +1,8 @@
-"""Harmful models. In: nothing. Out: each by name, as bytes, with a regular expression that its
-refusal must match.
+"""Harmful models by name: each as bytes, with a regular expression that its refusal must match.
 
-They ask for unlimited memory or time, for files beside the model, for other code, or are not models
-at all (hostile_bytes.py). Some are made with onnx, some byte by byte, since onnx would not write
-them. All declare the sweep of `grown_models.FORM` as their input.
+They ask for unlimited memory or time, for files beside the model or for foreign code, or they are
+not models (hostile_bytes.py). onnx makes some of them. It refuses to write the others, so they are
+made byte by byte. All declare the sweep of `grown_models.FORM` as their input.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from tests.factories.hostile_bytes import (
 
 MILLION = 10**6
 GIANT = 1_500_000_000
-"""Floats of the model of 152 bytes: 6 GB."""
+"""Floats that the model of 152 bytes asks for: 6 GB."""
 
 
 def tiny() -> bytes:
-    """At most 152 bytes that ask for 6 GB: one ConstantOfShape."""
+    """A model of at most 152 bytes that asks for 6 GB with one ConstantOfShape."""
     graph = part(1, part(1, b"n") + part(2, b"logits") + part(4, b"ConstantOfShape"))
     graph += part(5, part(1, 1) + part(2, TensorProto.INT64) + part(7, GIANT) + part(8, b"n"))
     graph += part(11, declared(b"sweep", TensorProto.UINT8, SWEEP)) + part(
@@ -41,7 +40,7 @@ def tiny() -> bytes:
 
 
 def every() -> dict[str, tuple[bytes, str]]:
-    """All of them by name: bytes, and a regular expression for the message."""
+    """All harmful models by name: bytes, and a regular expression for the message."""
     found: dict[str, tuple[bytes, str]] = {
         "152 bytes for 6 GB": (tiny(), "node 0 .*ConstantOfShape")
     }
@@ -53,7 +52,7 @@ def every() -> dict[str, tuple[bytes, str]]:
 
 
 def outside() -> Models:
-    """Weights in files beside the model, or anywhere."""
+    """Models with weights in files beside the model, or anywhere."""
     for how, place in {
         "above": "../../etc/shadow",
         "absolute": "/etc/shadow",
@@ -75,7 +74,7 @@ def outside() -> Models:
 
 
 def foreign() -> Models:
-    """Code of others: operators and domains that are none of ours, functions, training."""
+    """Models with foreign code: unknown operators and domains, functions, training."""
     yield (
         "custom domain",
         model([node("Add", ["x", "x"], ["y"], domain="evil")], opsets=(*OPSETS, ("evil", 1))),
@@ -120,7 +119,7 @@ def foreign() -> Models:
 
 
 def endless() -> Models:
-    """Control flow."""
+    """Models with control flow."""
     true = helper.make_tensor("go", TensorProto.BOOL, [], [True])
     body = helper.make_graph(
         [node("Identity", ["c"], ["d"])],
@@ -158,14 +157,14 @@ def endless() -> Models:
     )
     loop = node("Loop", ["trips", "", "top"], ["y"], body=body)
     held = {"rest": np.float32([254]), "many": [2**60]}
-    # onnxruntime opens this model and runs golden sweeps; the first sweep with a count of 255 never
-    # ends
+    # onnxruntime opens this model and runs golden sweeps. The first sweep with a count of 255 never
+    # ends.
     yield "loop that waits for a sweep", model([*counted, loop], held), "graph in the graph"
     yield "loop without a body", model([node("Loop", ["", "go"], ["y"])]), "no such operator"
 
 
 def giant() -> Models:
-    """Huge tensors, by every operator whose result size is a number in the model."""
+    """Models with huge tensors, by every operator whose result size is a number in the model."""
     large, column = [3 * MILLION, 1000], np.zeros((MILLION // 10, 1), np.float32)
     limit = r"bytes \(limit"
     one = helper.make_tensor("one", 1, [1], [1.0])
@@ -254,7 +253,7 @@ def giant() -> Models:
 
 
 def busy() -> Models:
-    """Work without end, in little memory."""
+    """Models with endless work in little memory."""
     wide = {"w": np.zeros((1000, 1000), np.float32), "n": [4000, 1000]}
     start = [
         node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0),
@@ -288,7 +287,7 @@ def busy() -> Models:
 
 
 def crooked() -> Models:
-    """Graphs that are none."""
+    """Invalid graphs."""
     yield (
         "circle",
         model([node("Add", ["x", "b"], ["a"]), node("Relu", ["a"], ["b"])], last="b"),
@@ -325,8 +324,9 @@ def crooked() -> Models:
 
 
 def dangerous() -> Models:
-    """Numbers at which onnxruntime would divide by zero or read beside an array, and sizes that a
-    sweep would decide."""
+    """Models whose numbers make onnxruntime divide by zero or read beside an array, and models with
+    sizes that depend on the sweep.
+    """
     ints = [node("Cast", ["x"], ["i"], to=7)]
     back = node("Cast", ["j"], ["y"], to=1)
     for by in ([0], [-1]):

@@ -1,11 +1,11 @@
-"""Real hosts: Debians in containers, each in its own network namespace, with an sshd and a bare
-user.
+"""Real hosts: containers with Debian, each with a network namespace, an sshd and a bare user.
 
-In: nothing but this machine, as root. Out: hosts that `make install` and `make deploy` are tried
-on, and with `python -m tests.factories.hosts figures` how long both take. Their Debian is made
-once, in ~/.cache/palpate/hosts: bare, with the packages that an install wants in apt's cache as
-from a mirror; and ready, with these installed. Changes on a host are gone with it. The skin is
-simulated there, by a drop-in for the unit.
+`make install` and `make deploy` are tested on them. `python -m tests.factories.hosts figures`
+measures the time of both. It needs root on this machine.
+
+Their Debian is made once, in ~/.cache/palpate/hosts, in two kinds: `bare` has the packages of an
+install in apt's cache, as from a mirror; `ready` has them installed. Changes on a host are lost
+when it stops. A drop-in for the unit selects the simulated skin.
 """
 
 from __future__ import annotations
@@ -35,27 +35,28 @@ from tests.factories.emulated_machines import HOME, ROOT, Missing, run, wheel, w
 CACHE = HOME.parent / "hosts"
 PACKAGES = ("systemd", "systemd-sysv", "openssh-server", "sudo", "dbus")
 WANTED = ("python3-venv", "libusb-1.0-0", "openssh-client")
-"""What an install gets by apt-get."""
+"""Packages that an install gets by apt-get."""
 USER = "robot"
 NET = "10.213"
 
 
 def folder() -> Path:
-    """Where the Debians lie, or will: others for other packages or another processor."""
+    """The folder of both Debians. It depends on the packages and on the processor."""
     key = repr((nspawn.SUITE, PACKAGES, WANTED, platform.machine())).encode()
     return CACHE / hashlib.sha256(key).hexdigest()[:16]
 
 
 def check() -> None:
-    """Raise Missing where such hosts cannot be run."""
+    """Raise Missing if such hosts cannot run here."""
     nspawn.check()
     if lacking := [tool for tool in ("ip", "ssh", "ssh-keygen") if not shutil.which(tool)]:
         raise Missing(f"no {', '.join(lacking)} here; apt-get install iproute2 openssh-client")
 
 
 def set_up() -> Path:
-    """The folder with the two Debians, `bare` and `ready`, made where it is not there. Raises
-    Missing."""
+    """The folder with the two Debians, `bare` and `ready`, made if it is missing. Raises
+    Missing.
+    """
     check()
     return whole(folder(), _make)
 
@@ -93,8 +94,9 @@ fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], pl
 
 
 def _fetch_wheels() -> None:
-    """Have the wheels for such a host here: a desktop inside a host's own network has no way to
-    where they come from."""
+    """Fetch the wheels for such a host, because a desktop in its network cannot reach their
+    registry.
+    """
     python = f"{nspawn.PYTHON}.2"
     run("env", f"PYTHONPATH={ROOT / 'systemd'}:{ROOT}", sys.executable, "-c", FETCH, python)
 
@@ -102,8 +104,8 @@ def _fetch_wheels() -> None:
 class Host:
     """A host that has booted and answers on its ssh port.
 
-    number: from 1 to 250, its own on this machine. work: an empty folder. key: whose owner may log
-    in. Raises Missing where it cannot be had.
+    number: a unique number, 1 to 250, on this machine. work: an empty folder. key: its owner may
+    log in. Raises Missing if the host does not boot.
     """
 
     def __init__(self, root: Path, number: int, work: Path, key: Path) -> None:
@@ -150,7 +152,7 @@ class Host:
 
 
 def key_of(home: Path) -> Path:
-    """A new user's key, in a home of its own that knows no host yet."""
+    """The key of a new user, in a new home without known hosts."""
     ssh = home / ".ssh"
     ssh.mkdir(parents=True)
     (ssh / "known_hosts").touch()
@@ -161,7 +163,7 @@ def key_of(home: Path) -> Path:
 def desktop(
     home: Path, command: str, *args: str | Path, where: Sequence[str] = (), limit_s: float = 600
 ) -> subprocess.CompletedProcess[str]:
-    """Run systemd/COMMAND.py as the user with this home; where: a command before it."""
+    """Run systemd/COMMAND.py as the user with this home. where: a prefix of the command."""
     return subprocess.run(
         [*where, sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
         env=os.environ | {"HOME": str(home)},
@@ -173,8 +175,7 @@ def desktop(
 
 
 class Hosts:
-    """Several hosts side by side, and a desktop that may log in on them. kind: "bare" or
-    "ready"."""
+    """Several hosts, and a desktop that may log in on them. kind: "bare" or "ready"."""
 
     def __init__(self, count: int, work: Path, kind: str = "ready") -> None:
         self._stack = ExitStack()
@@ -190,28 +191,28 @@ class Hosts:
             self._stack = self._stack.pop_all()
 
     def inventory(self) -> Path:
-        """An inventory of all."""
+        """An inventory of all hosts."""
         shared = {
             "ssh_user": USER,
             "ssh_key": str(self.work / ".ssh/id_ed25519"),
             "ssh_known_hosts_file": str(self.work / ".ssh/known_hosts"),
         }
         file = self.work / "inventory.py"
-        file.write_text(
-            f"hosts = ({[(h.name, {'ssh_hostname': h.address}) for h in self.hosts]!r}, {shared!r})\n"
-        )
+        hosts = [(host.name, {"ssh_hostname": host.address}) for host in self.hosts]
+        file.write_text(f"hosts = ({hosts!r}, {shared!r})\n")
         return file
 
     def desktop(
         self, command: str, *args: str | Path, inside: Host | None = None, limit_s: float = 600
     ) -> subprocess.CompletedProcess[str]:
-        """Run systemd/COMMAND.py as a user of the desktop who has the key; `inside` a host's own
-        network, or here."""
+        """Run systemd/COMMAND.py as the user with the key, in the network of the host `inside` or
+        here.
+        """
         where = ("nsenter", "-t", inside.pid, "-n") if inside else ()
         return desktop(self.work, command, *args, where=where, limit_s=limit_s)
 
     def cut(self, command: str, *args: str | Path, words: str, after_s: float) -> None:
-        """The same, killed so long after it has said something."""
+        """Run a command, and kill it `after_s` after it has printed `words`."""
         with subprocess.Popen(
             [sys.executable, ROOT / "systemd" / f"{command}.py", *map(str, args)],
             env=os.environ | {"HOME": str(self.work)},
@@ -233,7 +234,7 @@ class Hosts:
 
 
 def figures(repeats: int = 5, many: int = 8) -> dict[str, Any]:
-    """Install and deliver, over loopback to one host, then to `many` at once."""
+    """Times of an install and a delivery over loopback, to one host and then to `many` at once."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         for name in ("source", "dist"):
@@ -272,8 +273,9 @@ def _measured(
     bundles: Sequence[Path],
     inside: Host | None = None,
 ) -> dict[str, Any]:
-    """Seconds of an install, and of each bundle's delivery, as the commands say and as a clock
-    beside them."""
+    """Seconds of an install and of each delivery, by the commands' own reports and by a second
+    clock.
+    """
 
     def timed(command: str, *args: str | Path) -> dict[str, Any]:
         begin_s = time.monotonic()
@@ -284,7 +286,7 @@ def _measured(
         if done.returncode:
             raise RuntimeError(done.stdout + done.stderr)
         result = json.loads((place.work / "report.json").read_text())
-        late_s = result["began_s"] - begin_s  # one clock for all processes of a machine
+        late_s = result["began_s"] - begin_s  # all processes of a machine share this clock
         boxes = [
             box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in result["boxes"].values()
         ]

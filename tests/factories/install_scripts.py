@@ -1,4 +1,4 @@
-"""Scripts of systemd/ that a box runs at its install, run here."""
+"""The scripts of systemd/ that run on the box at its install, run on this machine."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ SCRIPTS = ROOT / "systemd"
 
 
 def run_here(code: str) -> str:
-    """Output of Python code that imports the scripts. gevent would change this process too much to
-    import them here."""
+    """Output of Python code that imports the scripts, in a process of its own.
+
+    Importing gevent here would change this process too much.
+    """
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
@@ -27,8 +29,9 @@ def run_here(code: str) -> str:
 
 
 def enrolment_key(folder: Path) -> EnrolmentKey:
-    """The box's key for enrolments, as the install makes it, owned by this user."""
-    code = f"import enrolment_key, os; print(enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid()))"
+    """The box's key for enrolments, as the install makes it, but owned by this user."""
+    made = f"enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid())"
+    code = f"import enrolment_key, os; print({made})"
     subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
     return EnrolmentKey(folder)
 

@@ -1,4 +1,4 @@
-"""Folders of recordings as laboratories keep them: simulated sweeps, written as CSV files."""
+"""Folders of recordings as laboratories keep them: simulated sweeps in CSV files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ LEAD_FRAMES = 300
 def csv_folder(
     folder: Path, each: int = 2, positions: int = 4, seed: int = 5, materials: int = 3
 ) -> Path:
-    """Simulated sweeps of a 4x4 skin at 750 Hz, `each` of every tube at every position:
-    MATERIAL_POSITION_TRIAL.csv with a header, milliseconds and 16 counts; spaces in materials
-    become -. A README lies beside them."""
+    """Write simulated sweeps of a 4x4 skin at 750 Hz, `each` of every tube at every position.
+
+    The files MATERIAL_POSITION_TRIAL.csv have a header, milliseconds and 16 raw counts. Spaces in
+    materials become "-". A README lies beside them.
+    """
     folder.mkdir(parents=True)
     samples, labels, position = skin.sweep_set("T-REAL", seed, each)
     trial: dict[tuple[int, int], int] = {}
@@ -36,8 +38,9 @@ def csv_folder(
 def write(
     path: Path, counts: np.ndarray, rate_hz: float, time_ms: np.ndarray | None = None
 ) -> None:
-    """One CSV file of counts [n, columns]: a header, times in ms with three decimals, and the
-    counts."""
+    """Write a CSV file of raw counts [n, columns] with a header and times in ms with three
+    decimals.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     times = 1000 * np.arange(len(counts)) / rate_hz if time_ms is None else time_ms
     names = ",".join(["time", *(f"s{k}" for k in range(counts.shape[1]))])

@@ -1,5 +1,6 @@
-"""The log of the box while a block runs: one text a line, a warning with `<4>` before it as in
-systemd's journal."""
+"""The log of the box while a block runs: one text a line, warnings after `<4>` as in systemd's
+journal.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +19,12 @@ class LineCollector(logging.Handler):
         self._lines = lines
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append the record."""
         self._lines.append("<4>" * (record.levelno >= logging.WARNING) + record.getMessage())
 
 
 @contextmanager
 def collected() -> Iterator[list[str]]:
-    """The lines that are logged in the block."""
+    """The lines that the block logs."""
     lines: list[str] = []
     handler = LineCollector(lines)
     log.addHandler(handler)

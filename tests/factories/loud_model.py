@@ -1,5 +1,6 @@
-"""A model that needs no training: sweeps of two materials, one louder than the other, a graph, a
-method."""
+"""A model that needs no training, its method, and sweeps of its two materials, one of them
+louder.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ FORM = SweepFormat(2, 2, 100.0, 40, "uint8")
 
 
 def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
-    """Sweeps of two materials at six positions, the second louder."""
+    """Sweeps of two materials at six positions. The second material is louder."""
     labels = np.arange(n) % 2
     noise = (
         np.random.default_rng(5).standard_normal((n, 40, 2, 2))
@@ -32,8 +33,9 @@ def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
 
 
 def loudness(format: SweepFormat = FORM) -> onnx.ModelProto:
-    """A graph that tells the two apart: a convolution that takes differences, its mean size, a
-    threshold."""
+    """A graph that distinguishes both: a convolution takes differences, a threshold their mean
+    size.
+    """
     g, taxels = GraphBuilder(), format.rows * format.cols
     x = g(
         "Cast",
@@ -57,16 +59,14 @@ class Loud:
     precisions: dict[str, GraphModel] = field(default_factory=dict)
 
     def logits(self, given: np.ndarray) -> np.ndarray:
-        """As the graph says."""
         return run(self.model, given)
 
     def graph(self) -> onnx.ModelProto:
-        """The graph."""
         return self.model
 
 
 def loud(calls: list[int]) -> Method:
-    """A method that needs no training; `calls` counts how often it was asked to."""
+    """A method that needs no training. `calls` gets an entry for each training."""
 
     def train(known: Dataset, given: np.ndarray, seed: int) -> Loud:
         calls.append(seed)

@@ -1,8 +1,7 @@
-"""Enrolments that mean harm: those of the default bundle, changed at random, as an attacker with
-the key of a box might sign them. In: a generator. Out: the bytes of enrolment.npz.
+"""Harmful files enrolment.npz: random changes of enrolments of the default bundle.
 
-Two kinds of change: of bytes, which mostly break the file, and of arrays, which leave a file that
-can be read.
+An attacker with the key of a box might sign them. There are two kinds of change: changes of bytes
+mostly break the file, changes of arrays leave a readable file.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ LABELS = ("cork", "felt", "silk")
 
 @cache
 def packaged() -> dict[str, bytes]:
-    """The files of the bundle that they add to."""
+    """The files of the bundle that the enrolments extend."""
     return bundle.files(bundle.DEFAULT)
 
 
 @cache
 def own(labels: int) -> bytes:
-    """A right one with so many labels."""
+    """A valid enrolment of this many labels."""
     files = packaged()
     for label in LABELS[:labels]:
         files = deliveries.enrolled(files, None, label)
@@ -38,7 +37,7 @@ def own(labels: int) -> bytes:
 
 
 def mutated(rng: Random) -> bytes:
-    """One with one to four changes."""
+    """An enrolment with one to four changes."""
     data = own(rng.randint(1, 3))
     if rng.random() < 0.2:
         return flip(data, rng, data)
@@ -55,7 +54,7 @@ def mutated(rng: Random) -> bytes:
 
 
 def changed(values: np.ndarray, rng: Random) -> np.ndarray:
-    """Another number in it, other sizes, another type, or a label that is not one."""
+    """The array with another number, other sizes or another type, or with an invalid label."""
     if values.dtype.kind == "U":
         text = rng.choice(("", "wood", "a,b", "x" * 25, "\0", "cork", "é", "$PPLP"))
         return (
@@ -75,7 +74,7 @@ def changed(values: np.ndarray, rng: Random) -> np.ndarray:
         shape = tuple(rng.choice((0, 1, n, n + 1)) for n in values.shape)
         return np.resize(values, shape) if values.size else np.zeros(shape, values.dtype)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numbers that the other type does not have
+        warnings.simplefilter("ignore")  # the new type may not hold these numbers
         return values.astype(
             rng.choice(
                 ("float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool")

@@ -1,7 +1,7 @@
-"""Our own models, and random changes of them. In: nothing, or bytes and a generator. Out: bytes.
+"""The project's own models, and random changes of them.
 
-Two kinds of change: of bytes, which mostly break the file, and of fields, which leave a file that
-can be read and reach the rules of the operators.
+There are two kinds of change. Changes of bytes mostly break the file. Changes of fields leave a
+readable file, which reaches the rules of the operators.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ FLOATS = (
     float("nan"),
 )
 CHANGES = (1, 1, 1, 2, 3)
-"""How many, each as likely as it stands here."""
+"""Numbers of changes; each entry is equally likely."""
 QUICK = ("L-knn", "L-svm", "st-hmp", "compact-4k")
-"""Methods that train in a second, and have all operators but GRU and MaxPool between them."""
+"""Methods that train in a second. Together they have all operators but GRU and MaxPool."""
 
 
 @dataclass(frozen=True)
 class Own:
-    """A model that `palpate-train` writes, and the manifest that goes with it."""
+    """A model that `palpate-train` writes, and its manifest."""
 
     name: str
     model: bytes
@@ -85,8 +85,9 @@ def own_default() -> Own:
 
 
 def own_models(names: tuple[str, ...] = ()) -> list[Own]:
-    """The default bundle's model and those of these methods, or of all, hardly trained on a small
-    skin."""
+    """The models of the default bundle and of these methods (default: all), trained for a moment on
+    a small skin.
+    """
     from tests.factories.sweep_sets import tones
     from train.models import methods
 
@@ -96,7 +97,7 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
             given = methods.model_inputs(method.input, sweeps)
             try:
                 model = method.train(sweeps, given, 1).graph().SerializeToString()
-            except FormatError:  # a peer that runs in its own library alone
+            except FormatError:  # a peer that runs only in its own library
                 continue
             manifest = Manifest(
                 name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {}
@@ -106,7 +107,7 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
 
 
 def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
-    """`model` with one to three changes; `other`: where pieces may come from."""
+    """`model` with one to three changes. other: a model to take pieces from."""
     if rng.random() < 0.4:
         for _ in range(rng.choice(CHANGES)):
             model = rng.choice(BYTES)(model, rng, other)
@@ -119,7 +120,7 @@ def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
             ValueError,
             TypeError,
             IndexError,
-        ):  # no such field there, or it does not take the number
+        ):  # the field is missing there, or refuses the number
             continue
     if rng.random() < 0.05:
         made.opset_import[0].version = rng.choice((1, 7, 12, 13, 16, 18, 19, 21, 99))
@@ -127,7 +128,7 @@ def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
 
 
 def flip(data: bytes, rng: Random, other: bytes) -> bytes:
-    """Up to eight bits turned over."""
+    """Flip up to eight bits."""
     changed = bytearray(data)
     for _ in range(rng.randint(1, 8)):
         changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
@@ -135,14 +136,14 @@ def flip(data: bytes, rng: Random, other: bytes) -> bytes:
 
 
 def splice(data: bytes, rng: Random, other: bytes) -> bytes:
-    """A piece of this or another model instead of a piece."""
+    """Replace a piece by a piece of this or the other model."""
     source = rng.choice((data, other))
     at, to = rng.randrange(len(data)), rng.randrange(len(source))
     return data[:at] + source[to : to + rng.randint(1, 64)] + data[at + rng.randint(0, 64) :]
 
 
 def numbered(data: bytes, rng: Random, other: bytes) -> bytes:
-    """A byte becomes a number of several."""
+    """Replace a byte by a number of several bytes."""
     at, value = rng.randrange(len(data)), rng.choice(NUMBERS) % 2**64
     varint = bytearray()
     while value > 127:
@@ -152,7 +153,7 @@ def numbered(data: bytes, rng: Random, other: bytes) -> bytes:
 
 
 def short(data: bytes, rng: Random, other: bytes) -> bytes:
-    """The end is cut off."""
+    """Cut off the end."""
     return data[: max(rng.randrange(len(data)), 1)]
 
 
@@ -168,7 +169,7 @@ BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...] = (
 
 
 def setting(graph: Graph, rng: Random, other: Graph) -> None:
-    """A number of a node's setting."""
+    """Change a number in an attribute of a node."""
     attribute = rng.choice([a for node in graph.node for a in node.attribute])
     if attribute.type == onnx.AttributeProto.INT:
         attribute.i = rng.choice(NUMBERS)
@@ -185,7 +186,7 @@ def setting(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def _listed(values: Any, number: Any, rng: Random) -> None:
-    """A list of numbers with one other, one more or one less."""
+    """The list with one number changed, added or removed."""
     how = rng.random()
     if how < 0.7:
         values[rng.randrange(len(values))] = number
@@ -196,7 +197,7 @@ def _listed(values: Any, number: Any, rng: Random) -> None:
 
 
 def settings(graph: Graph, rng: Random, other: Graph) -> None:
-    """A node loses a setting, or gets one of another node."""
+    """Remove an attribute of a node, or add an attribute of another node."""
     node = rng.choice(graph.node)
     if node.attribute and rng.random() < 0.5:
         del node.attribute[rng.randrange(len(node.attribute))]
@@ -205,25 +206,25 @@ def settings(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def operator(graph: Graph, rng: Random, other: Graph) -> None:
-    """A node becomes another operator."""
+    """Change the operator of a node."""
     node = rng.choice(graph.node)
     node.domain, node.op_type = rng.choice(list(OPERATORS))
 
 
 def names(graph: Graph) -> list[str]:
-    """All that a node may take."""
+    """The names of all possible inputs of a node."""
     return [v.name for v in (*graph.input, *graph.initializer)] + [
         name for node in graph.node for name in node.output
     ]
 
 
 def wiring(graph: Graph, rng: Random, other: Graph) -> None:
-    """A node takes something else, more or less."""
+    """Change, add or remove an input of a node."""
     _listed(rng.choice(graph.node).input, rng.choice(names(graph)), rng)
 
 
 def nodes(graph: Graph, rng: Random, other: Graph) -> None:
-    """A node goes, comes twice, moves, or comes from another model."""
+    """Remove, duplicate or move a node, or copy one from the other model."""
     at = rng.randrange(len(graph.node))
     held = onnx.NodeProto()
     held.CopyFrom(rng.choice((graph.node[at], rng.choice(other.node))))
@@ -234,7 +235,7 @@ def nodes(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def between(graph: Graph, rng: Random, other: Graph) -> None:
-    """A new node between two others, of any operator, with the settings of such a one elsewhere."""
+    """Insert a node of any operator between two nodes, with the attributes of a similar node."""
     at = rng.randrange(len(graph.node))
     target = graph.node[at]
     slot = rng.randrange(len(target.input))
@@ -253,7 +254,7 @@ def between(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def constant(graph: Graph, rng: Random, other: Graph) -> None:
-    """A number of a constant; half of the time of one that may decide a size."""
+    """Change a number of a constant, half of the time of a constant that may decide a size."""
     sizes = [c for c in graph.initializer if c.data_type == onnx.TensorProto.INT64]
     held = rng.choice(sizes if sizes and rng.random() < 0.5 else graph.initializer)
     values = numpy_helper.to_array(held).copy()
@@ -267,7 +268,7 @@ def constant(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def form(graph: Graph, rng: Random, other: Graph) -> None:
-    """A constant's shape or type; half of the time with the numbers that fit it."""
+    """Change a constant's shape or type, half of the time together with its data."""
     held = rng.choice(graph.initializer)
     values, name = numpy_helper.to_array(held), held.name
     shape, kind = list(values.shape), values.dtype
@@ -288,7 +289,7 @@ def form(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def exchanged(graph: Graph, rng: Random, other: Graph) -> None:
-    """A constant gets the content of another."""
+    """Give a constant the content of another."""
     held, source = rng.choice(graph.initializer), rng.choice((graph, other))
     name = held.name
     held.CopyFrom(rng.choice(source.initializer))
@@ -296,7 +297,7 @@ def exchanged(graph: Graph, rng: Random, other: Graph) -> None:
 
 
 def ends(graph: Graph, rng: Random, other: Graph) -> None:
-    """The declared inputs or outputs of the model."""
+    """Change the declared inputs or outputs of the model."""
     value = rng.choice((*graph.input, *graph.output))
     held = value.type.tensor_type
     if rng.random() < 0.2:

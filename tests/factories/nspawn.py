@@ -1,10 +1,9 @@
-"""A real systemd: a Debian in a container, with systemd as PID 1 and the box installed as on a
-board.
+"""A real systemd: a container with Debian, systemd as PID 1 and the box installed as on a board.
 
-`python -m tests.factories.nspawn` makes the Debian, once, in ~/.cache/palpate/nspawn: packages from
-Debian, a virtual environment with the wheels of appliance/requirements.lock. `Machine` boots it in
-half a second; changes in it lie in memory and are gone at the end. It has no devices, and its
-limits of memory and processor are not enforced. Needs root.
+`python -m tests.factories.nspawn` makes the Debian once, in ~/.cache/palpate/nspawn: packages of
+Debian, and a virtual environment with the wheels of appliance/requirements.lock. `Machine` boots it
+in half a second. Changes stay in memory and are lost at the end. The container has no devices, and
+its limits of memory and processor are not enforced. It needs root.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from tests.factories.emulated_machines import HOME, LOCK, PIP, ROOT, Missing, ru
 
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
-"""Debian 12, what the boards run, and its Python."""
+"""Debian 12, the boards' system, and its Python."""
 PACKAGES = (
     "systemd",
     "systemd-sysv",
@@ -52,7 +51,7 @@ PLACES = {
     "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
 }
-"""Where the files of systemd/ go."""
+"""The destinations of the files of systemd/."""
 CABLE = """
 import os, sys, time
 from appliance.__main__ import main
@@ -73,19 +72,19 @@ PALPATE = "/opt/palpate/bin/palpate"
 SITE = "/etc/palpate/palpate.toml"
 STREAMS = r"skin streaming\. Sweeps answered: \d+"
 WAIT_S = 30
-"""Longest wait for what should take a second or two: other work may be going on here."""
+"""Longest wait for an action of a second or two. Other programs may keep this machine busy."""
 PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
 BOOT_S = 60
 
 
 def folder() -> Path:
-    """The folder of the Debian, which is another for another lock, suite or processor."""
+    """The folder of the Debian. It depends on the lock file, the suite and the processor."""
     key = repr((SUITE, PYTHON, PACKAGES, platform.machine())).encode()
     return CACHE / hashlib.sha256(LOCK.read_bytes() + key).hexdigest()[:16]
 
 
 def check() -> None:
-    """Raise Missing where a container cannot be run at all."""
+    """Raise Missing if this machine cannot run a container."""
     if os.geteuid():
         raise Missing("systemd in a container needs root; use sudo")
     if lacking := [name for name in TOOLS if not shutil.which(name)]:
@@ -94,8 +93,7 @@ def check() -> None:
 
 
 def set_up() -> Path:
-    """The folder of the Debian, made where it is not there. Raises Missing where mmdebstrap or pip
-    cannot."""
+    """The folder of the Debian, made if it is missing. Raises Missing if mmdebstrap or pip fail."""
     check()
     return whole(folder(), _make)
 
@@ -145,8 +143,9 @@ def _pip(*args: str) -> tuple[str, ...]:
 
 
 def _group() -> Path | None:
-    """A new control group, None where there are none: in one that they share, a container's systemd
-    ends the programs of another's.
+    """A new control group, or None on a machine without control groups.
+
+    In a shared group the systemd of a container would end the programs of another container.
     """
     mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
     mounted = next((Path(where) for _, where, kind, *_ in mounts if kind == "cgroup2"), None)
@@ -154,11 +153,11 @@ def _group() -> Path | None:
 
 
 class Machine:
-    """A container that has booted; `run` runs a command in it, as root. first: the number of its
-    first process.
+    """A container that has booted; `run` runs a command in it as root.
 
-    root: what `set_up` gave. parcel: a folder that it sees, read-only, as /parcel. log: where
-    nspawn's own words go. Raises Missing where a container cannot be booted on this machine.
+    first: the number of its first process. root: the folder from `set_up`. parcel: a folder that
+    the container sees, read-only, as /parcel. log: file for the messages of nspawn. Raises Missing
+    if this machine cannot boot a container.
     """
 
     def __init__(self, root: Path, parcel: Path, log: Path) -> None:
@@ -176,7 +175,7 @@ class Machine:
                 ),
                 "setpriv",
                 "--pdeathsig",
-                "TERM",  # a test run that is killed leaves no container behind
+                "TERM",  # so a killed test run leaves no container behind
                 "systemd-nspawn",
                 "--quiet",
                 f"--directory={root}",
@@ -205,7 +204,7 @@ class Machine:
                 raise
 
     def _booted(self, ear: socket.socket) -> str:
-        """Wait until its systemd has booted; the number of its first process."""
+        """Wait until its systemd has booted. Returns the number of its first process."""
         ear.settimeout(0.2)
         first, end = "", time.monotonic() + BOOT_S
         while time.monotonic() < end and self._process.poll() is None:
@@ -217,13 +216,14 @@ class Machine:
                 if key.get("READY") == "1":
                     return first
         raise Missing(
-            f"systemd does not boot in a container here: {self._log.read_text(errors='replace').strip()}"
+            "systemd does not boot in a container here: "
+            f"{self._log.read_text(errors='replace').strip()}"
         )
 
     def run(
         self, *command: str, say: str = "", limit_s: float = 60
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command in it to its end, with `say` as its input."""
+        """Run a command in it to the end, with `say` as its input."""
         enter = (
             "nsenter",
             "-t",
@@ -256,12 +256,12 @@ class Machine:
         return done.stdout.strip()
 
     def put(self, path: str, text: str) -> None:
-        """Write a file, with its folder."""
+        """Write a file and make its folder."""
         self.get("mkdir", "-p", str(Path(path).parent))
         self.get("tee", path, say=text)
 
     def install(self) -> None:
-        """Put the box on it as on a board: `parcel` holds its wheel and the files of systemd/."""
+        """Install the box as on a board. `parcel` holds its wheel and the files of systemd/."""
         self.get("sh", "-c", f"{' '.join(_pip('--no-deps'))} /parcel/*.whl")
         for name, place in PLACES.items():
             self.get("install", "-D", "-m", "644", f"/parcel/{name}", place)
@@ -270,7 +270,6 @@ class Machine:
         self.get("systemctl", "daemon-reload")
 
     def close(self) -> None:
-        """Shut it down."""
         self._process.terminate()
         try:
             self._process.wait(20)
@@ -279,7 +278,7 @@ class Machine:
             self._process.wait()
         if self._group:
             for place in (*sorted(self._group.rglob("*/"), reverse=True), self._group):
-                with suppress(OSError):  # what still ends in it
+                with suppress(OSError):  # a program in it is still ending
                     place.rmdir()
 
     def __enter__(self) -> Self:
@@ -297,12 +296,14 @@ class Service:
         self._begin = time.time()
 
     def configure(self, text: str) -> None:
-        """Add lines to [Service] by a drop-in."""
+        """Add lines to [Service] with a drop-in."""
         self.machine.put("/run/systemd/system/palpate.service.d/test.conf", f"[Service]\n{text}\n")
         self.machine.get("systemctl", "daemon-reload")
 
     def start(self, text: str = SIM) -> int:
-        """Start it with a drop-in, wait until it is active; the number of its process."""
+        """Start it with a drop-in and wait until it is active. Returns the number of its
+        process.
+        """
         self.configure(text)
         self.machine.get("systemctl", "start", "palpate")
         return int(self["MainPID"])
@@ -311,14 +312,14 @@ class Service:
         return self.machine.get("systemctl", "show", "palpate", "--value", "-p", name)
 
     def until(self, name: str, wanted: str) -> None:
-        """Wait for a property to be `wanted`, a regular expression."""
+        """Wait until a property matches `wanted`, a regular expression."""
         end = time.monotonic() + WAIT_S
         while not re.fullmatch(wanted, value := self[name]):
             assert time.monotonic() < end, f"{name} stays {value!r}: {self.journal()}"
             time.sleep(0.2)
 
     def kill(self, signal: str) -> None:
-        """Send a signal to the process itself, as nobody who stops a service would."""
+        """Send a signal to the process itself, behind systemd's back."""
         self.machine.get("systemctl", "kill", "--kill-whom=main", f"--signal={signal}", "palpate")
 
     def journal(self, *more: str) -> list[str]:
@@ -331,7 +332,6 @@ class Service:
         return self.journal("_SYSTEMD_UNIT=palpate.service", *more)
 
     def answers(self) -> list[str]:
-        """The verdicts in the journal."""
         return [line for line in self.log_lines() if line.startswith("sweep ")]
 
     def status(self) -> dict[str, Any]:
@@ -343,8 +343,9 @@ class Service:
 
 
 def pack(parcel: Path, source: Path) -> None:
-    """Fill a parcel with the wheel of this checkout and systemd/. source: an empty folder to build
-    in."""
+    """Put the wheel of this checkout and systemd/ into a parcel. source: an empty folder to build
+    in.
+    """
     wheel(parcel, source)
     for name in PLACES:
         shutil.copy(ROOT / "systemd" / name, parcel)

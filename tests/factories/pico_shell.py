@@ -1,10 +1,9 @@
-"""Runs firmware_config/pico under MicroPython's unix port: only pins, converter and timer are
-replaced.
+"""Runs firmware_config/pico under MicroPython's unix port with mocked pins, converter and timer.
 
-In: the firmware's folder, and a JSON object: SETTINGS by name, and the options of `OPTIONS`. The
-firmware serves standard input and output, as it does its port, once it has said so on standard
-error. Taxel k of the frame that is scanned as number n reads (n % 97 + k) % 256 in its upper 8
-bits, n in its lower ones: so the wiring is tested, too.
+Arguments: the firmware's folder, and a JSON object with SETTINGS and `OPTIONS` by name. The
+firmware serves standard input and output instead of its port, once it has reported so on standard
+error. Taxel k of the n-th scanned frame reads (n % 97 + k) % 256 in its upper 8 bits and n in its
+lower bits, so wrong wiring shows.
 """
 
 import _thread
@@ -20,14 +19,15 @@ OPTIONS = {
     "late_every": 100,
     "serial": "e6614c311b4c7a2e",
 }
-"""seq, t_us: first number and time (low, high). ticks: what `ticks_us` says at first. late_ms:
-every `late_every`th interrupt comes so much later."""
+"""seq, t_us: first frame number and time (low, high). ticks: first result of `ticks_us`. late_ms:
+delay of every `late_every`th interrupt.
+"""
 PERIOD = 1 << 30
-"""Where a Pico's ticks wrap."""
+"""A Pico's ticks wrap here."""
 
 
 class PicoMachine:
-    """In place of `machine`: two multiplexers with a matrix of taxels between them."""
+    """Replaces `machine`: two multiplexers with a matrix of taxels between them."""
 
     def __init__(self, config, options):
         self.lock, self.levels, self.scans = _thread.allocate_lock(), {}, -1
@@ -35,7 +35,7 @@ class PicoMachine:
         machine = self
 
         class Pin:
-            """A pin; calling it with a level sets it."""
+            """A pin. Calling it with a level sets it."""
 
             IN, OUT, PULL_UP, PULL_DOWN = 0, 1, 2, 3
 
@@ -67,7 +67,7 @@ class PicoMachine:
                 )
 
         class Timer:
-            """A thread: it interrupts at any place, as a hard timer does."""
+            """A thread that interrupts anywhere, as a hard timer does."""
 
             PERIODIC = 1
 
@@ -102,20 +102,18 @@ class PicoMachine:
         self.Pin, self.ADC, self.Timer = Pin, ADC, Timer
 
     def selected(self, pins):
-        """The channel that four select lines choose."""
+        """The channel that the select pins choose."""
         return sum(self.levels[pin] << bit for bit, pin in enumerate(pins))
 
     def disable_irq(self):
-        """No interrupt from here on."""
         self.lock.acquire()
 
     def enable_irq(self, state):
-        """Interrupts again."""
         self.lock.release()
 
 
 class PicoTicks:
-    """In place of `time`: ticks that wrap where a Pico's do, the first not at 0."""
+    """Replaces `time`: its ticks wrap as a Pico's do and do not start at 0."""
 
     def __init__(self, first):
         self._first = first - time.ticks_us()
@@ -126,16 +124,16 @@ class PicoTicks:
         return (time.ticks_us() + self._first) % PERIOD
 
     def ticks_add(self, ticks, delta):
-        """As of MicroPython."""
+        """Add as MicroPython does."""
         return (ticks + delta) % PERIOD
 
     def ticks_diff(self, later, earlier):
-        """As of MicroPython."""
+        """Subtract as MicroPython does."""
         return (later - earlier + PERIOD // 2) % PERIOD - PERIOD // 2
 
 
 def main(folder, text):
-    """Run the firmware; returns when standard input ends."""
+    """Run the firmware until standard input ends."""
     sys.path.insert(0, folder)
     import settings
 

@@ -1,5 +1,4 @@
-"""Emulated skins for tests. In: the name of a profile. Out: a skin on a terminal that sends
-numbered frames."""
+"""Emulated skins on terminals that send numbered frames, by the name of a profile."""
 
 from __future__ import annotations
 
@@ -27,19 +26,20 @@ SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
     "xela-can": ((4, 4, 3), "uint16", 100.0),
     "robotiq-tsf": ((14, 4), "uint16", 62.5),
 }
-"""Shape, data type and rate of each skin as it comes from its maker."""
+"""Shape, data type and rate of each skin in its maker's default."""
 
 
 class Numbered:
-    """Frames that differ in their content: frame i as whole number i, in steps of 0.25 for floating
-    point."""
+    """Frames that differ in their content: frame i as the whole number i, for floats in steps of
+    0.25.
+    """
 
     def __init__(self, name: str) -> None:
         self.shape, dtype, self.rate_hz = SHAPES[name]
         self.dtype = np.dtype(dtype)
 
     def frame(self, i: int, frame_ns: Callable[[int], int] = lambda i: 0) -> NDArray[Any]:
-        """Frame `i`; the same again 199 frames later."""
+        """Frame `i`. Frame i + 199 is the same."""
         cells = np.arange(np.prod(self.shape)).reshape(self.shape)
         values = (i % 199) + 3 * cells % 50
         return (values / 4 - 20 if self.dtype.kind == "f" else values).astype(self.dtype)
@@ -47,7 +47,7 @@ class Numbered:
 
 @contextmanager
 def played(name: str, **how: Any) -> Iterator[Player]:
-    """A skin that plays in a thread until the end of the block."""
+    """A skin that plays in a thread until the block ends."""
     source, stop = Numbered(name), threading.Event()
     with tempfile.TemporaryDirectory() as folder:
         player = Player(

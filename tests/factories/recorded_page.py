@@ -27,8 +27,7 @@ KIND = "application/json"
 
 
 def ordered(page: Page, key: str, body: bytes | Mapping[str, str], **changed: str | None) -> bytes:
-    """The answer to an order as the page sends it, with other headers where a test changes them
-    (None: without)."""
+    """The answer to an order of the page. changed: other headers (None: without this header)."""
     content = body if isinstance(body, bytes) else json.dumps(body).encode()
     headers = {
         "Origin": f"http://localhost:{port(page)}",
@@ -42,7 +41,7 @@ def ordered(page: Page, key: str, body: bytes | Mapping[str, str], **changed: st
 
 
 def key_of(page: Page) -> str:
-    """The key that a page gets with its events."""
+    """The key that a page receives with its events."""
     reader = EventReader(page)
     key = reader.until("key")
     reader.socket.close()
@@ -50,8 +49,7 @@ def key_of(page: Page) -> str:
 
 
 class RecordedPage:
-    """A recording in `folder` and its page, without a box: `turn` is a turn of the loop, which
-    `going` takes by itself."""
+    """A recording in `folder` and its page, without a box. In a `with` a thread takes its turns."""
 
     def __init__(
         self, folder: Path, labels: Labels, target: int = 3, access: Access | None = None
@@ -75,7 +73,7 @@ class RecordedPage:
         self._going = threading.Thread(target=self._go)
 
     def obey(self, command: Command) -> list[object]:
-        """Carry out a command of the recording; START and STOP change the state alone."""
+        """Carry out a command of the recording. START and STOP change only the state."""
         self.done.append(command.line)
         if command.name in ("START", "STOP"):
             sweeping = command.name == "START"
@@ -84,7 +82,7 @@ class RecordedPage:
         return self.recording.commands[command.name](command.text)
 
     def turn(self) -> None:
-        """One turn, with frames of a finger that rests on the skin."""
+        """Take one turn, with frames of a finger that rests on the skin."""
         with self._lock:
             n = np.arange(20)
             taxels = np.broadcast_to(load(1.5, 1.5), (20, 4, 4)).astype(np.uint8)
@@ -92,7 +90,7 @@ class RecordedPage:
             self.page.turn(self.health)
 
     def sweep(self, status: Status = Status.RECORDED, detail: str = "") -> int:
-        """A sweep is answered; its number."""
+        """Answer a sweep; returns its number."""
         with self._lock:
             answered = self.answered(status, detail)
             for observer in (self.recording, self.page):
@@ -100,7 +98,7 @@ class RecordedPage:
         return self.sweeps
 
     def answered(self, status: Status, detail: str = "") -> tuple[Sweep, Verdict]:
-        """The next sweep, with a window if the status has one, and its answer."""
+        """The next sweep and its answer. The sweep has a window if its status has one."""
         self.sweeps += 1
         frames = Frames.empty(skin.FORMAT) if status in (Status.SHORT, Status.GAP) else cut().frames
         one = replace(cut(), id=self.sweeps, start_ns=SystemClock().now_ns(), frames=frames)
@@ -109,7 +107,6 @@ class RecordedPage:
         )
 
     def __enter__(self) -> Self:
-        """Serve the page, and take turns."""
         self.page.__enter__()
         self._going.start()
         return self

@@ -18,7 +18,7 @@ def record(
     format: SweepFormat = FORMAT,
     **more,
 ) -> None:
-    """A recording as the box keeps it; its raw counts go up from its id."""
+    """A recording in the files of the box. Its raw counts start at its id."""
     n = more.pop("frames", format.window)
     taxels = (
         (more.setdefault("id", 1) + np.arange(n * 6)).reshape(n, 2, 3).astype(format.numpy_type)

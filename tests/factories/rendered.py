@@ -1,5 +1,4 @@
-"""A finished page or picture in a browser, and its illegible parts. In: a file, a width, light or
-dark."""
+"""Illegible parts of a page or picture in a browser, at several widths, light and dark."""
 
 from __future__ import annotations
 
@@ -9,9 +8,10 @@ from typing import Any
 
 WIDTHS, SCHEMES = (390, 1024, 1920), ("light", "dark")
 TALLEST = 16000
-"""Of the window, so that all of a page is in it: colours are asked for by place."""
+"""Height of the window. It has to hold the whole page, because colours are read by position."""
 FAULTS = """() => {
-  const root = document.body ?? document.documentElement, wide = document.documentElement.clientWidth;
+  const root = document.body ?? document.documentElement;
+  const wide = document.documentElement.clientWidth;
   document.querySelectorAll("details").forEach((one) => { one.open = true; });
   const all = (what) => [...document.querySelectorAll(what)].filter((one) => one.checkVisibility());
   const words = (one) => one.textContent.trim().slice(0, 60);
@@ -21,7 +21,8 @@ FAULTS = """() => {
     const scale = text.startsWith("color(") ? 255 : 1;
     return [...parts.slice(0, 3).map((one) => one * scale), parts[3] ?? 1];
   };
-  const over = (top, below) => below.slice(0, 3).map((one, i) => top[i] * top[3] + one * (1 - top[3]));
+  const over = (top, below) => below.slice(0, 3)
+    .map((one, i) => top[i] * top[3] + one * (1 - top[3]));
   const paint = (one, what) => {
     const style = getComputedStyle(one), made = colour(style[what]);
     made[3] *= Number(style.opacity) * (what === "fill" ? Number(style.fillOpacity) : 1);
@@ -32,9 +33,11 @@ FAULTS = """() => {
   const behind = (one) => {
     const at = box(one), point = [at.left + at.width / 2, at.top + at.height / 2];
     const drawn = shape(one) ? document.elementsFromPoint(...point) : [];
-    const shapes = drawn.slice(drawn.indexOf(one) + 1).filter((other) => shape(other) && other.tagName !== "text" && other.tagName !== "svg");
+    const shapes = drawn.slice(drawn.indexOf(one) + 1)
+      .filter((other) => shape(other) && !["text", "svg"].includes(other.tagName));
     const boxes = ancestors(one).filter((other) => !shape(other));
-    const layers = [...shapes.map((other) => paint(other, "fill")), ...boxes.map((other) => paint(other, "backgroundColor"))];
+    const layers = [...shapes.map((other) => paint(other, "fill")),
+      ...boxes.map((other) => paint(other, "backgroundColor"))];
     const haloed = shape(one) && getComputedStyle(one).paintOrder.startsWith("stroke");
     const halo = haloed ? [colour(getComputedStyle(one).stroke)] : [];
     return [...halo, ...layers].reverse().reduce((below, top) => over(top, below), [255, 255, 255]);
@@ -51,31 +54,40 @@ FAULTS = """() => {
   const walk = document.createTreeWalker(root, NodeFilter.SHOW_TEXT);
   for (let node = walk.nextNode(); node; node = walk.nextNode()) {
     const one = node.parentElement;
-    const told = ["script", "style", "title", "desc", "metadata"].includes(one.tagName.toLowerCase());
-    if (node.textContent.trim() && !told && one.checkVisibility() && box(one).width) texts.push(one);
+    const hidden = ["script", "style", "title", "desc", "metadata"];
+    const told = hidden.includes(one.tagName.toLowerCase());
+    if (!node.textContent.trim() || told || !one.checkVisibility()) continue;
+    if (box(one).width) texts.push(one);
   }
   const outside = (text) => {
     const inner = box(text), outer = box(text.ownerSVGElement);
-    return inner.left < outer.left - 1 || inner.right > outer.right + 1 || inner.top < outer.top - 1 || inner.bottom > outer.bottom + 1;
+    return inner.left < outer.left - 1 || inner.right > outer.right + 1
+      || inner.top < outer.top - 1 || inner.bottom > outer.bottom + 1;
   };
   const scrolls = (one) => one.scrollWidth > one.clientWidth + 1;
   return {
-    "page wider than the window": document.documentElement.scrollWidth > wide + 1 && document.body ? [`${document.documentElement.scrollWidth}`] : [],
+    "page wider than the window":
+      document.documentElement.scrollWidth > wide + 1 && document.body
+        ? [`${document.documentElement.scrollWidth}`] : [],
     "verdict out of sight": all(".verdict").filter((one) => box(one).right > wide + 1).map(words),
-    "scrolls without keyboard": all("div").filter((one) => scrolls(one) && (one.tabIndex < 0 || !one.getAttribute("role"))).map(words),
-    "text outside its picture": all("svg text").filter((one) => one.ownerSVGElement && outside(one)).map(words),
+    "scrolls without keyboard": all("div")
+      .filter((one) => scrolls(one) && (one.tabIndex < 0 || !one.getAttribute("role"))).map(words),
+    "text outside its picture": all("svg text")
+      .filter((one) => one.ownerSVGElement && outside(one)).map(words),
     "axis without title": all('[data-axis=""]').map(words),
     "head without scope": all("th:not([scope])").map(words),
-    "low contrast": texts.filter((one) => contrast(one) < 4.5).map((one) => `${contrast(one).toFixed(1)} ${words(one)}`),
+    "low contrast": texts.filter((one) => contrast(one) < 4.5)
+      .map((one) => `${contrast(one).toFixed(1)} ${words(one)}`),
     "raw brace": texts.map(words).filter((one) => /[{}]/.test(one)),
   };
 }"""
-"""What is wrong with a page, by kind: the texts concerned."""
+"""The faults of a page by kind, each with its texts."""
 
 
 def faults(browser: Any, address: str, width: int, scheme: str) -> Mapping[str, list[str]]:
-    """What could not be read of a page or picture in a window of this width, light or dark: texts
-    by kind of fault."""
+    """Illegible texts of a page or picture by kind of fault. width: of the window. scheme: light or
+    dark.
+    """
     context = browser.new_context(
         viewport={"width": width, "height": 900}, color_scheme=scheme, reduced_motion="reduce"
     )
@@ -92,5 +104,5 @@ def faults(browser: Any, address: str, width: int, scheme: str) -> Mapping[str, 
 
 
 def address(path: Path) -> str:
-    """Of a file, for a browser."""
+    """The URL of a file."""
     return path.resolve().as_uri()

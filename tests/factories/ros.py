@@ -1,5 +1,4 @@
-"""The bridge to ROS 2 and another node, two processes over loopback, with the Python that has ROS
-2."""
+"""The bridge to ROS 2 and a second node: two processes over loopback, in the Python with ROS 2."""
 
 from __future__ import annotations
 
@@ -17,12 +16,13 @@ from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 
 PYTHON = ROOT / os.environ.get("PALPATE_ROS", "build/ros") / "bin" / "python"
-"""Of `python -m tests.campaigns ros`; PALPATE_ROS names another virtual environment, and says that it has to be
-there."""
+"""The Python of `python -m tests.campaigns ros`. PALPATE_ROS names another environment; then a
+missing ROS 2 is a failure.
+"""
 
 
 def required() -> None:
-    """Skip where ROS 2 is not installed, unless it was asked for."""
+    """Skip the test without ROS 2, or fail if PALPATE_ROS is set."""
     if not PYTHON.exists():
         if "PALPATE_ROS" in os.environ:
             pytest.fail(
@@ -32,7 +32,7 @@ def required() -> None:
 
 
 def messages_required() -> None:
-    """Fail where ROS 2 is installed without palpate_msgs."""
+    """Fail if ROS 2 is installed without palpate_msgs."""
     package = PYTHON.parent.parent / "share" / "palpate_msgs" / "package.xml"
     assert package.exists(), (
         f"{package} is not there; python -m tests.campaigns ros builds palpate_msgs"
@@ -40,7 +40,7 @@ def messages_required() -> None:
 
 
 def environment() -> dict[str, str]:
-    """Loopback alone, a domain of this test process."""
+    """Variables for loopback only and a ROS domain of this process."""
     domain = str(1 + os.getpid() % 100)
     return {
         **os.environ,
@@ -51,7 +51,7 @@ def environment() -> dict[str, str]:
 
 
 class RosPeer:
-    """The other node: its messages by topic, and the results of its calls."""
+    """The second node: its messages by topic, and the results of its calls."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.heard: list[dict[str, Any]] = []
@@ -60,23 +60,23 @@ class RosPeer:
         eventually(lambda: self.on("ready") != [])
 
     def on(self, topic: str) -> list[dict[str, Any]]:
-        """What came on a topic."""
+        """The messages of a topic."""
         return [line for line in [*self.heard] if line.get("topic") == topic]
 
     def last(self, topic: str) -> Mapping[str, Any]:
-        """What came last on a topic; waits for it."""
+        """Wait for a message of a topic; returns the last."""
         eventually(lambda: self.on(topic) != [])
         return self.on(topic)[-1]
 
     def call(self, name: str) -> dict[str, Any]:
-        """Call a service or a transition; its answer."""
+        """Call a service or a transition; returns its answer."""
         before = self._answers(name)
         self._write(name)
         eventually(lambda: len(self._answers(name)) > len(before))
         return self._answers(name)[-1]
 
     def sweep(self, **terms: float | bool) -> None:
-        """Send a goal to the action; feedback and results come as topics."""
+        """Send a goal to the action. Its feedback and results come as topics."""
         self._write(json.dumps(terms))
 
     def cancel(self) -> None:
@@ -97,7 +97,7 @@ class RosPeer:
 
 @contextmanager
 def peer() -> Iterator[RosPeer]:
-    """Another node."""
+    """Run the second node."""
     script = ROOT / "tests" / "factories" / "ros_peer.py"
     command = [PYTHON, str(script)]
     pipes: dict[str, Any] = {
@@ -116,7 +116,7 @@ def peer() -> Iterator[RosPeer]:
 def bridge(
     *parameters: str, log: int = subprocess.DEVNULL, **variables: str
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """The bridge as a node. log: where its log goes. variables: of its environment."""
+    """Run the bridge as a node. log: file for its log. variables: environment variables."""
     command = [PYTHON, "-m", "appliance.bridges", "ros", "--ros-args", *parameters]
     with subprocess.Popen(command, cwd=ROOT, env=environment() | variables, stderr=log) as process:
         try:
@@ -125,5 +125,5 @@ def bridge(
             process.terminate()
             try:
                 process.wait(LONG_S)
-            finally:  # else one that did not end would be waited for without end
+            finally:  # otherwise the test waits forever for a node that does not end
                 process.kill()

@@ -1,8 +1,7 @@
-"""The content of a launch file, without the package `launch`, which has neither a wheel nor a
-Debian package.
+"""Reads launch files without the package `launch`, which has neither a wheel nor a Debian package.
 
-The four names take the arguments of those of ROS 2 (github.com/ros2/launch, launch/actions and
-launch/substitutions); a launch file that uses more fails here.
+The four names accept the arguments of ROS 2's (github.com/ros2/launch, launch/actions and
+launch/substitutions) that the project uses. A launch file that uses more fails here.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ class LaunchConfiguration:
 
 @dataclass(frozen=True)
 class DeclareLaunchArgument:
-    """An argument; without a default it has to be given."""
+    """An argument. Without a default it is required."""
 
     name: str
     default_value: str | None = field(default=None, kw_only=True)
@@ -34,7 +33,7 @@ class DeclareLaunchArgument:
 
 @dataclass(frozen=True, kw_only=True)
 class ExecuteProcess:
-    """A process. cmd: texts, arguments, or lists of both that are joined."""
+    """A process. cmd: texts, arguments, or lists of both, which are joined."""
 
     cmd: list[Any]
     output: str = "log"
@@ -43,12 +42,12 @@ class ExecuteProcess:
 
 
 def LaunchDescription(entities: list[Any]) -> list[Any]:
-    """What is launched."""
+    """The entities of the launch."""
     return entities
 
 
 def processes(path: Path, **arguments: str) -> list[tuple[ExecuteProcess, list[str]]]:
-    """The processes that a launch file describes, each with its command for these arguments."""
+    """The processes of a launch file, each as its command with these arguments."""
     modules = {
         name: ModuleType(name) for name in ("launch", "launch.actions", "launch.substitutions")
     }

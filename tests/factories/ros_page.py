@@ -1,7 +1,6 @@
-"""Runs a program of docs/robots/ros2.md, which comes on stdin, four times; prints what came of each
-as a JSON line.
+"""Runs a program of docs/robots/ros2.md four times and prints each result as a JSON line.
 
-Arguments: the program's class, and what `classify` gets, as JSON.
+The program comes on stdin. Arguments: its class, and the arguments of `classify` as JSON.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Another ROS 2 node, in a process of its own: prints its messages as JSON lines, and makes the
-calls that stdin names.
+"""A second ROS 2 node as a process: prints its messages as JSON lines, makes the calls from stdin.
 
-Runs with a Python that has rclpy; imports nothing of the project.
+It runs in a Python with rclpy and imports nothing of the project.
 """
 
 from __future__ import annotations
@@ -40,11 +39,10 @@ STATES = {
 
 
 ONE_LINE = threading.Lock()
-"""Two threads tell something."""
+"""Two threads print."""
 
 
 def tell(**fields: object) -> None:
-    """Print a line."""
     with ONE_LINE:
         print(json.dumps(fields), flush=True)
 
@@ -67,7 +65,7 @@ def status(topic: str, array: DiagnosticArray) -> None:
 
 
 def listen(node: Node) -> None:
-    """Subscribe to all that the box publishes."""
+    """Subscribe to all topics of the box."""
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     node.create_subscription(
         DiagnosticArray, "/palpate/verdict", lambda m: status("verdict", m), 50
@@ -92,14 +90,14 @@ def listen(node: Node) -> None:
 
 
 def fields(message: object) -> dict:
-    """The fields of a message without others in it."""
+    """The fields of a message, without nested messages."""
     return {name: getattr(message, name) for name in message.get_fields_and_field_types()}
 
 
 class Sweeper:
     """Sends goals to the action, and cancels the goal that was accepted last.
 
-    Hears feedback on its topic: rclpy's client passes none on once the result is there, and may see
+    It reads feedback from its topic. rclpy's client drops feedback after the result, and may see
     the result first.
     """
 
@@ -117,14 +115,13 @@ class Sweeper:
         )
 
     def send(self, **terms: float | bool) -> None:
-        """Send a goal; its result is printed."""
+        """Send a goal and print its result."""
         if not self._client.wait_for_server(20):
             tell(topic="result", state="no such action")
             return
         self._client.send_goal_async(self._goal(**terms)).add_done_callback(self._answered)
 
     def cancel(self) -> None:
-        """Cancel a goal."""
         self._accepted.cancel_goal_async()
 
     def _answered(self, sent: Future) -> None:
@@ -141,7 +138,7 @@ class Sweeper:
 
 
 def allow_writes(node: Node) -> None:
-    """Try to set this parameter of the bridge."""
+    """Try to set the parameter allow_writes of the bridge."""
     client = node.create_client(SetParameters, "/palpate/set_parameters")
     wanted = Parameter("allow_writes", value=True).to_parameter_msg()
     client.wait_for_service(20)
@@ -155,8 +152,7 @@ def allow_writes(node: Node) -> None:
 
 
 def obey(node: Node, sweeper: Sweeper | None) -> None:
-    """Call the services that stdin names, one after the other; a JSON object is a goal of the
-    action."""
+    """Call the services that stdin names, in turn. A JSON object is a goal of the action."""
     for line in sys.stdin:
         name = line.strip()
         if name.startswith("{"):
@@ -189,7 +185,7 @@ if __name__ == "__main__":
     rclpy.init()
     peer = rclpy.create_node("peer")
     listen(peer)
-    # long before the first goal, since feedback is not sent again
+    # It subscribes long before the first goal, because feedback is not sent again.
     sweeps = Sweeper(peer) if find_spec("palpate_msgs") else None
     threading.Thread(target=obey, args=(peer, sweeps), daemon=True).start()
     tell(topic="ready")

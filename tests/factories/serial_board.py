@@ -1,5 +1,7 @@
-"""A board of PROTOCOL.md on a pseudo-terminal: requests are bytes, replies are packets. In: a board
-of the rig. Out: the path of a port, with a thread of this process as the board."""
+"""A board of PROTOCOL.md on a pseudo-terminal: requests are bytes, replies are packets.
+
+A board of the rig answers in a thread of this process.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ TURN_S = 0.002
 
 
 class SerialBoard:
-    """A board behind a port at `path`, there while it is plugged in. board: may be exchanged while
-    it is unplugged."""
+    """A board behind a port. path: exists while the board is plugged in. board: may be exchanged
+    while it is unplugged.
+    """
 
     def __init__(self, board: rig.ReadoutBoard, stack: ExitStack) -> None:
         self.board = board
@@ -29,7 +32,6 @@ class SerialBoard:
         stack.callback(self.unplug)
 
     def plug(self) -> None:
-        """Put the board's port under its name."""
         self.board.running = False
         far, name = self._plugged.enter_context(pseudo_terminal.pair())
         self.path.symlink_to(name)
@@ -41,7 +43,7 @@ class SerialBoard:
         self._plugged.callback(ended.set)
 
     def unplug(self) -> None:
-        """The port goes away, also for who has it open."""
+        """Remove the port, also for programs that have it open."""
         self._plugged.close()
 
     def _serve(self, far: int, ended: threading.Event) -> None:
@@ -59,11 +61,11 @@ class SerialBoard:
     def _heard(self, far: int) -> bytes:
         if not select.select([far], [], [], TURN_S)[0]:
             return b""
-        with suppress(OSError):  # nobody has the port open
+        with suppress(OSError):  # no program has the port open
             return os.read(far, 64)
         return b""
 
     def _send(self, far: int, data: bytes) -> None:
-        """Frames that do not fit into the line are lost, as on a board without a FIFO."""
+        """Send bytes. Frames that do not fit are lost, as on a board without a FIFO."""
         with suppress(BlockingIOError):
             os.write(far, data)

@@ -13,8 +13,10 @@ NO_FILE = Path("/dev/null")
 
 
 def load(sets: Iterable[str] = (), board: str | None = None) -> Config:
-    """The settings of this checkout with "section.key=value" of `sets`, which may also name the
-    constants beside the settings (`schema.fixed`)."""
+    """The settings of this checkout with "section.key=value" of `sets`.
+
+    `sets` may also name the constants beside the settings (`schema.fixed`).
+    """
     constants, known = [], []
     fixed = fixed_names()
     for text in sets:
@@ -30,7 +32,7 @@ def load(sets: Iterable[str] = (), board: str | None = None) -> Config:
 
 
 def fixed_names() -> set[str]:
-    """The constants that stand beside the settings, as "section.key"."""
+    """The constants beside the settings, as "section.key"."""
     return {
         f"{section}.{f.name}"
         for section, group in config._SECTIONS.items()

@@ -1,4 +1,4 @@
-"""Simulated sweeps of a skin of 2x2 taxels with three axes, for tests."""
+"""Simulated sweeps of a skin of 2x2 taxels with three axes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FRAMES = 600
 
 
 def sheared(each: int = 2, seed: int = 5, frames: int = FRAMES) -> Dataset:
-    """Six tubes at nine positions, `each` sweeps [frames, 2, 2, 3] of each tube at each."""
+    """`each` sweeps [frames, 2, 2, 3] of each of six tubes at each of nine positions."""
     samples, labels, position = skin.sweep_set("T-REAL", seed, each, WORLD)
     first = (samples.shape[1] - frames) // 2
     return Dataset(

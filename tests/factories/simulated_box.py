@@ -1,5 +1,6 @@
-"""A box on simulated devices, for tests: numbered frames, devices with an idle robot, the robot's
-end of the port."""
+"""A box on simulated devices: numbered frames, devices with an idle robot, the robot's serial
+port.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ SETTLE_S = 0.02
 
 def numbered(n: int, format: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
     """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the
-    axis."""
+    axis.
+    """
     grid = np.arange(format.channels).reshape(1, *format.shape)
     return (
         (np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(format.shape)) + grid
@@ -33,7 +35,7 @@ def numbered(n: int, format: SweepFormat = skin.FORMAT, first: int = 0) -> np.nd
 def idle_devices(
     seconds: float = 3600, format: SweepFormat = skin.FORMAT, **board
 ) -> devices.SimDevices:
-    """Simulated devices whose skin sends numbered frames and whose robot does nothing."""
+    """Simulated devices: a skin that sends numbered frames, and an idle robot."""
     n = min(round(seconds * format.rate_hz), 60_000)
     acts = [rig.Act(numbered(n, format), 10**9, 10**9 + 1, "")]
     simulated = devices.build(format, acts, rig.VirtualClock(), "sim", acm=board.pop("acm", False))
@@ -50,7 +52,6 @@ class OnSweep(Observer):
         self._act = act
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Call it."""
         self._act(sweep, verdict)
 
 
@@ -83,25 +84,25 @@ class Rigged:
         return self.until(lambda: self.simulated.clock.now_ns() >= end_ns)
 
     def listen(self, wait_s: float = 0) -> None:
-        """Read the robot's end; the kernel passes on the bytes of the near end in its own time."""
+        """Read the robot's end. wait_s: real time in which the kernel delivers the bytes."""
         while select.select([self.far_end], [], [], wait_s)[0]:
             *lines, self.rest = (self.rest + os.read(self.far_end, 65536)).split(b"\r\n")
             self.heard += [line.decode("ascii") for line in lines]
 
     def ask(self, line: str) -> str:
-        """Send a command; the answer's sentence."""
+        """Send a command; returns the sentence that answers it."""
         before = len(self.heard)
         os.write(self.far_end, line.encode() + b"\r\n")
         self.until(lambda: any(",ANS," in h for h in self.heard[before:]), limit_s=5)
         return next(h for h in self.heard[before:] if ",ANS," in h)
 
     def edge(self, name: str, after_s: float, level: bool = True) -> None:
-        """Drive an input line `after_s` from now."""
+        """Drive an input `after_s` from now."""
         self.simulated.gpio.drive(
             name, level, self.simulated.clock.now_ns() + round(after_s * SECOND)
         )
 
     def pulse(self, name: str, after_s: float) -> None:
-        """A pulse of 20 ms."""
+        """Drive an input high for 20 ms."""
         self.edge(name, after_s)
         self.edge(name, after_s + 0.02, False)

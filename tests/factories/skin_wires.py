@@ -1,10 +1,11 @@
-"""Skins on a wire, for tests in virtual time. In: a profile's name. Out: the right content of its
-frames, their bytes by the makers' descriptions, and a port that delivers them with a driver's
-buffer and every fault.
+"""Skins on a serial line in virtual time, by the name of a profile.
 
-The bytes are written a second time here and not taken from `appliance.sim.skins.wires`, on purpose:
-two readings of the same descriptions, with other choices where a skin leaves some (width of
-offsets, order of fields, separators), so that a mistake of one of them is not confirmed by itself.
+For each skin: the expected content of its frames, their bytes after the makers' descriptions, and a
+port that delivers them with a driver's buffer and every fault.
+
+The bytes are on purpose not those of `appliance.sim.skins.wires`. The second implementation makes
+other choices where a skin allows several (width of offsets, order of fields, separators), so a
+misreading in one of them shows.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.toml") if path.stem != "palp
 PATH = "/dev/serial/by-id/skin"
 SECOND = 1_000_000_000
 TTY_BYTES = 4095
-"""What a tty gives in one read."""
+"""Most bytes of one read from a tty."""
 
 
 @cache
 def profile(name: str) -> SkinProfile:
-    """A delivered profile."""
+    """A packaged profile."""
     return skin_profile.load(name, [FOLDER])
 
 
@@ -50,7 +51,7 @@ def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
 
 
 def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
-    """Frame `i` with all values on the wire [R, C, values]; values that are not taken are 99."""
+    """All values of frame `i` on the wire: [R, C, values]. Unused values are 99."""
     grid = np.full((p.rows, p.cols, p.values), 99, np.dtype(p.number))
     grid[..., list(p.take)] = taxels(p, i).reshape(p.rows, p.cols, len(p.take))
     return grid
@@ -58,8 +59,9 @@ def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
 
 @lru_cache(20_000)
 def wire(name: str, i: int, period_ns: float = 1e6) -> bytes:
-    """Frame `i` of a delivered profile as bytes, put together from the makers' descriptions.
-    period_ns: of its clock."""
+    """Frame `i` of a packaged profile as bytes, after the maker's description. period_ns: of its
+    clock.
+    """
     grid = numbers(profile(name), i)
     return (
         papillarray(grid, i, period_ns=period_ns)
@@ -89,8 +91,10 @@ def _lines(grid: NDArray[np.generic], i: int) -> bytes:
 def papillarray(
     grid: NDArray[np.generic], i: int, sensors: int = 1, period_ns: float = 1e6
 ) -> bytes:
-    """A PTS packet with blocks of type 1 and 3; offsets are one byte wide, counted from the byte
-    that holds their width."""
+    """A PTS packet with blocks of types 1 and 3.
+
+    Offsets are one byte wide and count from the byte that holds their width.
+    """
     pillars = grid.reshape(-1, 6)
     each = len(pillars) // sensors
     clock = struct.pack("<IQ", (1000 + i) % (1 << 32), 5_000_000 + round(i * period_ns / 1000))
@@ -143,11 +147,12 @@ _WIRES: dict[str, Callable[[NDArray[np.generic], int], bytes]] = {
 
 @dataclass
 class WirePort:
-    """A serial port with a skin behind it, and the kernel's buffer between.
+    """A serial port with a skin behind it and the kernel's buffer between them.
 
-    frames: bytes of frame i. period_ns: time between two. latency: from the end of a frame to the
-    driver. capacity: bytes that the driver keeps; later bytes are thrown away. mangle: changes the
-    bytes of a frame on the cable. chunk: most bytes of one read. sent: bytes from the box.
+    frames: the bytes of frame i. period_ns: time between two frames. latency: time from the end of
+    a frame to the driver. capacity: size of the driver's buffer in bytes; bytes beyond it are lost.
+    mangle: changes the bytes of a frame on the cable. chunk: most bytes of one read. sent: bytes
+    from the box.
     """
 
     clock: VirtualClock
@@ -170,11 +175,11 @@ class WirePort:
         self._plan()
 
     def taken_ns(self, i: int) -> int:
-        """Host time at which frame `i` is taken."""
+        """Host time of frame `i`."""
         return self.begun_ns + round((i + 1) * self.period_ns)
 
     def open(self, path: str, baud: int) -> WirePort:
-        """Open it, in the middle of a frame, with what came before thrown away."""
+        """Open it in the middle of a frame. Earlier bytes are lost."""
         if self.busy:
             raise SensorBusy("port held by another program")
         if self.gone:
@@ -185,13 +190,12 @@ class WirePort:
         return self
 
     def write(self, data: bytes) -> None:
-        """Remember it."""
         if self.gone:
             raise SensorLost("it is gone (errno 19)")
         self.sent.append(data)
 
     def close(self) -> None:
-        """Nothing is read any more."""
+        """Stop reading."""
         self.is_open = False
 
     def read(self, size: int, timeout_ms: int) -> bytes:
@@ -227,7 +231,7 @@ class WirePort:
 
 
 class WiredSkin:
-    """A sensor on a skin of a delivered profile, in virtual time."""
+    """A sensor on a skin of a packaged profile, in virtual time."""
 
     def __init__(
         self,
@@ -243,7 +247,8 @@ class WiredSkin:
         self.format = format or self.profile.format
         period_ns = self.profile.format.period_ns / rate
         self.port = WirePort(self.clock, lambda i: wire(name, i, period_ns), period_ns)
-        config = SkinConfig(profile=name, **{"port": PATH, "retry_ms": 50} | settings)  # type: ignore[arg-type]
+        options = {"port": PATH, "retry_ms": 50} | settings
+        config = SkinConfig(profile=name, **options)  # type: ignore[arg-type]
         adapted = skin_profile.adapted(self.profile, config)
         self.sensor = SerialSensor(
             config,
@@ -258,8 +263,7 @@ class WiredSkin:
         self.troubles: list[str] = []
 
     def seconds(self, seconds: float) -> Frames:
-        """All frames of this time. `states` gets the new states, from the first frame or trouble
-        on."""
+        """All frames of this time. `states` gets the new states after the first frame or fault."""
         end_ns, parts = self.clock.now_ns() + round(seconds * SECOND), [self.sensor.read()]
         while self.clock.now_ns() < end_ns:
             before = self.clock.now_ns()
@@ -268,20 +272,21 @@ class WiredSkin:
             if not opening and self.sensor.state not in self.states[-1:]:
                 self.states.append(self.sensor.state)
                 self.troubles.append(str(self.sensor.trouble or ""))
-            if self.clock.now_ns() == before:  # a turn takes some time
+            if self.clock.now_ns() == before:  # each turn takes some time
                 self.clock.sleep_until(before + 1_000_000)
         return Frames.joined(parts)
 
     def which(self, frames: Frames) -> NDArray[np.int64]:
-        """Number on the wire of each frame [n], by its content; fails for a frame that was never
-        sent."""
+        """Number [n] of each frame on the wire, by its content. Fails for a frame that was never
+        sent.
+        """
         sent = {taxels(self.profile, i).tobytes(): i for i in range(199)}
         low = np.array([sent[one.tobytes()] for one in frames.taxels], np.int64)
-        # the content repeats after 199 frames; the time tells which of them it is
+        # The content repeats after 199 frames. The time decides between equal frames.
         about = (frames.t_ns - self.port.begun_ns) / self.port.period_ns
         return low + 199 * np.rint((about - low) / 199).astype(np.int64)
 
     def late_ms(self, frames: Frames) -> NDArray[np.float64]:
-        """How much later than it was taken each frame's time is [n], ms."""
+        """Delay [n] of each frame's time behind its true time, ms."""
         taken = np.array([self.port.taken_ns(int(i)) for i in self.which(frames)])
         return (frames.t_ns - taken) / 1e6

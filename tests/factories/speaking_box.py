@@ -1,4 +1,4 @@
-"""The box's end of a serial line, played by a script: for tests of the other end."""
+"""The box's end of a serial line, played by a script, for tests of programs at the other end."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def result(
 
 
 def obeying(heard: Sentence) -> list[bytes]:
-    """The box as it is while all is well: a sweep ends with STOP and is answered `ok`."""
+    """The answers of a box without faults: STOP ends a sweep, which is answered `ok`."""
     fields: tuple[object, ...] = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}.get(
         heard.kind, ()
     )
@@ -67,8 +67,7 @@ def obeying(heard: Sentence) -> list[bytes]:
 class SpeakingBox:
     """Answers each command as the script says, and sends the sentences of the test.
 
-    path: where the robot finds its end; `unplug` takes it away, `plug_in` brings it back. heard:
-    the commands.
+    path: the robot's end; `unplug` removes it, `plug_in` brings it back. heard: the commands.
     """
 
     def __init__(self, path: Path, script: Script = obeying) -> None:
@@ -91,7 +90,6 @@ class SpeakingBox:
         self.unplug()
 
     def plug_in(self) -> None:
-        """Connect the two ends."""
         with self._lock:
             far, near = os.openpty()
             for end in (far, near):
@@ -101,7 +99,7 @@ class SpeakingBox:
             self.path.symlink_to(os.ttyname(near))
 
     def unplug(self) -> None:
-        """Take the robot's end away."""
+        """Remove the robot's end."""
         with self._lock:
             self.path.unlink(missing_ok=True)
             for end in self._ends:
@@ -109,12 +107,11 @@ class SpeakingBox:
             self._ends = ()
 
     def say(self, *lines: bytes) -> None:
-        """Send bytes to the robot."""
         with self._lock:
             os.write(self._ends[0], b"".join(lines))
 
     def wait_for(self, kind: str, timeout_s: float = 30) -> None:
-        """Wait until a command has come."""
+        """Wait until a command has arrived."""
         with self._come:
             assert self._come.wait_for(
                 lambda: any(s.kind == kind for s in self.heard), timeout_s
@@ -130,7 +127,8 @@ class SpeakingBox:
                 for one in found:
                     with (
                         self._come
-                    ):  # heard before it is answered: who has the answer may ask what was heard
+                        # before the answer, because a test with the answer may read `heard`
+                    ):
                         self.heard.append(one)
                         self._come.notify_all()
                     for line in self.script(one):

@@ -1,4 +1,4 @@
-"""Made-up results of the command stress: six methods and a bundle under three corruptions."""
+"""Invented results of the study stress: six methods and a bundle under three corruptions."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ BOX = {
 
 
 def figures() -> dict[str, Any]:
-    """Of 100 sweeps and one seed; `quant` refused the set, and the method of the first place is
-    ours."""
+    """Results of 100 sweeps and one seed. `quant` refused the set. The first method is the
+    project's.
+    """
     methods = robustness.merge(
         [
             *(task(name, right) for name, right in METHODS.items()),
@@ -63,7 +64,7 @@ def figures() -> dict[str, Any]:
 
 
 def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
-    """What robustness.evaluate_method returns."""
+    """A result of robustness.evaluate_method."""
     curves = {
         key: {
             "title": title,

@@ -1,4 +1,4 @@
-"""Pages of studies for tests: drawn from results that a test makes, or from those in docs/data."""
+"""Pages of studies, drawn from results of a test or from those in docs/data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def committed(name: str) -> Any:
 
 
 def published(name: str, results: Any, folder: Path) -> Path:
-    """The page of a study, drawn of `results` in the folder; its path."""
+    """Draw the page of a study from `results` in the folder; returns its path."""
     save(results_file(name, folder / "data"), results)
     (page,) = pages.write([name], folder / "pages", folder / "data")
     return page

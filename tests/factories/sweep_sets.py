@@ -1,4 +1,4 @@
-"""Sweep sets for tests: easy to distinguish, written to files."""
+"""Sweep sets in files, with materials that are easy to distinguish."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from train.data.sets import Dataset
 
 
 def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> Dataset:
-    """Three materials that hum at different rates, `n` sweeps [64, 2, 2] of each, `pieces` to a
-    recording."""
+    """`n` sweeps [64, 2, 2] of each of three materials that hum at different rates, `pieces` a
+    recording.
+    """
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.05, 0.15, 0.35])[labels] * rng.uniform(0.9, 1.1, 3 * n)
@@ -25,7 +26,7 @@ def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> D
 
 
 def held() -> dict[str, np.ndarray]:
-    """The content of a good file."""
+    """The content of a valid file."""
     return {
         "samples": np.arange(6 * 8 * 2 * 3).reshape(6, 8, 2, 3).astype(np.int16),
         "labels": np.array([0, 1, 2, 0, 1, 2]),
@@ -36,7 +37,7 @@ def held() -> dict[str, np.ndarray]:
 
 
 def write(path: Path, **changes: object) -> str:
-    """A set file with some arrays changed, or left out where the change is None."""
+    """Write a set with some arrays changed, or left out if the change is None."""
     arrays = {k: v for k, v in (held() | changes).items() if v is not None}
     np.savez(path, **arrays)
     return str(path)
@@ -46,7 +47,8 @@ def tones(
     recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0
 ) -> Dataset:
     """Three materials that hum at 5, 11 and 23 Hz on a 2 x 1 skin at 100 Hz; `offset` distinguishes
-    a material by its mean."""
+    a material by its mean.
+    """
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(3), recordings * windows)
     recording = np.arange(len(labels)) // windows

@@ -1,9 +1,8 @@
-"""The fixtures of the tests under a real systemd: the machine, the box installed on it, its
-service. In: nothing. Out: these.
+"""Fixtures of the tests under a real systemd: the machine, the box on it, and its service.
 
-A test file has them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is
-simulated, in real time. PALPATE_SYSTEMD=1 makes the container (see nspawn.py) and fails without it;
-otherwise tests without it are skipped.
+A test file loads them with pytest_plugins = ["tests.factories.systemd_fixtures"]. The skin is
+simulated, in real time. PALPATE_SYSTEMD=1 makes the container (see nspawn.py) and fails without it.
+Otherwise tests are skipped without a container.
 """
 
 from __future__ import annotations
@@ -19,14 +18,15 @@ from tests.factories.emulated_machines import Missing
 
 @pytest.fixture(scope="session")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[nspawn.Machine]:
-    """A machine that has booted, nothing of the box on it but its locked dependencies."""
+    """A machine that has booted, with the locked dependencies and nothing else of the box."""
     insist = os.environ.get("PALPATE_SYSTEMD") == "1"
     parcel, folder = tmp_path_factory.mktemp("parcel"), tmp_path_factory.mktemp("machine")
     try:
         nspawn.check()
         if not insist and not nspawn.folder().exists():
             raise Missing(
-                "no Debian for a container here; run python -m tests.factories.nspawn (90 s, 370 MB in ~/.cache/palpate)"
+                "no Debian for a container here; run python -m tests.factories.nspawn "
+                "(90 s, 370 MB in ~/.cache/palpate)"
             )
         nspawn.pack(parcel, tmp_path_factory.mktemp("source"))
         booted = nspawn.Machine(nspawn.set_up(), parcel, folder / "nspawn.log")
@@ -40,7 +40,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[nspawn.Machine
 
 @pytest.fixture(scope="session")
 def before(machine: nspawn.Machine) -> list[bool]:
-    """Whether user and folders were there; then the box is installed."""
+    """Install the box. Yields whether its user and folders were there before."""
     tests = (("id", "palpate"), ("test", "-e", "/etc/palpate"), ("test", "-e", "/var/lib/palpate"))
     there = [machine.run(*one).returncode == 0 for one in tests]
     machine.install()
@@ -50,7 +50,9 @@ def before(machine: nspawn.Machine) -> list[bool]:
 
 @pytest.fixture
 def service(machine: nspawn.Machine, before: list[bool]) -> Iterator[nspawn.Service]:
-    """The installed service, stopped; stopped again and as it was delivered after the test."""
+    """The installed service, stopped. After the test it is stopped and has its packaged settings
+    again.
+    """
     yield nspawn.Service(machine)
     machine.run(
         "rm", "-rf", "/run/systemd/system/palpate.service.d", nspawn.SITE, "/run/skin", "/run/hang"

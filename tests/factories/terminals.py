@@ -1,6 +1,7 @@
-"""A program on a terminal, for tests. In: the far end, the process. Out: the shown text, or an
-AssertionError with the text so far. The process never outlives that, so no test waits for it for
-ever.
+"""Reads a program on a terminal.
+
+On failure an AssertionError contains the text so far, and the process is killed, so no test waits
+for it forever.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 LIMIT_S = 300
-"""Far more than any of these programs takes, also on a machine that is very busy."""
+"""Far above the run time of these programs, also on a very busy machine."""
 
 
 def read(
@@ -33,7 +34,7 @@ def read(
             )
         try:
             more = os.read(far, 65536)
-        except OSError:  # the terminal's end where the last writer has gone
+        except OSError:  # Linux's end of file, after the last writer has closed
             return shown
         if not more:
             return shown

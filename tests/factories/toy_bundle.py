@@ -1,8 +1,8 @@
-"""A bundle whose answers are known by arithmetic, for tests, and windows for it.
+"""A bundle whose answers are known by arithmetic, and windows for it.
 
-Its embedding is two of the taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its
-materials "a", "b" and "c" lie at (0, 0), (6, 0) and (0, 6) there. Of a format with several axes it
-uses the normal axis.
+Its embedding is made of two taxels: z = (mean of taxel 1.1, mean of taxel 1.2) / 10 - 10. Its
+materials "a", "b" and "c" lie at (0, 0), (6, 0) and (0, 6). With several axes it uses the normal
+axis.
 """
 
 from __future__ import annotations
@@ -27,15 +27,18 @@ KNOWN = Known(limit=9.0, temperature=2.0)
 DISPLACEMENT = DisplacementRule(limit=4.0, temperature=3.0, unsure=0.75)
 """Rule for displaced sweeps, with the arrays of `displaced_arrays`."""
 IN_PLACE = ContactPositions(1.0, (0.5,), (0.5,), 0.25)
-"""The contact of a sweep with a small embedding is in the middle; a larger one draws it aside by up
-to this limit."""
+"""The contact of a sweep with a small embedding is in the middle. A larger embedding displaces it
+by up to this limit.
+"""
 LIMITS = Thresholds(contact=10, full_scale=32767, unsure=0.5)
 OUTPUTS = ("logits", "embedding")
 
 
 def window(z1: float, z2: float, format: SweepFormat = FORMAT) -> np.ndarray:
-    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths; every taxel is loaded and moves.
-    Shear is a tenth of it."""
+    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths.
+
+    Every taxel is loaded and vibrates. The shear is a tenth of the normal load.
+    """
     level = np.full((format.rows, format.cols), 100.0)
     level[0, :2] += 10 * z1, 10 * z2
     ripple = np.where(np.arange(format.window) % 2, 1, -1)[:, None, None]
@@ -51,7 +54,7 @@ def window(z1: float, z2: float, format: SweepFormat = FORMAT) -> np.ndarray:
 def sweep(
     z1: float, z2: float, number: int = 1, object: int = 0, format: SweepFormat = FORMAT
 ) -> Sweep:
-    """A good sweep with this embedding."""
+    """A valid sweep with this embedding."""
     n = np.arange(format.window)
     return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, format)), object=object)
 
@@ -63,8 +66,9 @@ def model(
     scale: float = 0.1,
     labels: int = 3,
 ) -> bytes:
-    """The graph; each early row d is (d + 1) times the logits; an output of another name is a copy
-    of the logits."""
+    """The graph. Each early row d is (d + 1) times the logits. Further outputs are copies of the
+    logits.
+    """
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
     values = format.rows * format.cols * format.axes
@@ -109,14 +113,14 @@ def model(
 
 
 def npz(**arrays: np.ndarray) -> bytes:
-    """An .npz."""
+    """The bytes of an .npz file."""
     packed = io.BytesIO()
     np.savez(packed, **arrays)
     return packed.getvalue()
 
 
 def npy(array: np.ndarray) -> bytes:
-    """An .npy."""
+    """The bytes of an .npy file."""
     packed = io.BytesIO()
     np.save(packed, array)
     return packed.getvalue()
@@ -134,8 +138,12 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def displaced_arrays() -> dict[str, np.ndarray]:
-    """More arrays of means.npz: in place "a" scatters twice as far in the second direction; moved
-    sweeps scatter ten times as far in the first, and lie a tenth further in it."""
+    """Further arrays of means.npz, for displaced sweeps.
+
+    At the trained positions "a" scatters twice as far in the second direction as the others.
+    Displaced sweeps scatter ten times as far in the first direction; their means are 0.1 further
+    there, after `moved_turn`.
+    """
     shapes = np.stack([np.eye(1)] * 3).astype(np.float16)
     turn = np.diag([0.1, 1]).astype(np.float32)
     at = (MEANS @ turn + [0.1, 0]).astype(np.float32)
@@ -189,7 +197,6 @@ def files(
 
 
 def put(folder: Path, content: dict[str, bytes]) -> Path:
-    """Write the files of a bundle."""
     folder.mkdir(exist_ok=True)
     for name, data in content.items():
         (folder / name).write_bytes(data)
@@ -197,5 +204,5 @@ def put(folder: Path, content: dict[str, bytes]) -> Path:
 
 
 def load(folder: Path, **more) -> Bundle:
-    """A toy bundle, written to `folder` and read."""
+    """A toy bundle, written to `folder` and read from it."""
     return bundle.load(put(folder, files(**more)))

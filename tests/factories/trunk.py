@@ -1,4 +1,4 @@
-"""A small trunk as an ONNX graph, for tests."""
+"""A small trunk as an ONNX graph."""
 
 import numpy as np
 import onnx
@@ -10,8 +10,10 @@ FORM = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
 def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:
-    """`sweep` -> the taxels' means over the window, `features` [1, F], or over its first tenths,
-    `tenths` [1, 10, F]."""
+    """A graph from `sweep` to the taxels' means over the window, `features` [1, F].
+
+    prefixes: instead the means over the first tenths of the window, `tenths` [1, 10, F].
+    """
     g, taxels, length = GraphBuilder(), format.rows * format.cols, format.window // 10
     x = g("Cast", g("Reshape", "sweep", g.constant([format.window, taxels], "int64")), to=1)
     x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
