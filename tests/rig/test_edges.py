@@ -299,13 +299,13 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
     )
 
     since, begun = len(cell.serial.heard), len(cell.lines.log)
-    toggle(cell, "START", count(2000, 10_000))
+    toggle(cell, "START", count(2500, 10_000))
     assert statuses(cell, since, 1) == ["edges-lost"]
     assert ("FAULT", True) in [(name, level) for _, name, level in cell.lines.log[begun:]]
     assert cell.lines.wait("FAULT", False, 10)
     cell.until_ready()
     note(
-        f"storm of {count(2000, 10_000)} edges in one burst",
+        f"storm of {count(2500, 10_000)} edges in one burst",
         "FAULT and edges-lost; READY by itself",
         1,
     )
