@@ -104,10 +104,11 @@ def gather(out: Path) -> list[str]:
 def results(out: Path) -> None:
     """Draw the pages of results into `out`/results, and list them on a page."""
     pages = (out / "results").absolute()
-    for words in (
+    drawn: tuple[list[str | Path], ...] = (
         ["train.studies", "pages", "--out", pages],
         ["tests.rig.soak", "--draw", "--work", pages, "--out", SOAK, "--page", pages / "soak"],
-    ):
+    )
+    for words in drawn:
         command = [sys.executable, "-m", *words]
         subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
     names = [page.parent.name for page in sorted(pages.glob("*/index.html"))]
