@@ -1,8 +1,9 @@
 """`python -m tests.campaigns NAME [OPTION ...]` runs a campaign; without a name it lists them.
 
 A campaign is a measurement or a set of tests that takes too long, or needs too much of the machine,
-for `make test-all`. Run `make lint` first (on a board, `make demo`). Each campaign installs the Debian packages and wheels
-that it lacks. Its options are appended to the command that the list shows, so the last value counts.
+for `make test-all`. Run `make lint` first (on a board, `make demo`). Each campaign installs the
+Debian packages and wheels that it lacks. Its options are appended to the command that the list
+shows, so the last value counts.
 """
 
 from __future__ import annotations

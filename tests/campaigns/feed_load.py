@@ -128,7 +128,8 @@ def measure(
             for name, kind in kinds.items():
                 _slot(name, path, box, listener, kind)
                 report(
-                    f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a core, {kind.rss_kib[-1]} KiB"
+                    f"{turn + 1}  {name:<10} {100 * kind.shares[-1]:5.2f} % of a "
+                    f"core, {kind.rss_kib[-1]} KiB"
                 )
         box.stop()
     return kinds, rss_kib, dict(box.about())
@@ -253,11 +254,14 @@ def table(content: dict[str, Any]) -> str:
     """The measurements in Markdown."""
     figures = content["readers"]
     rows = [
-        f"Measured by `python -m tests.campaigns.feed_load`, {figures['0']['seconds']} s of each kind in turns of {SLOT_S:g} s, on "
-        f"{content['machine']}{', with real-time priority' * content['real_time']}; load average {content['load']:.1f} by other "
+        f"Measured by `python -m tests.campaigns.feed_load`, {figures['0']['seconds']} s of each "
+        f"kind in turns of {SLOT_S:g} s, on "
+        f"{content['machine']}{', with real-time priority' * content['real_time']}; "
+        f"load average {content['load']:.1f} by other "
         f"work; commit {content['commit'][:12]}.",
         "",
-        "| readers | share of a core | more than without | in the feed | memory, more | sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
+        "| readers | share of a core | more than without | in the feed | memory, more | "
+        "sentence, after the quickest, p50 / p99 | in the box, p50 / p99 | answers | frames lost |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, one in figures.items():
@@ -268,8 +272,10 @@ def table(content: dict[str, Any]) -> str:
         )
         late, latency = one["late_ms"], one["latency_ms"]
         rows.append(
-            f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {100 * one['inside']:.2f} % | {one['memory_mib']:.2f} MiB | "
-            f"{late['p50']:.1f} / {late['p99']:.1f} ms | {latency['p50']:.2f} / {latency['p99']:.2f} ms | "
+            f"| {NAMES[name]} | {100 * one['share']:.2f} % | {more} | {100 * one['inside']:.2f} "
+            f"% | {one['memory_mib']:.2f} MiB | "
+            f"{late['p50']:.1f} / {late['p99']:.1f} ms | {latency['p50']:.2f} "
+            f"/ {latency['p99']:.2f} ms | "
             f"{one['answers']} | {one['frames_lost']} |"
         )
     return "\n".join(rows)

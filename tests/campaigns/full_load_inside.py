@@ -1,7 +1,7 @@
 """A box that is counted apart from its own counters: `python -m tests.campaigns.full_load_inside
 FILE FOLDER STATE_S COMMAND...`. COMMAND is the command line of `palpate`. FOLDER is for recordings,
-"" for none. STATE_S is the time between two STA sentences. Writes FILE, whose lines of JSON say what
-came in and went out.
+"" for none. STATE_S is the time between two STA sentences. Writes FILE, whose lines of JSON say
+what came in and went out.
 
 The recording is that of `palpate record`; here a box records and classifies at once, which is more
 than any command asks of it.

@@ -126,11 +126,17 @@ def _of_box(box: Json) -> Iterator[str]:
         yield f"the skin was lost and found {box['found'] - 1} times"
     # the sweep that is open at the end is answered without a stop edge
     if not 0 <= box["answered"] - box["stops"] <= 1 or box["answers"] != box["answered"]:
-        yield f"{box['stops']} stop edges, {box['answered']} answers, of which observers saw {box['answers']}"
+        yield (
+            f"{box['stops']} stop edges, {box['answered']} answers, of which observers "
+            f"saw {box['answers']}"
+        )
     if box["twice"]:
         yield f"{box['twice']} answers came twice"
     if box["said"] != box["heard"] + box["dropped"]:
-        yield f"{box['said']:,} sentences were sent, {box['heard']:,} came and {box['dropped']:,} are counted as dropped"
+        yield (
+            f"{box['said']:,} sentences were sent, {box['heard']:,} came "
+            f"and {box['dropped']:,} are counted as dropped"
+        )
     if box["calm"]["dropped"]:
         yield f"{box['calm']['dropped']} sentences dropped in the time without faults"
     if box["full"]:
@@ -158,11 +164,15 @@ def table(content: Json) -> str:
     boxes = content["boxes"]
     shown: Mapping[bool, str] = {False: "nothing attached", True: "all attached"}
     rows = [
-        f"Measured by `python -m tests.campaigns.full_load`, all boxes at the same time for {boxes[0]['seconds'] / 60:.3g} min without faults, "
-        f"on {content['machine']}{', with real-time priority' * content['real_time']}; load average {content['load'][0]:.1f} before, "
+        "Measured by `python -m tests.campaigns.full_load`, all boxes at the same time "
+        f"for {boxes[0]['seconds'] / 60:.3g} min without faults, "
+        f"on {content['machine']}{', with real-time priority' * content['real_time']}; "
+        f"load average {content['load'][0]:.1f} before, "
         f"{content['load'][1]:.1f} after; seed {content['seed']}, commit {content['commit'][:12]}.",
         "",
-        "| skin | box | frames | missing, of these counted | stop edges, answers | edge to sentence, p50 / p99 / most | in the box, p50 / p99 / most | longest turn | share of a core | memory, first, most |",
+        "| skin | box | frames | missing, of these counted | stop edges, answers | edge to "
+        "sentence, p50 / p99 / most | in the box, p50 / p99 / most | longest turn | share of a "
+        "core | memory, first, most |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for box in boxes:
@@ -172,15 +182,18 @@ def table(content: Json) -> str:
             for kind in ("edge", "in_box")
         )
         rows.append(
-            f"| {box['skin']}, {box['format']} | {shown[box['full']]} | {calm['came']:,} | {calm['missing']:,}, {calm['counted']:,} | "
-            f"{calm['stops']}, {calm['n']} | {edge} | {within} | {calm['turn_ms']['p100']:.0f} ms | {100 * calm['share']:.1f} % | "
+            f"| {box['skin']}, {box['format']} | {shown[box['full']]} | {calm['came']:,} "
+            f"| {calm['missing']:,}, {calm['counted']:,} | "
+            f"{calm['stops']}, {calm['n']} | {edge} | {within} | {calm['turn_ms']['p100']:.0f} "
+            f"ms | {100 * calm['share']:.1f} % | "
             f"{calm['first_mib']}, {calm['most_mib']} MiB |"
         )
     rows += [
         "",
         "Then faults, each with the 10 s after it:",
         "",
-        "| fault | skin | box | times | frames missing, counted | stop edges, answers | sentences dropped | answers |",
+        "| fault | skin | box | times | frames missing, counted | stop edges, answers | "
+        "sentences dropped | answers |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name in boxes[0]["faults"]:
@@ -188,7 +201,8 @@ def table(content: Json) -> str:
             one = box["faults"][name]
             answers = ", ".join(f"`{status}` {n}" for status, n in sorted(one["statuses"].items()))
             rows.append(
-                f"| {name} | {box['skin']} | {shown[box['full']]} | {one['times']} | {one['missing']:,}, {one['counted']:,} | "
+                f"| {name} | {box['skin']} | {shown[box['full']]} | {one['times']} "
+                f"| {one['missing']:,}, {one['counted']:,} | "
                 f"{one['stops']}, {one['answered']} | {one['dropped']:,} | {answers} |"
             )
     return "\n".join([*rows, "", *_wholes(content)])
@@ -200,14 +214,21 @@ def _wholes(content: Json) -> Iterator[str]:
     said, heard, dropped = (
         sum(box[name] for box in boxes) for name in ("said", "heard", "dropped")
     )
-    yield f"In the whole run {said:,} sentences were sent, {heard:,} came and {dropped:,} were counted as dropped.\n"
+    yield (
+        f"In the whole run {said:,} sentences were sent, {heard:,} came and {dropped:,} were "
+        "counted as dropped.\n"
+    )
     for box in boxes:
         if box["full"]:
             peers = content["peers"][box["skin"]]
             yield (
-                f"{box['skin']}: {box['recorded']:,} sweeps recorded, {box['kept'].get('full', 0)} while the disk was full, {box['black_box']} in the "
-                f"black box, {box['compared']:,} judged by the shadow; readers got {peers['feed']['verdict']:,} verdicts and "
-                f"{peers['feed']['frame']:,} frames, the page {peers['page']:,} events, robots at the bridges {peers['tcp']:,} and "
+                f"{box['skin']}: {box['recorded']:,} sweeps "
+                f"recorded, {box['kept'].get('full', 0)} while the disk was "
+                f"full, {box['black_box']} in the "
+                f"black box, {box['compared']:,} judged by the shadow; "
+                f"readers got {peers['feed']['verdict']:,} verdicts and "
+                f"{peers['feed']['frame']:,} frames, the page {peers['page']:,} events, robots "
+                f"at the bridges {peers['tcp']:,} and "
                 f"{peers['modbus']:,} answers.\n"
             )
     yield "By arithmetic from these shares, not measured, with all attached:\n"
@@ -218,8 +239,13 @@ def _slower(box: Json) -> str:
     """The share on a slower core, in proportion."""
     reading, share = box["reading"], box["calm"]["share"]
     slow = (
-        f"{100 * n * share:.0f} % of a core {word} times slower, reading alone {100 * n * reading:.0f} %"
-        + ": `palpate check` fails there" * (n * reading > MOST_READING)
+        f"{100 * n * share:.0f} % of a core {word} times slower, reading "
+        f"alone {100 * n * reading:.0f} %"
+        + ": `palpate check` fails there"
+        * (n * reading > MOST_READING)
         for n, word in ((6, "six"), (10, "ten"))
     )
-    return f"- {box['skin']}: {100 * share:.1f} % of a core here, reading alone {100 * reading:.1f} % (`palpate check`); {'; '.join(slow)}."
+    return (
+        f"- {box['skin']}: {100 * share:.1f} % of a core here, reading "
+        f"alone {100 * reading:.1f} % (`palpate check`); {'; '.join(slow)}."
+    )

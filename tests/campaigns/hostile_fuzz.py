@@ -264,7 +264,8 @@ def main() -> int:
         if record["done"] % BATCH == 0 or record["done"] == args.count:
             storage.put(args.out, (json.dumps(record, indent=1) + "\n").encode())
             print(
-                f"{record['done']} of {args.count}: {record['outcomes']}, finds {len(record['finds'])}",
+                f"{record['done']} of {args.count}: {record['outcomes']}, "
+                f"finds {len(record['finds'])}",
                 flush=True,
             )
     return 1 if record["finds"] else 0

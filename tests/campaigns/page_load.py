@@ -110,7 +110,10 @@ def main() -> int:
                 one.terminate()
                 one.wait(10)
     for one in results:
-        shown = f"{100 * one['share']:.1f} % of a core, {one['rss_kib'] / 1024:.0f} MiB resident, {one['pss_kib'] / 1024:.0f} MiB in proportion"
+        shown = (
+            f"{100 * one['share']:.1f} % of a core, {one['rss_kib'] / 1024:.0f} MiB "
+            f"resident, {one['pss_kib'] / 1024:.0f} MiB in proportion"
+        )
         print(f"{one['browsers']} browsers: {shown}, {one['events_s']:.0f} events a second")
     if args.out:
         about = {

@@ -40,7 +40,10 @@ def play(work: Path) -> Makes:
     def make(
         does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []
     ) -> ScenePlay:
-        code = "import os, sys; from pathlib import Path; from appliance.core import storage; f = Path(sys.argv[1])\n"
+        code = (
+            "import os, sys; from pathlib import Path; from appliance.core import storage; "
+            "f = Path(sys.argv[1])\n"
+        )
 
         def prepare(folder: Path) -> None:
             exec(code.replace("sys.argv[1]", repr(str(folder))) + before, {})
@@ -96,7 +99,8 @@ def test_a_renaming_is_never_half_done(play: Makes):
     folder is enough."""
     before = "[storage.put(f / name, name.encode()) for name in 'ab']; (f / 'x').mkdir()"
     played = play(
-        "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); storage.exchange(f / 'b', f / 'x' / 'a')",
+        "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); "
+        "storage.exchange(f / 'b', f / 'x' / 'a')",
         before,
     )
     assert left(played, "fsync") == [

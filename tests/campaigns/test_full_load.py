@@ -89,23 +89,23 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
     assert content["boxes"][1]["faults"]["disk full"]["missing"] == 0
     text = table(content)
     assert (
-        "for 1 min without faults, on m, with real-time priority; load average 1.5 before, 2.5 after; seed 7"
-        in text
+        "for 1 min without faults, on m, with real-time priority; "
+        "load average 1.5 before, 2.5 after; seed 7" in text
     )
     assert (
         "| papillarray, 3x3x3 | all attached | 6,000 | 0, 0 | 60, 60 | 5.5 / 6.0 / 6.0 ms |" in text
     )
     assert (
-        "| processor away | papillarray | nothing attached | 1 | 150, 150 | 12, 12 | 0 | `gap` 2, `unknown` 10 |"
-        in text
+        "| processor away | papillarray | nothing attached | 1 | 150, 150 | 12, 12 | 0 | `gap` "
+        "2, `unknown` 10 |" in text
     )
     assert (
-        "- papillarray: 10.0 % of a core here, reading alone 7.0 % (`palpate check`); 60 % of a core six times slower"
-        in text
+        "- papillarray: 10.0 % of a core here, reading alone 7.0 % (`palpate check`); "
+        "60 % of a core six times slower" in text
     )
     assert (
-        "reading alone 42 %; 100 % of a core ten times slower, reading alone 70 %: `palpate check` fails there."
-        in text
+        "reading alone 42 %; 100 % of a core ten times slower, reading alone 70 %: `palpate "
+        "check` fails there." in text
     )
     assert (
         "In the whole run 1,800 sentences were sent, 1,800 came and 0 were counted as dropped."

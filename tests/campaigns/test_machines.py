@@ -160,7 +160,8 @@ def test_what_int8_computes_is_the_same_to_the_bit(
         if what.endswith(" inside/shown"):
             other = np.abs(there_result[what].astype(int) - here[what])
             print(
-                f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up to {other.max()}"
+                f"{name}: {what}: {np.count_nonzero(other)} of {other.size} differ, by up "
+                f"to {other.max()}"
             )
             assert np.mean(other > 0) < 1e-4
 

@@ -667,7 +667,8 @@ def test_the_page_needs_nothing_else_and_tells_all(result):
     text = PageReader(html).text
     assert re.search(r"This machine: \d of 7 targets reached\.", text)
     assert re.search(
-        r"The virtual box: \d of 7 targets reached; missed: sentences out of order, broken or missing, 1",
+        r"The virtual box: \d of 7 targets reached; missed: sentences out of order, broken or "
+        r"missing, 1",
         text,
     )
 

@@ -30,7 +30,8 @@ KEPT = "kept/sweeps"
 """Folder below that of the scene; it does not exist at first, so the program that makes it must
 sync it too."""
 HEARD = re.compile(
-    r",REC,(?P<id>\d+),stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|^(?P<how>discard\w+) (?P<gone>\S+)",
+    r",REC,(?P<id>\d+),stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|"
+    r"^(?P<how>discard\w+) (?P<gone>\S+)",
     re.MULTILINE,
 )
 Files = Mapping[Path, bytes]

@@ -33,7 +33,8 @@ def show(cell: Cell, sweeps: int) -> None:
         cell.lines.wait("RESULT-VALID", True, 5)
         heard_ns = next(t for t, line in reversed(cell.serial.heard) if ",RES," in line)
         print(
-            f"{touch.act.label:<15} -> {answer.status} {answer.label:<15} {answer.probability:.3f}  class bits "
+            f"{touch.act.label:<15} "
+            f"-> {answer.status} {answer.label:<15} {answer.probability:.3f}  class bits "
             f"{cell.lines.code()}  {(heard_ns - touch.stop_ns) / 1e6:.1f} ms from edge to sentence",
             flush=True,
         )
@@ -44,7 +45,8 @@ def shell(cell: Cell) -> None:
     the robot sweep."""
     cell.plug()
     print(
-        "a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line ends"
+        "a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line "
+        "ends"
     )
     while line := input("box# ").strip():
         if line == "sweep":

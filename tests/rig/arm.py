@@ -13,7 +13,8 @@ import sys
 
 NEW_NAMESPACES = 0x20000 | 0x10000000  # CLONE_NEWNS, CLONE_NEWUSER
 FOLDER = b"/proc/sys/fs/binfmt_misc"
-# ELF, 64 bits, little-endian, a program or a library, for machine 183; a mask of the bits that may differ
+# ELF, 64 bits, little-endian, a program or a library, for machine 183; a mask of the bits that may
+# differ
 MAGIC = rb"\x7fELF\x02\x01\x01\x00\x00\x00\x00\x00\x00\x00\x00\x00\x02\x00\xb7\x00"
 MASK = rb"\xff\xff\xff\xff\xff\xff\xff\x00\xff\xff\xff\xff\xff\xff\xff\xff\xfe\xff\xff\xff"
 

@@ -238,7 +238,8 @@ def guest_lock() -> str:
     """The locked dependencies for the guest's Python and processor; pip would choose them for this
     machine's."""
     return run_here(
-        f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', 'aarch64'))"
+        f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', "
+        "'aarch64'))"
     )
 
 
@@ -246,15 +247,21 @@ def _make_root(part: Path, version: str) -> None:
     """Debian with the box's virtual environment, the agent and the modules of its kernel."""
     shutil.copy(part / emulated_machines.LOCK.name, part / "wheels")
     (part / "wheels").chmod(0o755)
-    pip = "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links /wheels"
+    pip = (
+        "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links "
+        "/wheels"
+    )
     hooks = (
         f"copy-in {part / 'wheels'} /",
-        f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service $1/etc/systemd/system/",
+        f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service "
+        "$1/etc/systemd/system/",
         'chroot "$1" python3 -m venv /opt/palpate',
         f'chroot "$1" {pip} --require-hashes -r /wheels/{emulated_machines.LOCK.name}',
-        'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
+        'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; '
+        'echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
         'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
-        'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer e2scrub_reap.service '
+        'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer '
+        "e2scrub_reap.service "
         "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
         'chroot "$1" systemctl disable ssh.service systemd-networkd.service',
     )

@@ -187,14 +187,16 @@ def progress(run: SoakRun) -> str:
     results = soak_judge.sums({"runs": [asdict(run)]})
     memory = f"{results['rss_kib'][-1] / 1024:.1f} MiB, " if results["rss_kib"] else ""
     return (
-        f"{run.length_s / 60:.0f} min, {results['answers']} sweeps, {results['unanswered']} unanswered, {results['wrong']['n']} "
-        f"wrong, {memory}{results['lost']} frames lost, {results['unaccounted']} unaccounted for, {results['faults']} faults"
+        f"{run.length_s / 60:.0f} min, {results['answers']} sweeps, {results['unanswered']} "
+        f"unanswered, {results['wrong']['n']} "
+        f"wrong, {memory}{results['lost']} frames lost, {results['unaccounted']} unaccounted "
+        f"for, {results['faults']} faults"
     )
 
 
 def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
-    """The runs of an interrupted soak and its start time. The list is empty and the time is now if there is
-    no record, or if its code, seed or machine differ."""
+    """The runs of an interrupted soak and its start time. The list is empty and the time is now if
+    there is no record, or if its code, seed or machine differ."""
     if path.exists():
         held = json.loads(path.read_text())
         if all(held.get(name) == value for name, value in about.items()):
@@ -271,12 +273,14 @@ def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for name in SAME:
             if other[name] != first[name]:
                 raise ValueError(
-                    f"{name} is {other[name]!r} in one record, {first[name]!r} in another; join like ones"
+                    f"{name} is {other[name]!r} in one record, {first[name]!r} in another; "
+                    "join like ones"
                 )
         for run in (SoakRun(**run) for run in other["runs"]):
             if any(run.seed == held.seed for held in runs):
                 raise ValueError(
-                    f"two runs have the seed {run.seed}: the same sweeps; give each soak its own --seed"
+                    f"two runs have the seed {run.seed}: the same sweeps; "
+                    "give each soak its own --seed"
                 )
             runs.append(_moved(run, sum(held.length_s for held in runs)))
     return first | {"runs": [asdict(run) for run in runs]}
@@ -321,7 +325,8 @@ def draw(works: Sequence[Path], out: Path, page: Path) -> bool:
         for what, wanted, came, met in soak_judge.targets(box["sums"]):
             mark = {True: "ok  ", False: "FAIL", None: "    "}[met]
             print(
-                f"{mark} {name:<13} {what}: {came} (wanted {wanted}){'' if met is not None else ', too short to judge'}"
+                f"{mark} {name:<13} {what}: {came} "
+                f"(wanted {wanted}){'' if met is not None else ', too short to judge'}"
             )
             reached &= met is not False
     return reached and bool(records)
@@ -360,7 +365,8 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="WORK",
-        help="where a soak with another --seed is kept, whose runs are joined when the page is drawn",
+        help="where a soak with another --seed is kept, whose runs are joined when the page is "
+        "drawn",
     )
     parser.add_argument(
         "--draw",

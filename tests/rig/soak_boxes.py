@@ -284,7 +284,8 @@ class ThisMachine:
             "onnxruntime": ort.__version__,
         }
         return {
-            "what": "palpate run --sim skin, the serial line a pseudo-terminal; its memory holds the simulated skin too",
+            "what": "palpate run --sim skin, the serial line a pseudo-terminal; "
+            "its memory holds the simulated skin too",
             "machine": f"{platform.machine()}, {os.cpu_count()} cores, Linux {platform.release()}",
             "versions": versions,
         }

@@ -173,8 +173,10 @@ class VirtualBox:
         """As BoxUnderTest; only describes the emulated machine, since the guest does not run
         yet."""
         return {
-            "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines and its serial port",
-            "machine": f"QEMU {' '.join(image.MACHINE[1:])}, on {platform.machine()}, {os.cpu_count()} cores",
+            "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines "
+            "and its serial port",
+            "machine": f"QEMU {' '.join(image.MACHINE[1:])}, "
+            f"on {platform.machine()}, {os.cpu_count()} cores",
             "versions": {
                 "debian": image.SUITE,
                 "python": image.GUEST_PYTHON,

@@ -46,7 +46,10 @@ an emulator."""
 TRIES = 3
 """Sweeps until one is named: while an emulator is busy with something else, one may come to
 nothing."""
-NETWORK = "[Match]\nType=ether\n[Network]\nAddress=10.0.2.15/24\nLinkLocalAddressing=no\nIPv6AcceptRA=no\n"
+NETWORK = (
+    "[Match]\nType=ether\n[Network]\nAddress=10.0.2.15/24\nLinkLocalAddressing=no\n"
+    "IPv6AcceptRA=no\n"
+)
 """What QEMU's network without a way out expects."""
 ROBOT_PORT = 'SUBSYSTEM=="tty", KERNELS=="0000:00:08.0", SYMLINK+="palpate-robot"\n'
 ADMIT = f"""set -e

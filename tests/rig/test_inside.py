@@ -13,7 +13,10 @@ from tests.rig.image import Image
 from tests.rig.inside import GuestControls, pack
 from tests.rig.machine import Guest
 
-PYTEST = "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/appliance/io/test_backends.py"
+PYTEST = (
+    "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider "
+    "tests/appliance/io/test_backends.py"
+)
 CODE = (
     "pyproject.toml",
     "tests/conftest.py",

@@ -27,7 +27,10 @@ PORT = "/dev/palpate-robot"
 DROPPED, LOST_FRAMES = 8, 5
 """Fields of STA, counted from 0."""
 AS_NOBODY = "setpriv --reuid nobody --regid dialout --clear-groups"
-HOLD = "import fcntl, sys, termios, time; f = open(sys.argv[1]); fcntl.ioctl(f, termios.TIOCEXCL); time.sleep(600)"
+HOLD = (
+    "import fcntl, sys, termios, time; f = open(sys.argv[1]); "
+    "fcntl.ioctl(f, termios.TIOCEXCL); time.sleep(600)"
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -146,7 +149,8 @@ def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
     for junk in (b"x" * size, rng.bytes(size)):
         since = len(cell.serial.heard)
         cell.serial.say(junk + b"\r\n")
-        cell.state()  # by then noise is separated from commands, and answered; a robot waits at least as long
+        # by then noise is separated from commands, and answered; a robot waits at least as long
+        cell.state()
         cell.serial.say(b"$PPLP,ID\r\n")
         cell.serial.wait_for("$PPLP,ANS,ID,ok", 60, since)
     assert len(cell.state()) == 17
@@ -198,7 +202,8 @@ def test_another_program_and_an_adapter(
         far = plug(cell, tmp_path / f"robot{i}")
         far.wait_for("$PPLP,STA,", 20)
         assert far.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")
-    cell.restore()  # an emulator that was busy with all this has a board with seconds of frames in hand
+    # an emulator that was busy with all this has a board with seconds of frames in hand
+    cell.restore()
     shown(cell)
     far.wait_for("$PPLP,RES,", 5)
     assert "it is opened again when it is back" in cell.journal()

@@ -78,7 +78,8 @@ class EndlessRobot:
                 at = [kill for kill in kills if last.start_ns < kill < last.stop_ns]
                 wrong += (
                     [
-                        f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, killed {at}"
+                        f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, "
+                        f"killed {at}"
                     ]
                     if at
                     else []
@@ -96,7 +97,8 @@ def kill(cell: Cell) -> int:
     """SIGKILL, as soon as there is a program to kill; when, in ns. READY falls, although nobody is
     there to lower it."""
     cell.machine.run(
-        "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; kill -KILL $pid",
+        "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; "
+        "kill -KILL $pid",
         timeout_s=60,
         check=True,
     )
@@ -151,8 +153,10 @@ def test_killed(image: Image, tmp_path: Path, count: Callable[..., int], note: C
     assert not any(line.get("harmed") for line in ledger.lines)
     note(
         "SIGKILL at a random moment",
-        f"READY again each time ({where}); {ledger.sum('owed')} of {ledger.sum('answered')} answered sweeps had to be "
-        f"kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not kept",
+        f"READY again each time ({where}); {ledger.sum('owed')} of {ledger.sum('answered')} "
+        "answered sweeps had to be "
+        f"kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not "
+        "kept",
         ledger.sum("back"),
     )
 
@@ -233,8 +237,10 @@ def test_power_cut(
     assert ledger.sum("lost") == ledger.sum("fsck") == ledger.sum("parts") == 0 < ledger.sum("owed")
     note(
         "power cut at a random moment",
-        f"it boots again each time ({where}), file system clean; {ledger.sum('owed')} of {ledger.sum('answered')} answered "
-        f"sweeps had to be kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not kept",
+        f"it boots again each time ({where}), file system clean; {ledger.sum('owed')} "
+        f"of {ledger.sum('answered')} answered "
+        f"sweeps had to be kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} "
+        "in progress not kept",
         ledger.sum("cut"),
     )
 

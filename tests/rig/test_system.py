@@ -178,7 +178,10 @@ def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., N
 def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
     """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when
     there is space."""
-    fill = "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; dd if=/dev/zero of={0}/fill2 2>/dev/null;"
+    fill = (
+        "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; "
+        "dd if=/dev/zero of={0}/fill2 2>/dev/null;"
+    )
     try:
         box.machine.run(fill.format("/run") + fill.format("/var"), timeout_s=200)
         box.unplug()
@@ -297,7 +300,8 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
         assert by_hand(box) == "not-ready"
         until_logged(
             box,
-            "skin may not be opened by this user (errno 13); install the udev rule, join group plugdev",
+            "skin may not be opened by this user (errno 13); "
+            "install the udev rule, join group plugdev",
         )
     finally:
         guest.run(
@@ -311,7 +315,8 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
     assert (
         journal_count(
             box,
-            f"record: sweep {answer.sweep} is not stored: Permission denied; see that {KEPT} may be",
+            f"record: sweep {answer.sweep} is not stored: Permission denied; "
+            f"see that {KEPT} may be",
         )
         == 1
     )

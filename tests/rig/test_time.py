@@ -164,7 +164,8 @@ def test_windows_lie_in_the_middle(
             max((apart for _, apart in found), key=abs),
         )
         seen.append(
-            f"at most {worst_ns / FRAME_NS:+.2f} frames beside the middle, {way_ns / 1e6:.2f} ms of them a transfer's way, "
+            f"at most {worst_ns / FRAME_NS:+.2f} frames beside the middle, {way_ns / 1e6:.2f} ms "
+            "of them a transfer's way, "
             f"known to {offset.within_ns / 1e6:.2f} ms"
         )
         unsure_ns = offset.within_ns + max(0, abs(ppm) - SLOPE_PPM) * 1e-6 * SPAN_S * 1e9

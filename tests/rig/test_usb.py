@@ -37,8 +37,11 @@ Note = Callable[[str, str, int], None]
 HUB = "0409:55aa"
 RESETS = {
     "reset of the device": "usbreset 1209:7ac7",
-    "root hub turned off and on": "cd /sys/bus/usb/devices/usb1; echo 0 > authorized; echo 1 > authorized",
-    "driver taken from the device and given back": "cd /sys/bus/usb/drivers/usb; echo 1-1 > unbind; echo 1-1 > bind",
+    "root hub turned off and on": "cd /sys/bus/usb/devices/usb1; echo 0 > authorized; "
+    "echo 1 > authorized",
+    "driver taken from the device and given back": "cd /sys/bus/usb/drivers/usb; "
+    "echo 1-1 > unbind; "
+    "echo 1-1 > bind",
 }
 
 

@@ -35,7 +35,8 @@ def test_sweeps_become_sentences_and_codes(cell: Cell, note: Callable[[str, str,
     assert right
     note(
         "none",
-        f"{right} right, others said why not; {statistics.median(ms):.0f} ms median from edge to sentence",
+        f"{right} right, others said why not; {statistics.median(ms):.0f} ms median from edge to "
+        "sentence",
         6,
     )
 

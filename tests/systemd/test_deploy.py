@@ -609,7 +609,8 @@ def test_what_a_box_says_comes_with_what_to_do(stderr: str, why: str):
     code = f"""
 import fleet
 from types import SimpleNamespace
-host = SimpleNamespace(name="box", run_shell_command=lambda *a, **k: (False, SimpleNamespace(stderr={stderr!r}, stdout="")))
+said = SimpleNamespace(stderr={stderr!r}, stdout="")
+host = SimpleNamespace(name="box", run_shell_command=lambda *a, **k: (False, said))
 try:
     fleet.FleetBox(host, False).run("copying", "tar")
 except fleet.Failed as e:
@@ -694,11 +695,13 @@ def test_another_system_is_refused_with_what_is_needed():
     code = """
 import install
 class Box:
-    def __init__(self, **outputs): self.outputs = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"} | outputs
+    good = {"looking at its system": "Debian\\namd64", "looking at /opt": "/"}
+    def __init__(self, **outputs): self.outputs = self.good | outputs
     def run(self, what, command, **options): return self.outputs.get(what, "")
     def report(self, text): pass
-for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"}, {"looking at its system": "Raspbian 11\\narmhf"},
-             {"looking at /opt": "/opt"}, {"asking for Python": "3.9.2"}):
+for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"},
+             {"looking at its system": "Raspbian 11\\narmhf"}, {"looking at /opt": "/opt"},
+             {"asking for Python": "3.9.2"}):
     try: install.install(Box(**outputs), None, "", "")
     except install.Failed as e: print(e)
 """
@@ -733,7 +736,10 @@ def test_the_lock_is_read_for_the_box_not_for_the_desktop():
     """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay
     with their packages."""
     for python, numpy in (("3.11.2", "2.4"), ("3.13.5", "2.5")):
-        code = f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, 'aarch64'))"
+        code = (
+            f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, "
+            "'aarch64'))"
+        )
         lock = run_here(code)
         (line,) = re.findall(r"^numpy==(\S+) \\$", lock, re.MULTILINE)
         assert line.startswith(numpy)

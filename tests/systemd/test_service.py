@@ -98,7 +98,10 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
     stays active without it."""
     service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}")
     machine.get("systemctl", "start", "--no-block", "palpate")
-    absent = r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps answered: \d"
+    absent = (
+        r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps "
+        r"answered: \d"
+    )
     service.until("StatusText", absent)
     time.sleep(2.1 * START_S)
     assert (service["ActiveState"], service["NRestarts"]) == ("activating", "0")

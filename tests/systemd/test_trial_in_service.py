@@ -46,7 +46,10 @@ class Cursed(usb.RigBackend):
 usb.RigBackend = Cursed
 sys.exit(main())
 """
-RUN = "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cursed.py run --sim skin --shadow\nRestartSec=100ms\n"
+RUN = (
+    "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cursed.py run --sim skin "
+    "--shadow\nRestartSec=100ms\n"
+)
 REAL = "ExecStart=\nExecStart=/opt/palpate/bin/palpate run\nRestartSec=100ms\n"
 AS_PALPATE = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
 LEFT = "has failed its trial, and "

@@ -24,10 +24,12 @@ while socket.socket().connect_ex(("127.0.0.1", 8137)) and time.monotonic() < end
     time.sleep(0.1)
 trusts = ssl.create_default_context(cafile="/etc/palpate/watch/certificate.pem")
 token = open("/etc/palpate/watch/token").read().strip()
-request = urllib.request.Request("https://127.0.0.1:8137/events", headers={"Authorization": f"Bearer {token}"})
+key = {"Authorization": f"Bearer {token}"}
+request = urllib.request.Request("https://127.0.0.1:8137/events", headers=key)
 with urllib.request.urlopen(request, context=trusts, timeout=20) as answer:
     found = {}
-    while "verdict" not in found and not (sys.argv[1:] and found.get("box", {}).get("there") is False):
+    absent = lambda: sys.argv[1:] and found.get("box", {}).get("there") is False
+    while "verdict" not in found and not absent():
         name, _, text = answer.readline().decode().strip().partition(": ")
         if name == "event":
             event = text
