@@ -1,9 +1,9 @@
-"""A command with the processor time of the box's feed counted: `python -m
-tests.campaigns.feed_inside FILE COMMAND...`. In: the command line of `palpate`. Out: what that
-gives; FILE holds the nanoseconds that the loop has spent in the feed so far.
+"""Runs a command and counts the processor time that the box's loop spends in the feed: `python -m
+tests.campaigns.feed_inside FILE COMMAND...`.
 
-The whole process varies by more than the feed takes, from one turn to the next: caches and memory
-are shared with others.
+COMMAND is the command line of `palpate`; FILE holds the nanoseconds up to now. The time of the
+whole process would not show the feed's share: it varies more from turn to turn, because caches and
+memory are shared with other programs.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _COUNT = struct.Struct("=q")
 
 
 def spent_ns(path: Path) -> int:
-    """What FILE holds."""
+    """The nanoseconds in FILE."""
     return int(_COUNT.unpack(path.read_bytes())[0])
 
 
 def count(path: Path, feed: type) -> None:
-    """From now on, have each of CALLS of the class `feed` add its processor time to the file."""
+    """From now on, add the processor time of each of CALLS of the class `feed` to the file."""
     path.write_bytes(_COUNT.pack(0))
     with path.open("r+b") as file:
         total = mmap.mmap(file.fileno(), _COUNT.size)
@@ -52,4 +52,4 @@ def count(path: Path, feed: type) -> None:
 
 if __name__ == "__main__":
     count(Path(sys.argv[1]), FeedServer)
-    sys.exit(main(sys.argv[3:]))  # without the program's own name
+    sys.exit(main(sys.argv[3:]))  # without the name of this program

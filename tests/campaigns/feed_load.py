@@ -1,11 +1,13 @@
 """The load of the feed's readers on the box: `python -m tests.campaigns.feed_load --minutes 5 --out
-docs/data/feed.json`. In: minutes for each kind of readers. Out: JSON and a table: share of a core,
-memory, latency and losses, with and without them; exit code 1 if a target was missed.
+docs/data/feed.json`, minutes for each kind of readers.
 
-One box (`palpate run --sim skin`, in real time) meets all kinds in turns of SLOT_S, so that all had
-the same machine. Box and listener run with real-time priority where `chrt` may be used: other
-programs of the machine then cost no latency. The time that the loop spends in the feed is counted
-separately, too (feed_inside).
+Prints a table and writes JSON: share of a core, memory, latency and losses, with and without
+readers. The exit code is 1 if a target was missed.
+
+One box (`palpate run --sim skin`, in real time) goes through all kinds in turns of SLOT_S, so that
+all run on the same machine. Box and listener run with real-time priority if `chrt` may be used, so
+that other programs of the machine cause no latency. The time that the loop spends in the feed is
+counted separately, too (feed_inside).
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ from train.studies import marked_text
 SLOT_S, SETTLE_S = 20.0, 2.0
 WAIT_S = 0.1
 SHARE, MIB, LATE_MS = 0.01, 2.0, 1.0
-"""Targets: additional share of a core, additional memory, additional time to the sentence in the
-median."""
+"""Targets: additional share of a core, additional memory, additional median time to the
+sentence."""
 LOST, DROPPED = 7, 10
 """Fields of an STA sentence, counted from the talker."""
 PACKET = 6
@@ -55,15 +57,15 @@ class Kind:
     wall_s: float = 0.0
     cpu_s: float = 0.0
     inside_s: float = 0.0
-    """Of cpu_s, in the feed."""
+    """The part of cpu_s that is spent in the feed."""
     shares: list[float] = field(default_factory=list)
     rss_kib: list[int] = field(default_factory=list)
     answers: list[tuple[float, int]] = field(default_factory=list)
-    """When each answer came, in seconds, and the frame at which its stop edge was."""
+    """The time of each answer, in seconds, and the frame of its stop edge."""
     latency_ms: list[float] = field(default_factory=list)
     way_ms: list[float] = field(default_factory=list)
-    """From the verdict, whose time has whole milliseconds, to the robot's end: what is not the
-    box's."""
+    """From the verdict, whose time has whole milliseconds, to the robot's end: the part outside the
+    box."""
     lost: int = 0
     dropped: int = 0
     faults: Counter[str] = field(default_factory=Counter)
@@ -79,7 +81,7 @@ class LatencyListener:
         self._next, self._counts = 1, (0, 0)
 
     def listen(self, seconds: float, kind: Kind) -> None:
-        """Note the sentences of so many seconds for `kind`."""
+        """Record the sentences of this many seconds for `kind`."""
         end_s = time.monotonic() + seconds
         before = self._counts
         while (left_s := end_s - time.monotonic()) > 0:
@@ -107,7 +109,8 @@ class LatencyListener:
 def measure(
     names: Sequence[str], minutes: float, seed: int, before: Sequence[str], report: Any
 ) -> tuple[dict[str, Kind], int, dict[str, Any]]:
-    """All kinds in turns; resident memory in KiB before there was any reader; what was measured."""
+    """Measure all kinds in turns. Returns the measurements, the resident memory in KiB before the
+    first reader, and a description of box and machine."""
     kinds = {name: Kind() for name in names}
     with ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "feed.sock"
@@ -122,7 +125,7 @@ def measure(
         stack.callback(box.close)
         box.start(seed, sweeps)
         listener = LatencyListener(box, sweeps)
-        listener.listen(30.0, Kind())  # the start, and the first sweeps
+        listener.listen(30.0, Kind())  # until the box has started and answered the first sweeps
         rss_kib = box.process()[0]
         for turn in range(max(1, round(minutes * 60 / SLOT_S))):
             for name, kind in kinds.items():
@@ -141,7 +144,7 @@ def _inside(feed: Path) -> Path:
 
 
 def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, kind: Kind) -> None:
-    """One turn of a kind: readers come, the box is watched, they go."""
+    """One turn of a kind: start its readers, watch the box, end them."""
     command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(path), name]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
@@ -160,11 +163,11 @@ def _slot(name: str, path: Path, box: ThisMachine, listener: LatencyListener, ki
 
 
 def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
-    """Milliseconds of each answer after the packet in which its stop edge came, less those of the
-    quickest answer of all.
+    """Milliseconds from the packet with the stop edge to each answer, minus those of the quickest
+    answer.
 
-    Packets begin at every sixth frame. At which of six is not known outside the box: it is where
-    answers differ least.
+    Packets begin at every sixth frame. The phase is not known outside the box, so it is chosen for
+    the smallest spread of the answers.
     """
 
     def after(begin: int) -> dict[str, Any]:
@@ -185,9 +188,9 @@ def lateness(kinds: dict[str, Kind]) -> dict[str, Any]:
 
 
 def result(kinds: dict[str, Kind], rss_kib: int) -> dict[str, Any]:
-    """Figures by kind. late_ms: see `lateness`. share_more: difference to no reader, mean of the
-    turns with a 95 % interval. inside: share of a core that the loop spends in the feed.
-    memory_mib: resident, more than before the first reader, the most of all turns."""
+    """Figures of each kind. late_ms: see `lateness`. share_more: difference to the turns without
+    readers, mean with a 95 % interval. inside: share of a core that the loop spends in the feed.
+    memory_mib: largest increase of resident memory since before the first reader."""
     late, figures = lateness(kinds), {}
     for name, kind in kinds.items():
         more = np.array(kind.shares) - np.array(kinds["0"].shares)
@@ -223,7 +226,7 @@ def slowest(late_ms: Any) -> list[tuple[int, float]]:
 
 
 def missed(figures: dict[str, Any]) -> list[str]:
-    """Targets that were not reached, in words."""
+    """The targets that were missed, in words."""
     found = []
     for name, one in figures.items():
         more_ms = one["late_ms"]["p50"] - figures["0"]["late_ms"]["p50"]

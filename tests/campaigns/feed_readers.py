@@ -1,9 +1,9 @@
-"""Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND`
-until its input ends. In: the socket, one of KINDS. Out: one line of JSON with the lines that they
-got.
+"""Programs at the box's feed, good and bad: `python -m tests.campaigns.feed_readers PATH KIND`,
+until standard input ends.
 
-All are in one process, which pauses between its rounds, so that it takes less than a core. It has
-the usual priority, also if its parent has another.
+PATH is the socket, KIND one of KINDS. Prints a line of JSON with the number of lines that they got.
+All are in one process, which pauses between its rounds, so it takes less than a core. It has normal
+priority, also if its parent has another.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from tests.factories.paths import ROOT
 ALL = b'{"frames": 20, "sweeps": true}\n'
 PAUSE_S = 0.002
 STORM = 1000
-"""Connections that are open at once while the feed is attacked, most of which the box has not taken
-up or has refused."""
+"""Number of connections that are open at once while the feed is attacked. The box has refused most
+of them or not accepted them yet."""
 KINDS = ("0", "1", "8", "64", "attacked", "bridge")
 
 Act = Callable[[], None]
@@ -43,7 +43,7 @@ def connected(address: Address) -> socket.socket | None:
     try:
         one.connect(address)
     except BlockingIOError:
-        if family == socket.AF_INET:  # it is on its way
+        if family == socket.AF_INET:  # the connection is being made
             return one
         one.close()
         return None
@@ -54,7 +54,7 @@ def connected(address: Address) -> socket.socket | None:
 
 
 def send(one: socket.socket, data: bytes) -> bool:
-    """Send what goes; False where the connection has ended."""
+    """Send as much as possible; False if the connection has ended."""
     try:
         one.send(data)
     except BlockingIOError:
@@ -92,7 +92,7 @@ def reader(path: str, seen: Counter[str]) -> Act:
 
 
 def silent(path: str, seen: Counter[str]) -> Act:
-    """One that asks for all and never reads."""
+    """A reader that asks for everything and never reads."""
     held: list[socket.socket] = []
 
     def act() -> None:
@@ -104,7 +104,7 @@ def silent(path: str, seen: Counter[str]) -> Act:
 
 
 def sluggish(path: str, seen: Counter[str]) -> Act:
-    """One that asks for all and takes some bytes now and then."""
+    """A reader that asks for everything and reads a few bytes now and then."""
     held: list[socket.socket] = []
 
     def act() -> None:
@@ -147,8 +147,9 @@ def talker(
 
 
 def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int = 20) -> Act:
-    """Connections by the hundred: as many as the box lets wait, held until there are STORM; the
-    oldest then go. half: what some of them say, and no more. burst: connections of a round."""
+    """Hundreds of connections: as many as the box lets wait, held until there are STORM; then the
+    oldest end. half: incomplete request that some of them send. burst: number of connections in a
+    round."""
     held: list[socket.socket] = []
 
     def act() -> None:
@@ -169,8 +170,8 @@ def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int 
 
 
 def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
-    """Those of a kind. Of 8 and 64 readers one never reads; attacked: eight good ones, and all that
-    is bad."""
+    """The programs of a kind. Of 8 and 64 readers, one never reads; attacked: eight good readers
+    and all bad programs."""
     if kind != "attacked":
         n = int(kind)
         return [reader(path, seen) for _ in range(n - (n > 1))] + [silent(path, seen)] * (n > 1)
@@ -192,7 +193,8 @@ def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
 
 
 def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
-    """One that asks again when it has its answer, as a controller does; answers are counted."""
+    """A peer that asks again when it has its answer, as a controller does; its answers are
+    counted."""
     held: list[socket.socket] = []
     asked = False
 
@@ -219,8 +221,8 @@ def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
 
 
 def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
-    """A Modbus bridge on the feed, whose own port is attacked: floods of requests, garbage, endless
-    frames, a storm."""
+    """A Modbus bridge on the feed, whose own port is attacked with floods of requests, garbage,
+    endless frames and a storm."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [
@@ -253,7 +255,7 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
 
 
 def main(path: str, kind: str) -> None:
-    """Until standard input ends."""
+    """Run until standard input ends."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     seen: Counter[str] = Counter()
     with ExitStack() as stack:

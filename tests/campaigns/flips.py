@@ -1,12 +1,12 @@
-"""Alters a signed bundle in every way. In: a signed bundle. Out: how many alterations a box
-accepted; any is a failure.
+"""Alters a signed bundle in every way, and counts the alterations that a box accepts; each is a
+failure.
 
-`python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest, random bits
-of the other files, swaps each file with that of another signed bundle, and tries bundles that are
-unsigned, wrongly signed, cut or older. The same of a bundle into which the box has enrolled a
-label, all bits of its enrolment among them, or some of them. Each one goes the way of a delivered
-bundle, `Store.install`. Bits of the signature's own file are not counted: some of its line ends,
-say, may be others, and it is the same signature of the same manifest.
+`python -m tests.campaigns.flips --out build/flips.json` flips every bit of a manifest and random
+bits of the other files, swaps each file with that of another signed bundle, and tries bundles that
+are unsigned, wrongly signed, truncated or older. It does the same with a bundle into which the box
+has enrolled a label, including all or some bits of its enrolment. Each is installed like a
+delivered bundle, with `Store.install`. Bits of the signature's own file do not count: its line
+ends, for example, may differ without changing the signature.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from tests.factories.deliveries import Delivery
 
 Files = dict[str, bytes]
 Case = tuple[str, str, Files]
-"""Of an alteration: its kind, which it is, and the files."""
+"""An alteration: its kind, a description, and the files."""
 FLIPS = 1000
 ENROLLED = "enrolled: "
-"""Begins the kinds of alterations of a bundle with an enrolled label."""
+"""Prefix of the kinds of alterations of a bundle with an enrolled label."""
 FLIPPED = f"a bit of {bundle.MANIFEST} flipped"
 
 
 def flipped(files: Files, name: str, bit: int) -> Files:
-    """With one bit of one file flipped."""
+    """The files with one bit of one file flipped."""
     data = bytearray(files[name])
     data[bit // 8] ^= 1 << bit % 8
     return files | {name: bytes(data)}
 
 
 def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Case]:
-    """One file with each of its bits flipped (None), or `count` of them drawn."""
+    """The files with each bit of one file flipped (None), or with each of `count` random bits."""
     bits = range(8 * len(files[name]))
     chosen = (
         bits
@@ -164,8 +164,8 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
 
 
 def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
-    """All alterations of a bundle that the box would take. manifest_bits: of all bits of its
-    manifest so many are drawn."""
+    """All alterations of a bundle that the box would accept. manifest_bits: number of bits of its
+    manifest that are drawn, None for all."""
     good, other = deliveries.files(3, box.key), another(box.key)
     assert not any(good[name] == other[name] for name in good)
     yield from others(good, box)
@@ -192,7 +192,7 @@ def tried(box: Delivery, case: Case) -> str:
 
 
 def believed(box: Delivery, files: Files) -> bool:
-    """Whether the signature by itself fits the manifest."""
+    """Whether the signature alone fits the manifest."""
     try:
         return bool(
             signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], box.how.signers)
@@ -204,11 +204,11 @@ def believed(box: Delivery, files: Files) -> bool:
 def campaign(
     folder: Path, manifest_bits: int | None, seed: int, every: int = 0
 ) -> dict[str, dict[str, int]]:
-    """By kind of alteration: how many were tried, how many accepted, how many refusals changed the
-    running bundle; and how many flipped manifests the signature alone let pass, which the box asks
-    after it has read them.
+    """For each kind of alteration: the number tried, the number accepted, and the number of
+    refusals that changed the running bundle. Also the number of flipped manifests that the
+    signature alone accepts; the box checks it after it has read them.
 
-    every: after so many alterations a line on standard output, 0 for none.
+    every: prints a line after this many alterations, 0 for none.
     """
     box = Delivery(folder)
     box.committed(1)
@@ -229,7 +229,7 @@ def campaign(
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
     for n, good in enumerate(
         (deliveries.files(3, box.key), another(box.key))
-    ):  # else all of this would prove nothing
+    ):  # otherwise the campaign would prove nothing
         box.store.install(
             deliveries.put(folder / f"good{n}", deliveries.enrolled(good, box.enrolment_key))
         )
@@ -238,7 +238,7 @@ def campaign(
 
 
 def main() -> int:
-    """Run the campaign and write its figures; 1 where anything was accepted."""
+    """Run the campaign and write its figures; 1 if any alteration was accepted."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.campaigns.flips",
         description="Counts the altered bundles that a box accepts.",

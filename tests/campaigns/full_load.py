@@ -1,12 +1,14 @@
-"""All that can be attached, at once and for long: `python -m tests.campaigns.full_load --minutes 60
---page docs/faults.md`. In: minutes, and how often each fault is made after them. Out:
-docs/data/full-load.json, tables; exit code 1 if a target was missed.
+"""All that can be attached to a box, at once and for long: `python -m tests.campaigns.full_load
+--minutes 60 --page docs/faults.md`.
 
-Of each skin there are two boxes side by side (`palpate run`, emulator and box processes of their
-own in real time): one with recording, black box, shadow, feed with eight readers, page and both
-bridges, and one with nothing. Frames, stop edges and sentences are counted in the box apart from
-its own counters (full_load_inside). Its sweeps lie on a small file system of their own, which is
-mounted from a file: that needs root.
+After these minutes, each fault is made several times. Writes docs/data/full-load.json and tables;
+the exit code is 1 if a target was missed.
+
+For each skin two boxes run side by side (`palpate run`, with emulators and boxes in processes of
+their own, in real time). The full box has recording, black box, shadow, a feed with eight readers,
+page and both bridges; the bare box has nothing. Frames, stop edges and sentences are counted in the
+box, independently of its own counters (full_load_inside). Its sweeps are on a small file system of
+their own, which is mounted from a file; mounting needs root.
 """
 
 from __future__ import annotations
@@ -49,20 +51,20 @@ from train.studies import marked_text
 
 SKINS = ("flexitac", "papillarray")
 SETTLE_S, LOOK_S, WAIT_S = 20.0, 5.0, 0.1
-"""Until the boxes are measured, between two looks at the processes, and longest wait for a line."""
+"""Time before the measurement, time between two samples of the processes, and longest wait for a
+line."""
 AWAY_S, FULL_S, DEAF_S, REST_S = 2.0, 15.0, 25.0, 10.0
-"""How long the processor is away, the disk full and the port blocked, and time after each for the
-box to come back."""
+"""Durations of the faults: the processor is away, the disk is full, the port is blocked; and the
+time after each for the box to recover."""
 KEPT = 100
 """Sweeps in the black box."""
 DISK_MB = 512
 CHECKS = 5
-"""A check listens for a second, in which a few percent vary."""
+"""Number of checks; a check listens for a second, and its results vary by a few percent."""
 MEMORY = Path("/dev/shm")
-"""Where logs and counts lie: one that waits for a disk that others keep busy would hold up the bare
-box, too."""
+"""Folder of logs and counts. Waiting for a busy disk would slow the bare box down, too."""
 STATE_S = 0.05
-"""Time between two STA: the line's buffers are then full soon after the robot has stopped
+"""Time between two STA; short, so that the line's buffers fill soon after the robot has stopped
 reading."""
 
 
@@ -79,10 +81,10 @@ class SkinBox(SharedLine):
 
 @dataclass
 class LoadedSide:
-    """One box and its robot. reading: share of a core that `palpate check` says reading its skin
-    takes. folder: its disk. heard: lines; results: of each sweep; kept: by outcome of REC. looks:
-    (time, processor seconds, KiB resident). timed: when each answer came, milliseconds in the box.
-    deaf: while it is set, nobody reads."""
+    """One box and its robot. reading: share of a core that reading its skin takes, from `palpate
+    check`. folder: its disk. heard: lines; results: of each sweep; kept: by outcome of REC. looks:
+    (time, processor seconds, KiB resident). timed: time of each answer, with its milliseconds in
+    the box. deaf: while it is set, nobody reads."""
 
     skin: str
     format: str
@@ -100,7 +102,7 @@ class LoadedSide:
     deaf: threading.Event = field(default_factory=threading.Event)
 
     def note(self, at_s: float, line: str) -> None:
-        """A line has come."""
+        """Handle a line from the box."""
         self.heard += 1
         if answer := Answer.read(line):
             self.results[answer.sweep] += 1
@@ -109,7 +111,7 @@ class LoadedSide:
             self.kept[line.split(",")[3]] += 1
 
     def listen(self, ended: threading.Event) -> None:
-        """Read the line until `ended`, before all usual processes."""
+        """Read the line until `ended`, in a thread of high priority."""
         load.hurry(load.BOX)
         while not ended.is_set():
             if self.deaf.is_set():
@@ -124,7 +126,7 @@ class LoadedSide:
         self.looks.append((time.monotonic(), cpu_s, kib))
 
     def result(self, phases: Sequence[Phase]) -> dict[str, Any]:
-        """All figures, once box and emulator have ended."""
+        """All figures, after box and emulator have ended."""
         agreed = shadow.read(self.folder / "shadow")
         return {
             "skin": self.skin,
@@ -150,7 +152,7 @@ class LoadedSide:
 
 @contextmanager
 def disk(folder: Path) -> Iterator[Path]:
-    """A small ext4 of its own, as on a card, mounted at `folder`."""
+    """A small ext4 file system, like a card, mounted at `folder`."""
     image = folder.with_suffix(".ext4")
     folder.mkdir(parents=True, exist_ok=True)
     with image.open("wb") as file:
@@ -171,7 +173,7 @@ def disk(folder: Path) -> Iterator[Path]:
 
 
 def fill(path: Path) -> None:
-    """Let the file `path` take all that its disk has left."""
+    """Make the file `path` so large that its disk is full."""
     with path.open("wb") as file:
         for size in (1 << 20, 1 << 12):
             try:
@@ -183,8 +185,8 @@ def fill(path: Path) -> None:
 
 
 class FullLoad:
-    """All sides at work, with one thread each that hears them. seen: by skin, the counts of the
-    peers of its full box."""
+    """All boxes at work, each read by a thread. seen: by skin, the counts of the peers of its full
+    box."""
 
     def __init__(
         self, stack: ExitStack, disks: Path, bundles: Mapping[str, Path], before: Sequence[str]
@@ -205,11 +207,11 @@ class FullLoad:
         self._heard: list[Future[None]] = [
             threads.submit(side.listen, self._ended) for side in self.sides
         ]
-        self.pass_time(LOOK_S)  # the feeds come
+        self.pass_time(LOOK_S)  # until the feeds exist
         self._peers = {side.skin: self._attach(side) for side in self.sides if side.full}
 
     def _side(self, stack: ExitStack, skin: str, path: Path, full: bool) -> LoadedSide:
-        """One box, started."""
+        """Start one box."""
         name = f"{skin}-{'full' if full else 'bare'}"
         format, counts, link = (
             bundle.load(path).format,
@@ -244,8 +246,7 @@ class FullLoad:
         return LoadedSide(skin, str(format), full, box, player, reading, counts, folder)
 
     def _reading(self, chosen: Sequence[str]) -> float:
-        """The share of a core that `palpate check` says reading a skin takes, the median of
-        CHECKS."""
+        """The share of a core that reading a skin takes, from `palpate check`, median of CHECKS."""
         command = [
             *self._before,
             sys.executable,
@@ -264,7 +265,7 @@ class FullLoad:
         return self._folder / f"{skin}-run" / "feed.sock"
 
     def _attach(self, side: LoadedSide) -> subprocess.Popen[bytes]:
-        """Bridges, page and peers come."""
+        """Start the bridges, the page and the peers."""
         enter, feed = self._attached.enter_context, self._feed(side.skin)
         ports = (
             enter(bridge("tcp", "--port", side.box.line))[1],
@@ -285,8 +286,8 @@ class FullLoad:
         return peers
 
     def pass_time(self, seconds: float) -> tuple[float, float]:
-        """Let the boxes work; the begin and end of that. Raises the error of a thread that hears
-        them."""
+        """Let the boxes work; returns begin and end of this phase. Raises the error of a thread
+        that reads them."""
         begin_s = time.monotonic()
         while (left_s := begin_s + seconds - time.monotonic()) > 0:
             for side in self.sides:
@@ -296,14 +297,14 @@ class FullLoad:
         return begin_s, time.monotonic()
 
     def processor_away(self) -> None:
-        """No box is run, while its skin goes on."""
+        """No box runs for a while, but its skin continues."""
         for number in (signal.SIGSTOP, signal.SIGCONT):
             for side in self.sides:
                 side.box.send(number)
             time.sleep(AWAY_S * (number is signal.SIGSTOP))
 
     def disk_full(self) -> None:
-        """The disks of the full boxes have no room."""
+        """The disks of the full boxes are full."""
         files = [side.folder / "filler" for side in self.sides if side.full]
         for file in files:
             fill(file)
@@ -320,7 +321,7 @@ class FullLoad:
             side.deaf.clear()
 
     def end(self) -> None:
-        """All goes, in order; the last lines are noted."""
+        """End everything in order, and handle the last lines."""
         self.seen = {skin: said(peers) for skin, peers in self._peers.items()}
         self._ended.set()
         for heard in self._heard:
@@ -342,7 +343,7 @@ FAULTS: dict[str, Callable[[FullLoad], None]] = {
 def measure(
     bundles: Mapping[str, Path], minutes: float, rounds: int, before: Sequence[str], disks: Path
 ) -> dict[str, Any]:
-    """The figures of all sides, what their peers got, and what machine this is."""
+    """The figures of all boxes, the counts of their peers, and a description of the machine."""
     with ExitStack() as stack:
         run = FullLoad(stack, disks, bundles, before)
         run.pass_time(SETTLE_S)

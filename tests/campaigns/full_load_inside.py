@@ -36,8 +36,8 @@ EVERY_NS = 500_000_000
 
 
 class InsideCount(FrameCheck):
-    """Writes to `file`: a line of counts twice a second, and one for each answer. It is the first
-    observer, so that an answer's time is not that of the recordings after it."""
+    """Writes to `file`: a line of counts twice a second, and a line for each answer. It is the
+    first observer, so an answer's time does not include the recordings after it."""
 
     def __init__(self, file: Path) -> None:
         super().__init__(SystemClock())
@@ -48,14 +48,14 @@ class InsideCount(FrameCheck):
         self._health: Health | None = None
 
     def listen(self, port: SerialSink) -> None:
-        """From now on, count the sentences that are said at this port."""
+        """From now on, count the sentences that are sent to this port."""
         plain = port.say
 
         def say(line: bytes) -> None:
             self._counts["said"] += 1
             plain(line)
 
-        port.say = say  # type: ignore[method-assign]  # this one port's
+        port.say = say  # type: ignore[method-assign]  # only of this port
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """As Observer."""
@@ -83,7 +83,7 @@ class InsideCount(FrameCheck):
             self.write_counts()
 
     def write_counts(self) -> None:
-        """All counts as they are now. turn_ms: the longest turn since the line before."""
+        """Write the present counts. turn_ms: the longest turn since the previous line."""
         health = self._health
         self._write(
             **self._counts,
@@ -102,8 +102,8 @@ class InsideCount(FrameCheck):
 
 
 def attach(file: Path, folder: str, state_s: float) -> None:
-    """From now on, let each box that is put together be counted, record to `folder`, and send its
-    state every `state_s`."""
+    """From now on, each box that is assembled is counted, records to `folder`, and sends its state
+    every `state_s`."""
     plain = assembly.box
 
     def box(
@@ -119,7 +119,7 @@ def attach(file: Path, folder: str, state_s: float) -> None:
         settings = replace(settings, serial=replace(settings.serial, state_s=state_s))
         count = InsideCount(file)
         count.listen(port)
-        stack.callback(count.write_counts)  # after what is open was answered
+        stack.callback(count.write_counts)  # after open sweeps were answered
         recordings = []
         if folder:
             labels = Labels("wood", "p1", "load")
@@ -142,4 +142,4 @@ def attach(file: Path, folder: str, state_s: float) -> None:
 
 if __name__ == "__main__":
     attach(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
-    sys.exit(main(sys.argv[5:]))  # without the program's own name
+    sys.exit(main(sys.argv[5:]))  # without the name of this program

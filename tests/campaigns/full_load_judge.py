@@ -1,5 +1,5 @@
-"""The judgement of a box under full load. In: the lines of its counts, phases, its robot's
-sentences. Out: figures, targets that were missed in words, tables in Markdown."""
+"""The judgement of a box under full load: figures, missed targets in words, and tables, from its
+counts, the phases and its robot's sentences."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tests.campaigns.feed_load import LATE_MS
 Json = dict[str, Any]
 COUNTS = ("came", "missing", "counted", "stops", "answered", "said", "dropped")
 Phase = tuple[str, float, float]
-"""Name, begin and end in seconds; "calm" is the time without faults."""
+"""Name, begin and end in seconds; "calm" is the phase without faults."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, 99th percentile and the largest."""
+    """Median, 99th percentile and maximum."""
     return (
         {f"p{q}": round(float(np.percentile(values, q)), 2) for q in (50, 99, 100)}
         if len(values)
@@ -33,10 +33,10 @@ def figures(
     timed: Sequence[tuple[float, float]],
     looks: Sequence[tuple[float, float, int]],
 ) -> Json:
-    """Of one box: counts of the whole run; of the calm phase share, memory and times; of each kind
-    of fault its counts.
+    """The figures of one box: counts of the whole run; share, memory and times of the calm phase;
+    counts of each kind of fault.
 
-    timed: (when a sentence came, milliseconds in the box). looks: (when, processor seconds, KiB
+    timed: (time of a sentence, milliseconds in the box). looks: (time, processor seconds, KiB
     resident).
     """
     counts = [line for line in lines if "came" in line]
@@ -91,7 +91,7 @@ def _fault(
 
 
 def missed(content: Json) -> list[str]:
-    """Targets that were not reached, in words."""
+    """The targets that were missed, in words."""
     found = []
     for box in content["boxes"]:
         name = f"{box['skin']}, {'all attached' if box['full'] else 'bare'}"
@@ -148,10 +148,12 @@ def _of_box(box: Json) -> Iterator[str]:
 
 
 def told(box: Json) -> bool:
-    """Whether the box reports all missing frames. For a skin without a count the box reports that
-    losses cannot be seen. Then only their duration is left: it may err by a frame in each stop of
-    the processor, and by any number upwards, where a machine that passes bytes on late makes good
-    frames look lost."""
+    """Whether the box reports all missing frames.
+
+    For a skin without a count, the box reports that losses cannot be seen, and only the time of the
+    loss remains. This may err by a frame in each stop of the processor, and upwards by any number,
+    because good frames look lost if the machine passes bytes on late.
+    """
     if box["loss_known"]:
         return bool(box["missing"] == box["counted"])
     return bool(

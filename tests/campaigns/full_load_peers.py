@@ -1,9 +1,9 @@
-"""All peers of one box: `python -m tests.campaigns.full_load_peers FEED TCP MODBUS PAGE` until its
-input ends. In: the feed's socket, the ports of the bridges and of the page. Out: one line of JSON
-with the counts of each.
+"""All peers of one box: `python -m tests.campaigns.full_load_peers FEED TCP MODBUS PAGE`, until
+standard input ends.
 
-Eight readers of the feed, one of them never reads; a robot at each bridge that asks some times a
-second; a browser at the page.
+The arguments are the feed's socket and the ports of the bridges and of the page. Prints a line of
+JSON with the counts of each peer: eight readers of the feed, of them one that never reads; a robot at
+each bridge that asks a few times a second; a browser at the page.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from tests.robots.attackers import READ
 
 READERS = "8"
 ROUNDS = 50
-"""Rounds from one step of a robot to the next: it asks in one, and takes the answer in another."""
+"""Rounds between two steps of a robot: it asks in one round, and reads the answer in another."""
 
 
 def main(feed: str, tcp: int, modbus: int, page: int) -> None:
-    """Until standard input ends."""
+    """Run until standard input ends."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     read: Counter[str] = Counter()
     robots = {"tcp": Counter[str](), "modbus": Counter[str]()}

@@ -1,11 +1,11 @@
-"""The campaign of fuzzed models: our own, changed at random, through the box's check, onnxruntime
-and a run; and of fuzzed enrolments, beside the default bundle, through their check and the
-classifier.
+"""The campaign of fuzzed models and enrolments. Our own models, changed at random, go through the
+box's check, onnxruntime and a run; fuzzed enrolments beside the default bundle go through their
+check and the classifier.
 
-`python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (make it `nice`; a
-stopped one goes on where it was). Each model is opened in a child that may take 256 MB more than it
-had and ten seconds; the result is how many hung it, killed it, or went beyond that memory. Seed and
-number identify a model.
+`python -m tests.campaigns.hostile_fuzz --count 10000 --seed 1 --out FILE.json` (run it with `nice`;
+it continues an interrupted campaign). Each model is opened in a child with a limit of 256 MB more
+memory and ten seconds. The result is the number of models that hung the child, killed it, or
+exceeded the memory. Seed and number identify a model.
 """
 
 from __future__ import annotations
@@ -42,19 +42,20 @@ from train.metrics.score import provenance
 
 DEADLINE_S = 10.0
 MOST_MORE = 256 << 20
-"""Bytes that a child may ask for beyond what it has."""
+"""Additional memory that a child may take, in bytes."""
 BATCH = 50
-"""Models that a child takes one after another: a fork for each costs more than the model."""
+"""Models that a child tries one after another: a fork for each would take longer than the model."""
 GROWN = 0.25
-"""Share of models that grow by the check's own rules instead of being one of ours that was changed:
-they reach farther."""
+"""Share of models that are grown by the check's own rules, instead of changed from ours: they reach
+more operators."""
 ENROLLED = 0.1
 """Share of enrolments."""
 ENROLLING = Own("enrolment", b"", bundle.load(bundle.DEFAULT).manifest)
-"""Stands for the default bundle with an enrolment; the bytes are those of the enrolment."""
+"""Stands for the default bundle with an enrolment; its bytes are replaced by those of the
+enrolment."""
 GROWING = Own("grown", b"", Manifest("grown", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {}))
 SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
-"""What may become of a model; anything else is a find."""
+"""The expected outcomes of a model; any other is a find."""
 
 
 def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
@@ -78,9 +79,9 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
         outcome, why = "no number", str(e)
     except MemoryError:
         outcome = "no memory"
-    except Exception as e:  # onnxruntime's own classes share no base but this
+    except Exception as e:  # onnxruntime's classes have no other common base
         if outcome == "refused" and not isinstance(e, BundleError):
-            raise  # the check may refuse in one way only: the child dies
+            raise  # the check may only raise BundleError, so the child dies
         why = str(e)
     took = time.perf_counter() - begin
     if any(word in why for word in ("bad_alloc", "bad allocation", "Failed to allocate")):
@@ -107,7 +108,7 @@ def checked(model: bytes, own: Own) -> Bundle | None:
 
 
 def run(opened: Any, rng: Random) -> None:
-    """Three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError where a
+    """Run three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError if a
     classifier names a material without a probability."""
     if isinstance(opened, Classifier):
         classify(opened, rng)
@@ -121,8 +122,8 @@ def run(opened: Any, rng: Random) -> None:
 
 
 def classify(classifier: Classifier, rng: Random) -> None:
-    """The same by a classifier, with the golden sweeps, which have contact and get as far as the
-    class means."""
+    """Classify these sweeps, and the golden sweeps, which have contact and so reach the class
+    means."""
     f = classifier.format
     noise = (
         np.random.default_rng(rng.getrandbits(32))
@@ -142,7 +143,7 @@ def classify(classifier: Classifier, rng: Random) -> None:
 
 
 def memory(name: str) -> int:
-    """kB, as the kernel counts them."""
+    """An entry of the process's memory status, in kB."""
     line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith(name))
     return int(line.split()[1])
 
@@ -173,7 +174,7 @@ class Fuzz:
                 at = result["number"] + 1
 
     def _child(self, numbers: range) -> Iterator[dict[str, Any]]:
-        """A child tries these; the last result is of the model that ended it, where one did."""
+        """A child tries these models. If a model ended the child, it is the last result."""
         into, out = os.pipe()
         pid = os.fork()
         if not pid:
@@ -186,7 +187,7 @@ class Fuzz:
                 there = select.select([into], [], [], DEADLINE_S)[0]
                 more = os.read(into, 65536) if there else b""
                 if not more:
-                    os.kill(pid, signal.SIGKILL)  # it hangs, or has ended
+                    os.kill(pid, signal.SIGKILL)  # it hangs, or has ended already
                     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                     pid = 0
                     outcome = f"died ({code})" if there else "hung"
@@ -215,7 +216,8 @@ class Fuzz:
             size = memory("VmSize") * 1024 + MOST_MORE
             resource.setrlimit(resource.RLIMIT_AS, (size, size))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # onnxruntime prints what it refuses
+            # onnxruntime prints the models that it refuses
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
             for number in numbers:
                 result = {"number": number} | tried(*self.model(number))
                 os.write(out, json.dumps(result).encode() + b"\n")
@@ -225,7 +227,7 @@ class Fuzz:
 
 
 def fresh(seed: int) -> dict[str, Any]:
-    """A campaign in which nothing was done yet."""
+    """The record of a campaign that has not begun."""
     return provenance() | {
         "seed": seed,
         "done": 0,
@@ -238,7 +240,7 @@ def fresh(seed: int) -> dict[str, Any]:
 
 
 def note(record: dict[str, Any], result: dict[str, Any]) -> None:
-    """One result more."""
+    """Add a result to the record."""
     outcome = result["outcome"]
     record["done"] += 1
     record["outcomes"][outcome] = record["outcomes"].get(outcome, 0) + 1
@@ -249,7 +251,7 @@ def note(record: dict[str, Any], result: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """1 where a model was a find."""
+    """Run the campaign; 1 if a model was a find."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)

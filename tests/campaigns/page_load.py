@@ -1,10 +1,10 @@
 """The load of the page: `python -m tests.campaigns.page_load --seconds 60 --out
-docs/data/page-load.json`. In: seconds for each number of browsers. Out: a table and JSON: memory
-and share of a core of `palpate watch --web`, with none, one and eight browsers.
+docs/data/page-load.json`, seconds for each number of browsers.
 
-One box (`palpate run --sim skin`, in real time) and one page; the numbers of browsers take turns. A
-browser here is a connection that reads all events and asks for the picture of each sweep, as the
-page's script does; the load of a tablet is not measured.
+Prints a table and writes JSON: memory and share of a core of `palpate watch --web` with none, one
+and eight browsers. One box (`palpate run --sim skin`, in real time) and one page run; the numbers
+of browsers take turns. A browser is a connection that reads all events and requests the picture of
+each sweep, as the page's script does; the load of a tablet is not measured.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RUN = [sys.executable, "-m", "appliance"]
 
 
 def used(pid: int) -> tuple[float, int, int]:
-    """Seconds of processor, KiB resident and KiB in proportion of a process."""
+    """Processor seconds, KiB resident and KiB proportional (PSS) of a process."""
     parts = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     kib = dict(
         re.findall(r"(?m)^(Rss|Pss):\s+(\d+) kB", Path(f"/proc/{pid}/smaps_rollup").read_text())
@@ -46,7 +46,7 @@ def used(pid: int) -> tuple[float, int, int]:
 
 
 def browse(page: PageAddress, ended: threading.Event, read: list[int]) -> None:
-    """Read events as a page does, and ask for the picture of each sweep."""
+    """Read events as a page does, and request the picture of each sweep."""
     with suppress(OSError, EOFError):
         reader = EventReader(page)
         while not ended.is_set():
@@ -84,7 +84,7 @@ def measured(pid: int, page: PageAddress, browsers: int, seconds: float) -> dict
 
 
 def main() -> int:
-    """Measure and print; 0."""
+    """Measure and print; returns 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--out", type=Path)

@@ -1,6 +1,5 @@
-"""The content of the disk after a kill or a loss of power at any moment: a small part of `python -m
-tests.cuts`, and whether that finds programs that are wrong on purpose.
-"""
+"""Cuts: the disk's content after a kill or a loss of power at any moment, for a small part of
+`python -m tests.cuts`; programs that are wrong on purpose are found."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def work() -> Iterator[Path]:
 
 @pytest.fixture
 def play(work: Path) -> Makes:
-    """Plays lines of Python, which find the folder in `f`, after others that have prepared it."""
+    """Plays lines of Python, whose folder is `f`, after other lines that prepare it."""
 
     def make(
         does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []
@@ -63,13 +62,13 @@ def left(play: ScenePlay, call: str | None) -> list[tree.Tree]:
 
 
 def wrong(points: list[CrashPoint]) -> list[str]:
-    """All that was found wrong."""
+    """All faults that were found."""
     return [f"{p.step}, {p.how} before {p.call}: {text}" for p in points for text in p.wrong]
 
 
 def test_what_is_not_synced_may_be_there_or_not(play: Makes):
-    """A new file: no name, or a name with nothing, half, zeros or all; with its content synced, no
-    name or all."""
+    """A new file: no name, or a name with no content, half of it, zeros or all; after a sync of its
+    content, no name or all."""
     played = play("a = open(f / 'a', 'wb', 0); a.write(b'1234'); os.fsync(a.fileno())")
     contents = [b"", b"12", b"1234", bytes(4)]
     assert left(played, "fsync") == [{}] + [{"a": held} for held in (b"1234", b"", b"12", bytes(4))]
@@ -87,7 +86,7 @@ def test_a_folder_that_is_synced_holds_its_names(play: Makes):
 
 
 def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
-    """Written over in place, and not synced: the old content may still be there, and half of the
+    """Overwritten in place and not synced: the old content may still be there, or half of the
     new."""
     played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
     assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
@@ -95,8 +94,8 @@ def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
 
 
 def test_a_renaming_is_never_half_done(play: Makes):
-    """From folder to folder, and of two names that are exchanged: before or after; a sync of one
-    folder is enough."""
+    """A rename between folders, and an exchange of two names: before or after; a sync of one folder
+    is enough."""
     before = "[storage.put(f / name, name.encode()) for name in 'ab']; (f / 'x').mkdir()"
     played = play(
         "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); "
@@ -114,7 +113,7 @@ def test_a_renaming_is_never_half_done(play: Makes):
 
 
 def test_names_of_two_folders_come_in_any_order(play: Makes):
-    """The later of two changes may be on the disk without the earlier one, but not of the same
+    """The later of two changes may be on the disk without the earlier, unless both are in the same
     folder."""
     played = play(
         "[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]",
@@ -125,8 +124,8 @@ def test_names_of_two_folders_come_in_any_order(play: Makes):
 
 
 def test_a_sync_takes_with_it_what_came_before(play: Makes):
-    """A folder's new name came from another folder, where it was not synced: it is in one of the
-    two, not in both."""
+    """A folder's new name came from another folder, where the change was not synced: it is in one
+    of the two, not in both."""
     played = play(
         "(f / 'a').mkdir(); (f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x')",
         "(f / 'x').mkdir()",
@@ -135,8 +134,8 @@ def test_a_sync_takes_with_it_what_came_before(play: Makes):
 
 
 def test_a_symlink_is_swapped_in_one_step(play: Makes):
-    """disk.link: at every moment it leads to the old or the new, also where one of that name was
-    left half done."""
+    """disk.link: at every moment it leads to the old or the new target, also if a link was left
+    half done before."""
     played = play(
         "storage.link(f / 'current', 'new')",
         "storage.link(f / 'current', 'old'); (f / 'current.part').symlink_to('x')",
@@ -175,15 +174,15 @@ def test_a_kill_comes_before_its_call(play: Makes):
     ids=["mapped", "allocated", "a child's", "nameless", "failed"],
 )
 def test_what_cannot_be_followed_is_told(play: Makes, does: str):
-    """A program that changes files in a way that is not understood, or fails, is not taken for one
-    that changes none."""
+    """A program that changes files in an unknown way, or fails, is not mistaken for a program that
+    changes none."""
     with pytest.raises(NotFollowed):
         play(does, "(f / 'a').write_bytes(b'0')")
 
 
 def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs, and some kills: all that was reported as stored
-    is there."""
+    """The power is cut at every moment of two runs, with some kills: every sweep that was reported
+    as stored is there."""
     played = ScenePlay(recording.scene(), work)
     points = [played.power(moment) for moment in played.moments()]
     points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]
@@ -205,7 +204,7 @@ def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work:
 
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
-    """Killed once it has made the folder and before it has synced that; the next run must not rely
+    """Killed after it has made the folder and before it has synced it; the next run must not rely
     on it."""
     played = ScenePlay(recording.scene(), work)
     made = next(m for m in played.moments() if m.call and m.call.name == "fsync")
@@ -214,14 +213,13 @@ def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
 
 @pytest.mark.parametrize("way", [way for way in recording.WAYS if way != "right"])
 def test_ways_that_are_wrong_are_found(work: Path, way: str):
-    """Files that get onto the disk in a way that loses some: the judge says so of each."""
+    """The judge finds each way of writing files that loses some."""
     played = ScenePlay(recording.scene(way), work)
     assert any(played.power(moment).wrong for moment in played.moments())
 
 
 def test_a_kill_finds_what_is_written_under_its_own_name(work: Path):
-    """No loss of power is needed for that; and the judge sees it in the folder of a killed
-    program."""
+    """It needs no loss of power: the judge finds it in the folder of a killed program."""
     played = ScenePlay(recording.scene("under its own name"), work)
     half = next(
         m for m in played.moments() if m.call.name == "write" and m.call.paths[0].endswith(".npy")
@@ -238,14 +236,15 @@ def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
 
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
-    """Signed bundles, and a file of whom the box believes."""
+    """Signed bundles, and a file with the signer that the box trusts."""
     if not shutil.which("ssh-keygen"):
         pytest.skip("needs ssh-keygen (apt-get install openssh-client)")
     return delivery.Shop.opened(tmp_path_factory.mktemp("shop"))
 
 
 def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
-    """Killed before each file is renamed; without power where it is the link to the bundle."""
+    """Killed before each file is renamed; the power is cut before the link to the bundle is
+    renamed."""
     return [
         (played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment)
         for moment in played.moments()
@@ -257,9 +256,8 @@ def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
 def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
     shop: delivery.Shop, work: Path
 ):
-    """Killed before it names the bundle's folder and the ledger, and without power before the link
-    is swapped: the box starts, answers, and takes the next bundle.
-    """
+    """Killed before it renames the bundle's folder and the ledger, and a power cut before the link
+    is swapped: the box starts, answers, and takes the next bundle."""
     played = ScenePlay(shop.alone("right"), work)
     points = cut_at_renames(played)
     assert [point.states for point in points] == [1, 1, 4]
@@ -283,8 +281,8 @@ def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_with
 def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
     shop: delivery.Shop, work: Path, name: str
 ):
-    """The power goes as each command has ended: the bundle that the scene names answers, and the
-    next one is taken."""
+    """The power fails after each command: the bundle that the scene expects answers, and the next
+    is taken."""
     played = ScenePlay({"delivery": shop.scene, "enrolment": shop.enrolment}[name](), work)
     points = [played.power(moment) for moment in played.moments() if not moment.call]
     assert wrong(points) == []
@@ -310,7 +308,7 @@ def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
 def test_deliveries_that_are_wrong_are_found(
     shop: delivery.Shop, work: Path, way: str, call: str, what: str
 ):
-    """A store that is neither old nor new for a moment: a kill there finds it."""
+    """A store that is neither old nor new for a moment: a kill at that moment finds it."""
     played = ScenePlay(shop.alone(way), work)
     (moment,) = [
         m
@@ -323,8 +321,8 @@ def test_deliveries_that_are_wrong_are_found(
 
 
 def test_a_campaign_goes_on_where_it_was_broken_off(work: Path, monkeypatch: pytest.MonkeyPatch):
-    """Points that are in the file are not cut again, half a line there is; after a change of the
-    box all of them are."""
+    """Points in the file are not cut again, an incomplete line is; after a change of the box all
+    are cut again."""
     code = "import sys; from pathlib import Path; (Path(sys.argv[1]) / 'a').write_bytes(b'1')"
     step = SceneStep("it", lambda folder: [sys.executable, "-S", "-c", code, folder])
     lines = CutScene(

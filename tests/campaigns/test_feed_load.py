@@ -1,5 +1,5 @@
-"""The findings of the feed's campaign: each target missed by made-up figures, the packet's phase,
-and readers that behave as described."""
+"""The findings of the feed's campaign: each target is missed by invented figures, the packet's
+phase, and readers that behave as described."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ RATE = 750.0
 
 
 def kind(share: float, late_ms: float = 1.0, **more: object) -> Kind:
-    """Fifteen turns with forty answers, each so much later than the packet in which its stop edge
-    came."""
+    """Fifteen turns with forty answers, each this much later than the packet with its stop edge."""
     stops = np.arange(1000, 1000 + 40 * 2587, 2587)
     seen_s = (np.ceil((stops - 4) / PACKET) * PACKET + 4) / RATE
     answers = [(float(s) + late_ms / 1e3, int(stop)) for s, stop in zip(seen_s, stops, strict=True)]
@@ -43,8 +42,7 @@ def kinds() -> dict[str, Kind]:
 
 
 def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) -> None:
-    """Differences are those that were put in, the quickest answer is the zero, and each kind has
-    its row."""
+    """The given differences come back, the quickest answer is zero, and each kind has its row."""
     figures = feed_load.result(kinds, 69_000)
     assert feed_load.missed(figures) == []
     assert figures["64"]["share_more"] == pytest.approx([0.007] * 3)
@@ -75,7 +73,7 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(kinds: dict[str, Kind]) 
 def test_each_target_can_be_missed(
     kinds: dict[str, Kind], change: dict[str, object], what: str
 ) -> None:
-    """One kind with one thing wrong is named, and nothing else."""
+    """Only the kind with the fault is named."""
     worse = copy.deepcopy(kinds)
     worse["attacked"] = kind(0.059, **change)
     (found,) = feed_load.missed(feed_load.result(worse, 69_000))
@@ -84,13 +82,13 @@ def test_each_target_can_be_missed(
 
 
 def test_later_answers_are_found(kinds: dict[str, Kind]) -> None:
-    """Two milliseconds in the median."""
+    """A median that is two milliseconds later."""
     kinds["1"] = kind(0.052, 2.5)
     assert feed_load.missed(feed_load.result(kinds, 69_000)) == ["1: 2.00 ms later in the median"]
 
 
 def test_what_the_loop_spends_in_the_feed_is_counted(tmp_path: Path) -> None:
-    """Of all calls and nothing between them; a call that fails counts too."""
+    """The time in all calls, without the time between them; a call that fails counts too."""
 
     class Costly:
         def turn(self, numbers: int) -> None:
@@ -118,7 +116,7 @@ def test_what_the_loop_spends_in_the_feed_is_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["1", "8"])
 def test_readers_read_all_but_one_of_them(tmp_path: Path, name: str) -> None:
-    """Each that reads gets frames, verdicts and its hello."""
+    """Each reader that reads gets frames, verdicts and its hello."""
     offered, seen = Offered(tmp_path / "feed.sock"), Counter[str]()
     offered.turns()
     acts = feed_readers.acts(name, str(offered.path), seen)

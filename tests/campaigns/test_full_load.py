@@ -1,5 +1,5 @@
-"""The findings of the campaign of full load: each target missed by made-up figures; a box that is
-counted from inside; a disk that fills; one box with all clients, for some seconds."""
+"""The findings of the campaign of full load: each target is missed by invented figures; a box that
+is counted from inside; a full disk; one box with all clients, for some seconds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PEERS = {"feed": {"verdict": 20, "frame": 900}, "page": 7, "tcp": 8, "modbus": 9
 
 
 def lines(lost: int = 150) -> list[dict[str, Any]]:
-    """A box that was counted every two seconds for 90: 100 frames and an answer a second, and
+    """A box that was counted every two seconds for 90 s: 100 frames and an answer each second, and
     `lost` frames at 62 s."""
     found: list[dict[str, Any]] = []
     for at in range(0, 92, 2):
@@ -49,7 +49,7 @@ def lines(lost: int = 150) -> list[dict[str, Any]]:
 
 
 def box(full: bool) -> dict[str, Any]:
-    """The figures of one box in which all is well."""
+    """The figures of one box without faults."""
     timed = [(float(at), 1.0 + at % 2) for at in range(90)]
     looks = [(float(at), 0.1 * at, 70_000 + at) for at in range(0, 90, 5)]
     about = {
@@ -72,8 +72,7 @@ def content() -> dict[str, Any]:
 
 
 def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any]) -> None:
-    """Figures are those that were put in, of the time without faults and of each fault; each box
-    has its rows."""
+    """The given figures come back, for the calm phase and for each fault; each box has its rows."""
     assert missed(content) == []
     calm = content["boxes"][1]["calm"]
     assert (calm["came"], calm["missing"], calm["stops"], calm["n"]) == (6000, 0, 60, 60)
@@ -132,7 +131,7 @@ def test_a_campaign_in_which_all_is_well_misses_nothing(content: dict[str, Any])
 def test_each_target_can_be_missed(
     content: dict[str, Any], change: dict[str, Any], said: str
 ) -> None:
-    """A box with one thing wrong is named, and nothing else."""
+    """Only the box with the fault is named."""
     content["boxes"][1] |= change
     assert missed(content) == [f"papillarray, all attached: {said}"]
 
@@ -140,8 +139,8 @@ def test_each_target_can_be_missed(
 def test_drops_without_a_fault_late_answers_and_idle_peers_are_found(
     content: dict[str, Any],
 ) -> None:
-    """Sentences that are dropped while a robot reads, two milliseconds more in the median, a peer
-    that got nothing."""
+    """Sentences dropped while a robot reads, a median that is two milliseconds later, a peer that
+    got nothing."""
     full = content["boxes"][1]
     full["calm"] |= {"dropped": 2, "in_box_ms": {"p50": 3.5}}
     content["peers"]["papillarray"] |= {"tcp": 0, "feed": {"frame": 900}}
@@ -170,7 +169,8 @@ def test_a_skin_without_a_count_may_err_by_a_frame_in_each_stop(content: dict[st
 
 
 def test_missing_frames_are_seen_by_their_numbers() -> None:
-    """Between two turns and within one, up to two seconds of them, over the end of the numbers."""
+    """Missing between two turns or within one, up to two seconds of them, also where the numbers
+    wrap."""
     check = FrameCheck(SystemClock())
     for numbers in (range(9_900, 9_950), range(9_960, 10_000), range(12_100, 12_110)):
         at = np.array(numbers) % NUMBERS**2

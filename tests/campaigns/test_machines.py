@@ -37,8 +37,8 @@ SHOWN_SWEEPS = 8
 
 @pytest.fixture(scope="session")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The default bundle with simulated sweeps, one freshly trained for each type of raw counts,
-    and a network that overflows."""
+    """The default bundle with simulated sweeps, a freshly trained bundle for each type of raw
+    counts, and a network that overflows."""
     if os.environ.get("PALPATE_MACHINES") == "1":
         emulated_machines.set_up()
     folder = tmp_path_factory.mktemp("given")
@@ -55,7 +55,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _show(folder: Path, name: str) -> None:
-    """A folder more: the same graph, giving its int8 tensors."""
+    """Add a folder with the same graph, whose outputs are its int8 tensors."""
     model = onnx.load(folder / name / bundle.MODEL)
     del model.graph.output[:]
     (folder / f"{name} inside").mkdir()
@@ -70,8 +70,8 @@ def _show(folder: Path, name: str) -> None:
 
 
 def overflowing(folder: Path) -> None:
-    """A convolution with weights of eight bits over bytes at their highest: no 16 bits hold two of
-    its products."""
+    """A convolution with weights of eight bits over bytes at their maximum: two of its products
+    overflow 16 bits."""
     folder.mkdir()
     taps = np.full((32, 32, 5), 127, np.int8)
     constants = {
@@ -153,8 +153,8 @@ def test_a_bundle_says_the_same_on_every_machine(
 def test_what_int8_computes_is_the_same_to_the_bit(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
-    """The tensors inside: hardly one in ten thousand is another, where float rounding before it
-    fell the other way."""
+    """The inner tensors: at most one number in ten thousand differs, where an earlier float value
+    was rounded the other way."""
     name, there_result = there
     for what in here:
         if what.endswith(" inside/shown"):

@@ -14,7 +14,7 @@ from tests.factories.paths import ROOT
 from train.studies.command import PROGRAM
 
 READ = (".md", ".py", ".toml", ".yml", ".yaml", ".html", ".j2", ".service")
-"""Kinds of files that name commands, besides .ci/run."""
+"""Suffixes of files that name commands; .ci/run does, too."""
 
 
 def texts() -> dict[str, str]:
@@ -98,7 +98,7 @@ def test_an_unknown_campaign_is_refused(capsys: pytest.CaptureFixture[str]):
 def test_a_campaign_gets_its_variables_and_returns_its_exit_code(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    """A variable of the caller goes before that of the campaign."""
+    """A variable of the caller overrides that of the campaign."""
     code = "import os, sys; print(os.environ['A_'], os.environ['B_']); sys.exit(7)"
     monkeypatch.setenv("A_", "caller")
     campaign = campaigns.Campaign("", ("-c", code), variables={"A_": "own", "B_": "own"})

@@ -1,5 +1,5 @@
-"""Modules of the virtual box, without a guest: names of images, levels that are held, replies that
-cross, the table."""
+"""Modules of the virtual box, without a guest: names of images, held levels, crossing replies, the
+table."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_an_image_is_named_by_what_goes_in(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPatch):
-    """Whatever Python builds the virtual box: of packages that differ between 3.11 and 3.12 the
-    guest gets those for 3.11."""
+    """Of packages that differ between 3.11 and 3.12, the guest gets those for 3.11, whatever Python
+    builds it."""
     lock = image.guest_lock()
     assert "numpy==2.4" in lock
     assert "numpy==2.5" not in lock
@@ -47,7 +47,7 @@ def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):
-    """A step that fails names its command and output; no folder is left that looks like an
+    """A step that fails reports its command and output, and leaves no folder that looks like an
     image."""
 
     def fail(part: Path) -> None:
@@ -92,7 +92,7 @@ def qtest() -> Iterator[tuple[GuestLines, list[tuple[float, str]], GuestClock]]:
 def test_a_level_is_held_however_late_it_came(
     qtest: tuple[GuestLines, list[tuple[float, str]], GuestClock],
 ):
-    """A pulse of nothing becomes one of HOLD_NS, its edges in their order."""
+    """A pulse without length becomes a pulse of HOLD_NS, with its edges in order."""
     lines, asked, clock = qtest
     now_ns = clock.now_ns()
     lines.drive("START", False, now_ns + 1)
@@ -120,11 +120,11 @@ def test_a_line_that_the_box_drives_is_seen():
 
 
 class BusyHost:
-    """A host's clock that goes on only in waits, and the counter of a guest that gets a part of its
-    time.
+    """A host's clock that only advances in waits, and the counter of a guest that gets a part of
+    its time.
 
-    share: of the host's time that becomes the guest's. ticks: the counter as the guest's hardware
-    shows it.
+    share: part of the host's time that becomes the guest's. ticks: the counter as the guest's
+    hardware shows it.
     """
 
     def __init__(self, share: float, at: int = 0) -> None:
@@ -160,7 +160,7 @@ def test_a_wait_is_as_long_as_the_guest_s_time(share: float):
 
 
 def test_a_board_keeps_pace_with_a_guest_that_is_starved():
-    """A robot and a board by the guest's clock: a busy host makes them slow, and no frame is late
+    """A robot and a board on the guest's clock: a busy host makes them slow, but no frame is late
     or lost."""
     host = BusyHost(0.05)
     clock = GuestClock(host.ticks, host)
@@ -178,7 +178,7 @@ def test_a_board_keeps_pace_with_a_guest_that_is_starved():
 
 
 def test_a_guest_whose_clock_stands_still_is_said_to_have_crashed():
-    """A wait for a dead guest ends, and says why; so does one for a QEMU that has gone."""
+    """A wait for a dead guest ends with the reason; so does a wait for a QEMU that has ended."""
     host = BusyHost(0.0)
     with pytest.raises(TimeoutError, match=f"stood still for {STILL_S} s"):
         GuestClock(host.ticks, host).sleep(1)
@@ -212,11 +212,11 @@ class QemuEnd:
         self._socket.sendall(struct.pack("<IIQ", kind, len(body), ident) + body)
 
     def bulk(self, ident: int) -> None:
-        """Ask for a transfer."""
+        """Request a transfer."""
         self.say(BULK, ident, struct.pack("<BBHIH", 0x81, 0, 4096, 0, 0))
 
     def frames(self) -> int:
-        """First number of the packet that comes next."""
+        """First number of the next packet."""
         kind, _, body = self.hear()
         assert kind == BULK
         return packets.unpack(body[10:]).packets[0].seq
@@ -251,8 +251,8 @@ def test_a_reply_that_crosses_a_cancellation_comes_again():
 
 @pytest.fixture
 def shell(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[shell_lines.Shell, socket.socket]]:
-    """A shell whose agent is the test, at the other end of a socket; it waits 0.2 s beyond a line's
-    own time."""
+    """A shell whose agent is the test, at the other end of a socket; it waits 0.2 s beyond a
+    command's own time."""
     monkeypatch.setattr(shell_lines, "REPLY_S", 0.2)
     ours, theirs = socket.socketpair()
     with ours, theirs:

@@ -36,7 +36,7 @@ GOOD: dict[str, Any] = {
 
 
 def test_a_box_that_fared_alike_is_no_worse():
-    """Also where both lost a frame to the machine."""
+    """Also if both lost a frame because of the machine."""
     assert worse({"alone": GOOD, "attacked": GOOD}) == []
     lossy = GOOD | {"frames_lost": 6}
     assert worse({"alone": lossy, "attacked": lossy}) == []
@@ -60,7 +60,7 @@ def test_what_is_worse_is_named(bad: dict[str, Any], said: str):
 
 
 def test_the_table_has_both_boxes_and_the_peers():
-    """One row each; how many attacks there were, and what good peers got."""
+    """A row each; the number of attacks, and the answers that good peers got."""
     peers = {
         "tcp": {"attempts": 1500, "answers of the bridge": 20},
         "feed": {"attempts": 7, "hello": 8},
@@ -93,7 +93,7 @@ def test_the_shared_line_carries_both_ways():
         os.write(peer, b"$PPLP,ID\r\n")
         assert shared.heard(LONG_S) == []
         assert os.read(box, 4096) == b"$PPLP,ID\r\n"
-        for _ in range(200):  # more than a pseudo-terminal holds
+        for _ in range(200):  # more bytes than a pseudo-terminal holds
             os.write(box, state())
             assert len(shared.heard(LONG_S)) == 1
         for end in (box, peer):

@@ -32,8 +32,8 @@ from train.reports.plot_style import SCHEMES
 
 RATE = skin.FORMAT.rate_hz
 SILENT_CPU_S, SILENT_S = 30, 300
-"""A box that starts says its first sentence after a second or two of a processor's time. Of the
-clock's it may take any, but none in which it gets no processor at all."""
+"""Limits of the wait for a starting box. Its first sentence needs a second or two of processor
+time, and any real time; but it fails if it gets no processor time at all for SILENT_S."""
 LATEST_S = 60
 """The first answer comes after six seconds of the box's time."""
 UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
@@ -41,11 +41,11 @@ UNANSWERED, ORDER, LOST, DROPPED, WRONG, MEMORY, FILES = range(7)
 
 
 class FakeBox:
-    """A box without fault on a clock of its own: each call of `heard` takes its wait. change:
+    """A box without faults and with its own clock, which each call of `heard` advances. change:
     alters its lines.
 
-    dropped: frames that it has lost and never says so, a function of its time. runs: how often it
-    was started.
+    dropped: frames that it has lost without reporting them, as a function of its time. runs: number
+    of starts.
     """
 
     name = "this machine"
@@ -95,7 +95,7 @@ class FakeBox:
         return [(at_s, new) for new in self.change(line.decode().strip())]
 
     def edges(self, at_s: float) -> tuple[int, int]:
-        """By its time and the script."""
+        """Edges by its time and the script."""
         return self.sweeps.edges((at_s - self.begun_s) * RATE)
 
     def taken(self, at_s: float) -> float:
@@ -118,7 +118,7 @@ class FakeBox:
         return self.changed(self.now_s, aborted)
 
     def close(self) -> None:
-        """Count it."""
+        """Count the calls."""
         self.closed += 1
 
 
@@ -130,7 +130,7 @@ def soaked(box: FakeBox, length_s: float = 150) -> soak_judge.SoakRun:
 
 
 def sums(run: soak_judge.SoakRun) -> dict:
-    """Its sums, through a file's form."""
+    """Sums of a run that was written to JSON and read."""
     return soak_judge.sums(json.loads(json.dumps({"runs": [soak.asdict(run)]})))
 
 
@@ -157,8 +157,8 @@ def clean() -> soak_judge.SoakRun:
 
 
 def test_a_box_without_fault_reaches_every_target(clean):
-    """All sweeps answered, the last one as aborted; nothing lost, nothing noted; memory of three
-    minutes is not judged."""
+    """All sweeps are answered, the last as aborted; no loss, no fault; memory of three minutes is
+    not judged."""
     result = sums(clean)
     assert result["due"] == result["answers"] > 40
     assert (
@@ -184,14 +184,14 @@ def test_a_box_without_fault_reaches_every_target(clean):
 
 
 def test_a_missing_answer_is_found():
-    """A sweep that gets no sentence is unanswered, and the number that was left out is noted."""
+    """A sweep without a sentence is unanswered, and the missing number is noted."""
     result = sums(soaked(FakeBox(on(17, lambda line: []))))
     assert result["unanswered"] == 1
     assert missed(result) == [UNANSWERED, ORDER]
 
 
 def test_a_missed_start_edge_is_found():
-    """A box that never saw a start edge numbers on without a gap, and has one answer too few in the
+    """A box that misses a start edge counts on without a gap, and has one answer too few at the
     end."""
     box = FakeBox()
     run = soaked(box)
@@ -210,8 +210,8 @@ def test_a_double_answer_is_found():
 
 @pytest.mark.parametrize("number", [16, 18, 40])
 def test_a_wrong_number_is_found(number):
-    """An answer with the number of another sweep, before or after, is noted, and its own sweep has
-    none."""
+    """An answer with the number of an earlier or later sweep is noted, and its own sweep has no
+    answer."""
     result = sums(soaked(FakeBox(on(17, lambda line: [renumbered(line, number)]))))
     assert UNANSWERED in missed(result)
     assert ORDER in missed(result)
@@ -230,7 +230,7 @@ def test_a_number_too_many_makes_no_answer_wrong(clean):
 
 
 def test_an_answer_that_nobody_asked_for_is_found():
-    """A number right in order, but before the robot has given the start edge."""
+    """A right number, but before the robot has sent the start edge."""
     run = soaked(FakeBox(on(17, lambda line: [line, renumbered(line, 18), renumbered(line, 19)])))
     assert "answer 19 came before its start edge" in run.faults[0][1]
 
@@ -247,7 +247,7 @@ def test_an_answer_that_nobody_asked_for_is_found():
     ],
 )
 def test_a_broken_sentence_and_a_lost_skin_are_noted(line, what):
-    """A wrong checksum, half a sentence, a state other than streaming once frames have come."""
+    """A wrong checksum, half a sentence, a state other than streaming after frames have come."""
     run = soaked(FakeBox(on(3, lambda answer: [answer, line])), 30)
     assert [what in fault for _, fault in run.faults] == [True]
 
@@ -273,7 +273,8 @@ def test_frames_out_of_nowhere_are_found():
 
 
 def test_wrong_verdicts_beyond_the_network_by_itself_are_found(clean):
-    """A box that errs where its network does not leaves the band; refusals are not wrong."""
+    """A box that errs where its network does not leaves the expected band; refusals are not
+    wrong."""
     result, refused = copy.deepcopy(clean), copy.deepcopy(clean)
     for row in result.answers[:12]:
         row[3], row[4] = "ok", next(m for m in skin.MATERIALS if m != row[2])
@@ -288,14 +289,14 @@ def test_wrong_verdicts_beyond_the_network_by_itself_are_found(clean):
     ("column", "target"), [("dropped", DROPPED), ("files", FILES), ("threads", FILES)]
 )
 def test_counters_that_grow_are_found(clean, column, target):
-    """Dropped sentences, and files or threads that become more, each miss their own target."""
+    """Dropped sentences, and growing numbers of files or threads, each miss their own target."""
     run = copy.deepcopy(clean)
     run.samples[-1][SAMPLE.index(column)] += 1
     assert missed(sums(run)) == [target]
 
 
 def samples(rss_kib: np.ndarray, began_s: float = 0.0) -> dict:
-    """A run that has only memory, a sample each ten seconds."""
+    """A run with memory only, a sample every ten seconds."""
     return {
         "samples": [
             [began_s + 10.0 * i, float(k), 0, 0.0, 8, 1, 1, 0, 0, 1, 0, 0.0]
@@ -305,8 +306,8 @@ def samples(rss_kib: np.ndarray, began_s: float = 0.0) -> dict:
 
 
 def test_growing_memory_is_found_and_steady_memory_is_not():
-    """An hour with 1 MiB an hour grows; the same noise without it is flat; the interval holds the
-    truth."""
+    """Growth of 1 MiB an hour is found in an hour; the same noise without it is flat; the interval
+    holds the truth."""
     noise = np.random.default_rng(1).normal(0, 40, 360)
     hours = np.arange(360) / 360
     grown, flat = (soak_judge.slope([samples(70_000 + noise + kib * hours)]) for kib in (1024, 0))
@@ -316,8 +317,8 @@ def test_growing_memory_is_found_and_steady_memory_is_not():
 
 
 def test_the_interval_knows_that_neighbours_are_alike():
-    """Steps that stay for minutes widen the interval against noise as large that changes with each
-    sample."""
+    """Steps that last for minutes widen the interval, compared with independent noise of the same
+    size."""
     rng = np.random.default_rng(2)
     steps, noise = np.repeat(rng.normal(0, 40, 18), 20), rng.normal(0, 40, 360)
     wide, narrow = (soak_judge.slope([samples(70_000 + values)]) for values in (steps, noise))
@@ -381,8 +382,8 @@ def test_a_soak_goes_on_where_it_was_interrupted(tmp_path):
 
 
 def test_a_soak_that_is_killed_leaves_a_whole_record():
-    """At any moment the sweeps that are due have their answers, though the run has not ended and
-    one may be open."""
+    """At any moment each sweep that is due has its answer, even if the run has not ended and a
+    sweep is open."""
     box, run = FakeBox(), soak_judge.SoakRun(seed=1)
     recorder = soak.Recorder(box, run, Script(1))
     recorder.start()
@@ -394,7 +395,7 @@ def test_a_soak_that_is_killed_leaves_a_whole_record():
 
 
 def test_another_seed_begins_anew(tmp_path):
-    """Runs of other acts, code or machines are not put together."""
+    """Runs of other acts, code or machines are not joined."""
     box = FakeBox()
     settings = {"log": lambda line: None}
     soak.soak(box, 7, 0.01, tmp_path, **settings)
@@ -403,8 +404,7 @@ def test_another_seed_begins_anew(tmp_path):
 
 
 def test_soaks_side_by_side_are_joined(tmp_path):
-    """Runs follow each other in time, each with its own counters; what went wrong in either
-    counts."""
+    """Runs follow each other in time, each with its own counters; faults of both count."""
     settings = {"log": lambda line: None}
     first, second = (
         json.loads(soak.soak(FakeBox(), seed, 0.05, tmp_path / str(seed), **settings).read_text())
@@ -435,14 +435,14 @@ def test_soaks_side_by_side_are_joined(tmp_path):
     ],
 )
 def test_soaks_that_do_not_belong_together_are_not_joined(tmp_path, other, message):
-    """Of other code, or the same sweeps twice."""
+    """Different code, or the same sweeps twice."""
     record = json.loads(soak.soak(FakeBox(), 7, 0.01, tmp_path, log=lambda line: None).read_text())
     with pytest.raises(ValueError, match=message):
         soak.joined([record, record | other])
 
 
 def test_drawing_names_what_does_not_belong_together(tmp_path, monkeypatch, capsys):
-    """The command ends with the reason instead of a traceback, and has drawn nothing."""
+    """The command ends with the reason instead of a traceback, and draws nothing."""
     for folder in ("a", "b"):
         soak.soak(FakeBox(), 7, 0.01, tmp_path / folder, log=lambda line: None)
     works = ["--work", f"{tmp_path}/a", "--beside", f"{tmp_path}/b"]
@@ -455,8 +455,8 @@ def test_drawing_names_what_does_not_belong_together(tmp_path, monkeypatch, caps
 
 
 def test_edges_and_frames_are_reckoned_from_the_first_sentences():
-    """The first answer fixes the script, the first counted frames the board; before, nothing has
-    happened."""
+    """The first answer gives the start of the script, the first counted frames that of the board;
+    before, edges and frames are zero."""
     sweeps = Script(1)
     robot = Reckoned(sweeps)
     assert robot.edges(1e9) == (0, 0)
@@ -474,8 +474,8 @@ def test_edges_and_frames_are_reckoned_from_the_first_sentences():
 
 
 def test_a_slow_first_answer_does_not_move_the_others():
-    """Each answer is judged by its own sweep when later ones come quicker; one with a wrong number
-    moves nothing."""
+    """Each answer is compared with its own sweep if later answers are quicker; an answer with a
+    wrong number shifts nothing."""
     sweeps, begun_s = Script(1), 1000.0
     robot = Reckoned(sweeps)
     for k, late_s in ((1, 0.12), (2, 0.03), (3, 0.001), (4, 0.02)):
@@ -505,8 +505,8 @@ def test_the_script_tells_what_is_touched_and_what_the_network_says():
 
 @pytest.mark.slow
 def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
-    """Of twenty sweeps one act and no written line are held; the script has ended, and its end is
-    still known."""
+    """After twenty sweeps it holds one act and no written line; the script has ended, and its end
+    is still known."""
     sim = devices.build(skin.FORMAT, script.tubes(1, 20), VirtualClock(), "sim", remember=False)
     with ExitStack() as stack:
         settings = config.load(None, [], site=NO_SITE)
@@ -522,7 +522,7 @@ def test_a_simulated_world_that_remembers_nothing_stays_as_large_as_it_is():
 
 
 def test_a_process_is_read_from_proc():
-    """RSS and PSS in KiB, processor seconds, files and threads, also where the program's name has
+    """RSS and PSS in KiB, processor seconds, files and threads, also if the program's name has
     brackets and spaces."""
     stat = "12 (palpate (x) y) S " + " ".join(map(str, [*range(4, 14), 250, 50, 0, 0, 20, 0, 3, 0]))
     assert process("55 [rollup]\nRss:   70540 kB\nPss:  64586 kB\nPss_Dirty:  9 kB\n", stat, 8) == (
@@ -535,9 +535,11 @@ def test_a_process_is_read_from_proc():
 
 
 def heard(box: ThisMachine) -> list[tuple[float, str]]:
-    """The next sentences of a box. Raises AssertionError if none come, although it has used a
-    processor for SILENT_CPU_S or done nothing at all for SILENT_S: however busy this machine is, a
-    box that gets on is waited for."""
+    """The next sentences of a box.
+
+    Raises AssertionError if none come although the box has used SILENT_CPU_S of processor time, or
+    none for SILENT_S. A box that makes progress is waited for, however busy this machine is.
+    """
     begun_s, begun_cpu_s = time.monotonic(), box.process()[2]
     while not (lines := box.heard(0.2)):
         used_s = box.process()[2] - begun_cpu_s
@@ -551,13 +553,13 @@ def heard(box: ThisMachine) -> list[tuple[float, str]]:
 
 
 def states(lines: list[tuple[float, str]]) -> int:
-    """State sentences; a box says one in each second of its work."""
+    """State sentences; a working box sends one each second."""
     return sum(line.startswith("$PPLP,STA,") for _, line in lines)
 
 
 class Mute(FakeBox):
-    """A box that says nothing before look number `from_look`, and uses so much of a processor
-    between two looks."""
+    """A box that sends nothing before sample number `from_look`, and uses this much processor time
+    between two samples."""
 
     def __init__(self, step_s: float, from_look: int) -> None:
         super().__init__()
@@ -569,15 +571,14 @@ class Mute(FakeBox):
         return [(0.0, "there")] if self.looks >= self.from_look else []
 
     def process(self) -> tuple[int, int, float, int, int]:
-        """With the processor time of so many looks."""
+        """The processor time up to the present sample."""
         self.cpu_s += self.step_s
         return 1, 1, self.cpu_s, 1, 1
 
 
 def test_a_box_that_gets_on_is_waited_for_and_no_other(monkeypatch: pytest.MonkeyPatch):
-    """By processor time: one that uses much and says nothing has failed, as has one that gets none
-    for minutes; one that gets a little each time is waited for, however long that takes by the
-    clock."""
+    """A box that uses much processor time and sends nothing has failed, as has a box that gets none
+    for minutes. A box that gets a little each time is waited for, whatever the real time."""
     monkeypatch.setattr(sys.modules[__name__], "SILENT_S", 0.0)
     assert heard(Mute(SILENT_CPU_S / 1000, 500)) == [(0.0, "there")]
     with pytest.raises(AssertionError, match=f"said nothing in {SILENT_CPU_S}"):
@@ -674,7 +675,7 @@ def test_the_page_needs_nothing_else_and_tells_all(result):
 
 
 def test_a_day_of_sweeps_stays_a_small_picture(result):
-    """Of 25,000 sweeps the slowest of each few is drawn, and the slowest of all is among them."""
+    """Of 25,000 sweeps the slowest of each group is drawn, and with it the slowest of all."""
     rows = result["boxes"]["this machine"]["runs"][0]["answers"]
     many = [[3.45 * i, i + 1, *rows[0][2:6], 1.5, 0] for i in range(25_000)]
     many[12_345][6] = 700.0
@@ -696,8 +697,8 @@ def test_records_are_written_a_row_a_line_and_read_again(tmp_path):
 
 
 def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
-    """The whole command's end: page, picture and results are there; it fails for one missed target,
-    and names it."""
+    """Page, picture and results exist; the command fails because of one missed target, and names
+    it."""
     record = {
         "box": "this machine",
         "what": "",
@@ -719,7 +720,7 @@ def test_draw_says_which_target_was_missed(tmp_path, clean, capsys):
     soak.write(tmp_path / "other" / "virtual-box.json", record | {"box": "virtual box"})
     assert soak.draw(
         [tmp_path / "other"], results, tmp_path / "page"
-    )  # the box that was not recorded again stays
+    )  # a box that was not recorded again keeps its record
     kept = json.loads(results.read_text())
     assert list(kept["boxes"]) == ["this machine", "virtual box"]
     record["runs"][0]["due"] += 1

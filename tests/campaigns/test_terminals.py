@@ -17,7 +17,8 @@ from tests.factories import terminals
     ["time.sleep(600)", "[print('again', flush=True) or time.sleep(.01) for _ in range(60000)]"],
 )
 def test_a_program_that_hangs_fails_the_test_with_what_it_has_shown(does: str):
-    """One that falls silent, and one that shows the same for ever; neither outlives the wait."""
+    """A program that falls silent, and a program that prints the same for ever; neither outlives
+    the wait."""
     far, near = os.openpty()
     code = f"import time; print('begun', flush=True); {does}"
     with subprocess.Popen([sys.executable, "-c", code], stdout=near) as run:
