@@ -2,7 +2,7 @@
 standard input ends.
 
 The arguments are the feed's socket and the ports of the bridges and of the page. Prints a line of
-JSON with the counts of each peer: eight readers of the feed, of them one that never reads; a robot at
+JSON with the counts of each peer: eight readers of the feed, one of them never reads; a robot at
 each bridge that asks a few times a second; a browser at the page.
 """
 
