@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-WIDTHS, SCHEMES = (390, 1024, 1920), ("light", "dark")
+import pytest
+
+WIDTHS = (390, pytest.param(1024, marks=pytest.mark.thorough), 1920)
+"""Of a phone, a tablet and a desktop. A page that is legible on the others is so on a tablet."""
+SCHEMES = ("light", "dark")
 TALLEST = 16000
 """Height of the window. It has to hold the whole page, because colours are read by position."""
 FAULTS = """() => {

@@ -16,7 +16,7 @@ from tests.factories.costly import quick_first
 from tests.factories.skin_wires import NAMES, PATH, WiredSkin, profile, taxels, wire
 
 pytestmark = pytest.mark.slow
-each = pytest.mark.parametrize("name", NAMES)
+each = pytest.mark.parametrize("name", quick_first(NAMES))
 
 
 def consecutive(skin: WiredSkin, frames) -> bool:
@@ -215,7 +215,7 @@ def test_wrong_format_of_the_bundle(name: str):
     assert skin.port.sent == []
 
 
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@each
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.1, 2.0])
 def test_wrong_rate(name: str, rate: float):
     """A skin that is too slow or too fast: a mismatch that stays, with the measured figure and what

@@ -161,7 +161,7 @@ def test_adversarial_training_sees_the_worse_sweep():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 @pytest.mark.parametrize(
     ("shape", "dtype", "classes"),
     [((12, 64, 3, 3), "int16", 2), ((12, 21, 1, 1), "uint16", 3), ((12, 128, 16, 1), "float32", 3)],
@@ -177,7 +177,7 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     """Real sizes, 1500 x 4 x 4 of uint8, with random weights or the smallest training."""
     build = {
@@ -215,7 +215,7 @@ def test_what_is_easy_is_learnt(name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 def test_the_same_again_for_the_same_seed(name: str):
     """It has the same bits for any random state outside, which does not change; another seed gives
     another network."""
@@ -229,7 +229,7 @@ def test_the_same_again_for_the_same_seed(name: str):
     assert not np.array_equal(train(name, s, seed=2).logits(s.samples), first)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 def test_a_material_that_never_came_is_never_given(name: str):
     """Its logit is finite and far below, in the graph too; the others keep their places."""
     s = easy(12)
@@ -243,7 +243,7 @@ def test_a_material_that_never_came_is_never_given(name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 def test_small_sets_are_trained_whole(name: str):
     """Two recordings of one sweep each cannot be split; one position alone does not prevent a split
     by recording."""
@@ -269,7 +269,7 @@ def test_one_sweep_of_each_is_too_little_for_a_discriminant():
         check_agrees(train(name, easy(1)), easy(1).samples)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick_first(NAMES))
 def test_silence_is_no_trouble(name: str):
     """After training without any signal, logits of constant sweeps are finite and equal for all."""
     s = easy(6)

@@ -190,6 +190,7 @@ def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a command that trains and draws
 def test_the_command_writes_page_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
