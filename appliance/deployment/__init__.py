@@ -1,1 +1,1 @@
-"""Signed bundles: store, trial, roll back, shadow."""
+"""Signed bundles: signatures, store, trial, rollback and shadow mode."""

@@ -1,8 +1,7 @@
-"""Runs work that may crash, hang or take all memory in a limited child process. In: a callable.
-Out: nothing, or why it failed.
+"""Runs work that may crash, hang or take all memory in a limited child process.
 
-The child is a fork: it has what was read and checked here, byte for byte, and what it does to
-itself stays with it.
+The child is a fork, so it works on exactly the bytes that were read and checked here, and cannot
+damage this process.
 """
 
 from __future__ import annotations
@@ -16,17 +15,17 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 DEADLINE_S = 30.0
-"""The golden sweeps of our largest network take 0.1 s on a desktop."""
+"""Time limit. The golden sweeps of our largest network take 0.1 s on a desktop."""
 MOST_BYTES = 256 << 20
-"""Of address space beyond what the process has already."""
+"""Address space that the child may use in addition to the parent's."""
 MOST_MESSAGE = 2000
 """Bytes of the child's message that are read."""
 
 
 def run_limited(work: Callable[[], object]) -> None:
-    """Do `work` in a child process. Raises BundleError where it raises, dies, or takes longer than
+    """Do `work` in a child process. Raises BundleError if it raises, dies, or takes longer than
     DEADLINE_S."""
-    import multiprocessing  # these two here: only commands need them, not the service
+    import multiprocessing  # imported here since only commands need it, not the service
     import signal
 
     context = multiprocessing.get_context("fork")
@@ -56,7 +55,7 @@ def run_limited(work: Callable[[], object]) -> None:
 
 
 def _work(work: Callable[[], object], sender: Connection) -> None:
-    """What the child does: set the limits, do the work, send the error if there is one."""
+    """Run in the child: set the limits, do the work, send the error if there is one."""
     import resource
 
     with open("/proc/self/statm", "rb") as f:
@@ -71,5 +70,5 @@ def _work(work: Callable[[], object], sender: Connection) -> None:
         sender.send_bytes(
             f"model asks for more than {MOST_BYTES >> 20} MB; export a smaller one".encode()
         )
-    except Exception as e:  # of onnxruntime's classes, which share no base but this
+    except Exception as e:  # the classes of onnxruntime have no other base in common
         sender.send_bytes(f"model cannot be run: {type(e).__name__}: {e}".encode()[:MOST_MESSAGE])

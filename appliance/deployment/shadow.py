@@ -1,9 +1,7 @@
-"""Shadow mode: a candidate bundle classifies beside the one in service, before anybody commits to
-it.
+"""Shadow mode: a candidate bundle classifies beside the current bundle, before it is committed.
 
-In: sweeps with the verdicts that were sent. Out: how often the candidate agrees, and the sweeps on
-which it does not, in a folder. The candidate cannot affect the robot: it gets a sweep only after
-the answer has been sent.
+Shadow mode counts how often the candidate agrees and keeps the sweeps on which it does not. The
+candidate cannot affect the robot, since it gets a sweep only after the answer was sent.
 """
 
 from __future__ import annotations
@@ -32,31 +30,35 @@ from appliance.recording.recording import SweepFolder
 
 FILE = "agreement.json"
 KEPT = 100
-"""Most sweeps on which the two differ that are kept."""
+"""Largest number of sweeps with different answers that are kept."""
 FAILURES = 3
-"""The candidate is no longer asked after it failed on so many sweeps in a row."""
+"""The candidate is stopped after failing on this many sweeps in a row."""
 SLOW_NS = 100_000_000
-"""A candidate that computes for longer has failed on the sweep: frames wait for it."""
+"""Longest computing time; a candidate that takes longer has failed on the sweep, because frames
+wait for it."""
 MOST_MEMORY = 180 << 20
-"""Bytes that the candidate's model and the current one may need together, by the account of
-onnx_check: the service may have 256 MB (systemd/palpate.service), and needs 60 without a model."""
+"""Bytes that the candidate's model and the current model may need together, as computed by
+onnx_check. The service may have 256 MB (systemd/palpate.service), and needs 60 without a model."""
 STARTS = 3
-"""After so many starts in a row that did not last PERIOD_NS, the candidate is not loaded any
-more."""
+"""After this many starts in a row that did not last PERIOD_NS, the candidate is no longer
+loaded."""
 PERIOD_NS = 60_000_000_000
-"""How often the counts are written where the two agree."""
+"""Interval at which the counts are written while both bundles agree."""
 NEVER_NS = 1 << 63
 
 
 @dataclass(slots=True)
 class Agreement:
-    """How two bundles have answered the same sweeps; the content of agreement.json.
+    """Counts of how two bundles answered the same sweeps; the content of agreement.json.
 
-    pairs: answer of the current one -> answer of the candidate -> number of sweeps. later: early
-    answers where the candidate would have waited for more of the sweep; these are not compared.
-    failed: sweeps on which the candidate failed. kept: sweeps in the same folder. worst_ms,
-    total_ms: its longest and its whole computing time. starts: in a row without an orderly end, the
-    present one included until it is older than PERIOD_NS.
+    candidate, current: ids of the bundles.
+    starts: number of starts in a row without an orderly end, including the current start until it
+        is older than PERIOD_NS.
+    later: early answers at which the candidate needs more of the sweep; they are not compared.
+    failed: sweeps on which the candidate failed.
+    kept: sweeps in the same folder.
+    total_ms, worst_ms: the candidate's total and longest computing time.
+    pairs: answer of the current bundle -> answer of the candidate -> number of sweeps.
     """
 
     candidate: str
@@ -74,18 +76,24 @@ class Agreement:
 
     @property
     def text(self) -> str:
-        """In one line, for a person."""
-        text = f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of {self.compared} sweeps"
+        """The counts in one line, for a person."""
+        text = (
+            f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of "
+            f"{self.compared} sweeps"
+        )
         if self.compared:
             low, high = wilson(self.agreed, self.compared)
-            text += f" [{100 * low:.1f} to {100 * high:.1f} %], computing {self.total_ms / self.compared:.2g} ms for each"
-            text += f" and {self.worst_ms:.2g} ms at most"
+            text += (
+                f" [{100 * low:.1f} to {100 * high:.1f} %], computing "
+                f"{self.total_ms / self.compared:.2g} ms for each and {self.worst_ms:.2g} ms at "
+                "most"
+            )
         text += f"; {self.later} early answers are not compared" if self.later else ""
         return text + (f"; it failed on {self.failed}" if self.failed else "")
 
     def lines(self, folder: Path) -> list[str]:
-        """The text, then each pair of different answers, the most frequent first, and where the
-        sweeps are."""
+        """The text, each pair of different answers with the most frequent first, and the folder of
+        the kept sweeps."""
         pairs = [
             (n, one, other)
             for one, row in self.pairs.items()
@@ -106,7 +114,7 @@ class Agreement:
         return json.dumps(asdict(self), indent=1).encode()
 
     def add(self, one: Verdict, other: Verdict, took_ms: float) -> bool:
-        """Count a sweep; whether the robot would have got the same answer."""
+        """Count a sweep. Returns whether both answers are the same for the robot."""
         row = self.pairs.setdefault(_answer(one), {})
         row[_answer(other)] = row.get(_answer(other), 0) + 1
         same = _answer(one) == _answer(other)
@@ -116,12 +124,13 @@ class Agreement:
 
 
 def _answer(v: Verdict) -> str:
-    """What a robot acts on: the label, after the status where that is not ok."""
+    """The part of a verdict that a robot acts on: the label, after the status if that is not
+    ok."""
     return v.label if v.status is Status.OK else f"({v.status}) {v.label}".strip()
 
 
 def read(folder: Path) -> Agreement | None:
-    """The agreement in a shadow's folder, None where there is none. Raises FormatError where it
+    """The agreement in a shadow's folder, None if the file does not exist. Raises FormatError if it
     cannot be read."""
     try:
         found = typed(Agreement, json.loads((folder / FILE).read_bytes()))
@@ -132,17 +141,17 @@ def read(folder: Path) -> Agreement | None:
         return None
     except (OSError, ValueError, TypeError, RecursionError) as e:
         raise FormatError(
-            f"{folder / FILE} cannot be read: {e}; take it away, and the counts begin anew"
+            f"{folder / FILE} cannot be read: {e}; remove it, and the counts begin anew"
         ) from e
 
 
 class Shadow(Observer):
-    """Observer of a running box that lets the candidate judge each sweep by the same rules, and
-    counts.
+    """Observer of a running box that classifies each sweep with the candidate, by the same rules,
+    and counts the agreement.
 
-    current: the bundle in service. folder: for agreement and kept sweeps; those of another pair of
-    bundles are removed. judge: makes a bundle's classifier by the settings. Raises ApplianceError
-    where the candidate or the folder cannot be used.
+    current: the bundle in service. folder: for agreement and kept sweeps; files of another pair of
+    bundles are removed. judge: makes a bundle's classifier from the settings. Raises ApplianceError
+    if the candidate or the folder cannot be used.
     """
 
     def __init__(
@@ -155,14 +164,14 @@ class Shadow(Observer):
     ) -> None:
         if candidate.format != current.format:
             raise BundleError(
-                f"candidate {candidate.id} wants {candidate.format}, the bundle in service {current.format}: one skin "
-                "cannot serve both; commit to it without a shadow"
+                f"candidate {candidate.id} wants {candidate.format}, the bundle in service "
+                f"{current.format}: one skin cannot serve both; commit to it without a shadow"
             )
         if candidate.memory + current.memory > MOST_MEMORY:
             raise BundleError(
-                f"candidate {candidate.id} may need {candidate.memory >> 20} MB and the bundle in service "
-                f"{current.memory >> 20}, which is more than the {MOST_MEMORY >> 20} that there are for both; commit to it "
-                "without a shadow"
+                f"candidate {candidate.id} may need {candidate.memory >> 20} MB and the bundle in "
+                f"service {current.memory >> 20}, more than the {MOST_MEMORY >> 20} that both may "
+                "use; commit to it without a shadow"
             )
         self._clock, self._failures_in_row, self._tare = clock, 0, current.manifest.tare
         self._log = TroubleLog(
@@ -186,20 +195,18 @@ class Shadow(Observer):
             raise
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Let the candidate judge a sweep that has a window; one on which they differ is kept in a
-        later turn."""
+        """Classify a sweep that has a window with the candidate. If the answers differ, the sweep
+        is kept in a later turn."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
         tare = np.asarray(circumstances["tare"], np.float64)
-        sent = not np.array_equal(tare, self._tare)  # by TARE; without one each bundle has its own
+        sent = not np.array_equal(tare, self._tare)  # by TARE; before it each bundle uses its own
         self._classifier.tare = tare if sent else self._classifier.bundle.manifest.tare
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:
             other = self._judge(sweep)
-        except (
-            Exception
-        ) as e:  # onnxruntime raises its own classes, which share no base but Exception
+        except Exception as e:  # the classes of onnxruntime have no other base in common
             self._fail(str(e).strip()[:200])
             return
         took_ns = self._clock.now_ns() - begin_ns
@@ -219,7 +226,7 @@ class Shadow(Observer):
                 )
 
     def turn(self, health: Health) -> None:
-        """At the end of a turn: write one thing that is due, while no sweep is open."""
+        """At the end of a turn: write one file that is due, unless a sweep is open."""
         if health.sweeping:
             return
         if self._waiting:
@@ -228,7 +235,7 @@ class Shadow(Observer):
             self._log.attempt(self._write)
 
     def stopping(self) -> None:
-        """The loop has ended in order: write what is left, and do not count this start."""
+        """At an orderly end of the loop: write all pending files, and do not count this start."""
         self.agreement.starts = 0
         while self._waiting:
             self._log.attempt(self._keep)
@@ -236,7 +243,7 @@ class Shadow(Observer):
         self._sweeps.close()
 
     def _begin(self, candidate: str, current: str) -> Agreement:
-        """The agreement to continue, or a new one; with this start counted."""
+        """The agreement to continue, or a new agreement, with this start counted."""
         try:
             found = read(self._sweeps.folder)
         except FormatError as e:
@@ -249,15 +256,15 @@ class Shadow(Observer):
         if found.starts >= STARTS:
             self._sweeps.close()
             raise ApplianceError(
-                f"the program has died {found.starts} times while candidate {candidate} ran beside it; take away "
-                f"{self._sweeps.folder / FILE} to try again"
+                f"the program has died {found.starts} times while candidate {candidate} ran beside "
+                f"it; remove {self._sweeps.folder / FILE} to try again"
             )
         found.starts += 1
         storage.put(self._sweeps.folder / FILE, found.json())
         return found
 
     def _judge(self, sweep: Sweep) -> Verdict | None:
-        """The candidate's verdict; None where it would wait for more of the sweep."""
+        """The candidate's verdict; None if it needs more of the sweep."""
         if sweep.share == 1:
             return self._classifier(sweep)
         return self._early(sweep) if self._early else None
@@ -267,8 +274,8 @@ class Shadow(Observer):
         self._failures_in_row += 1
         if self._failures_in_row == FAILURES:
             log.warning(
-                f"shadow: candidate {self.agreement.candidate} is not asked any more, it failed {FAILURES} times "
-                f"in a row: {why}; classifying goes on"
+                f"shadow: candidate {self.agreement.candidate} was stopped, it failed {FAILURES} "
+                f"times in a row: {why}; classifying goes on"
             )
 
     def _keep(self) -> None:

@@ -1,9 +1,8 @@
-"""Signs and verifies bundles. In: a manifest, its signature, a file of trusted signers. Out: the
-signer's name.
+"""Signs and verifies bundles with ssh-keygen.
 
-ssh-keygen does the work (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its
-manual), with keys and tools that people have already. A manifest names the hash of every other
-file, so its signature covers the whole bundle.
+ssh-keygen (`-Y sign`, `-Y verify`; sections SSHSIG and ALLOWED SIGNERS of its manual) works with
+keys that people already have. A manifest has the hash of every other file, so its signature covers
+the whole bundle.
 """
 
 from __future__ import annotations
@@ -23,29 +22,30 @@ if TYPE_CHECKING:
     from subprocess import CompletedProcess
 
 NAMESPACE = "palpate-bundle"
-"""A signature made for another purpose, git for example, is not accepted here."""
+"""Namespace of bundles' signatures. A signature for another purpose, for example git, is not
+accepted."""
 MOST_SIGNATURE, MOST_SIGNERS = 16 << 10, 256 << 10
-"""Bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
+"""Largest sizes in bytes. A signature by the longest usual key, RSA of 16,384 bits, takes 6 kB."""
 DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
-"""For ssh-keygen by itself, some milliseconds on a desktop; and with a person who types a
-passphrase or touches a key."""
+"""Time limits for ssh-keygen: by itself, which takes some milliseconds on a desktop; and with a
+person who types a passphrase or touches a key."""
 LINE = re.compile(
     r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
     r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
     re.ASCII,
 )
-"""A line of the signers' file: one name, one key. ssh-keygen allows more: patterns, certificates,
-and dates, for which a box must know the time."""
+"""A line of the signers' file: one name, one key. ssh-keygen also allows patterns, certificates and
+dates. Dates need a correct clock, which a box may not have."""
 DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
 def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAMESPACE) -> str:
-    """The name of the signer, one of `signers`, who signed `message` for this use, by default as a
+    """The name of the signer in `signers` who signed `message` for this namespace, by default as a
     bundle's manifest.
 
-    Raises BundleError where none of them did, and ConfigError where this cannot be checked: the
-    file of signers is missing, empty or holds a line that is not understood, or ssh-keygen fails.
+    Raises BundleError if none of the signers did. Raises ConfigError if this cannot be checked: the
+    file of signers is missing, empty or has an invalid line, or ssh-keygen fails.
     """
     if len(signature) > MOST_SIGNATURE:
         raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
@@ -54,16 +54,17 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
         names = found.stdout.decode(errors="replace").splitlines()
         if found.returncode or not names:
             raise BundleError(
-                f"bundle is signed by none of those in {signers} ({_output(found)}); sign it with a key that is "
-                "there (palpate-train sign), or have the administrator add the key"
+                f"bundle is signed by none of the signers in {signers} ({_output(found)}); sign it "
+                "with a key that is there (palpate-train sign), or have the administrator add the "
+                "key"
             )
         checked = _keygen(
             "verify", "-f", allowed, "-I", names[0], "-n", namespace, "-s", signed, message=message
         )
     if checked.returncode:
         raise BundleError(
-            f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the bundle again, or sign it "
-            "again (palpate-train sign)"
+            f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the "
+            "bundle again, or sign it again (palpate-train sign)"
         )
     return names[0]
 
@@ -73,8 +74,8 @@ def sign(
 ) -> bytes:
     """The signature of `message`, by default as a bundle's manifest.
 
-    key: a private key, or a public one whose private key an agent holds. interactive: ask on the
-    terminal for what the key wants. Raises ConfigError where it does not sign.
+    key: a private key, or the public key of a private key in an agent. interactive: ssh-keygen may
+    ask for a passphrase on the terminal. Raises ConfigError if the key does not sign.
     """
     done = _keygen(
         "sign", "-f", str(key), "-n", namespace, "-q", message=message, interactive=interactive
@@ -87,8 +88,8 @@ def sign(
 
 
 def _trusted(signers: Path) -> bytes:
-    """The content of the file of signers, with each line checked: ssh-keygen would skip one that it
-    does not understand without a word. Raises ConfigError."""
+    """The content of the file of signers, with each line checked, because ssh-keygen skips invalid
+    lines silently. Raises ConfigError."""
     try:
         with signers.open("rb") as f:
             data = f.read(MOST_SIGNERS + 1)
@@ -106,7 +107,7 @@ def _trusted(signers: Path) -> bytes:
     ]
     if not entries:
         raise ConfigError(
-            f"{signers} names nobody, so no bundle can be believed; put a line `NAME KEY` there"
+            f"{signers} has no signer, so no bundle can be trusted; put a line `NAME KEY` there"
         )
     for n, line in entries:
         if not _is_signer(line):
@@ -123,7 +124,7 @@ def _trusted(signers: Path) -> bytes:
 
 
 def _is_signer(line: str) -> bool:
-    """Whether a line is a name and a key of the kind that it names."""
+    """Whether a line is a name and a key of the kind that the line states."""
     found = LINE.fullmatch(line)
     if not found:
         return False
@@ -137,8 +138,8 @@ def _is_signer(line: str) -> bool:
 
 @contextmanager
 def _as_file(data: bytes) -> Iterator[str]:
-    """Path of a file in memory with `data`, which a child can open: it reads what was checked here,
-    and no disk is needed."""
+    """Path of a file in memory with `data` that a child process can open. So the child reads the
+    bytes that were checked here, and no disk is needed."""
     at = os.memfd_create("palpate", 0)  # children inherit it
     try:
         os.write(at, data)
@@ -152,7 +153,7 @@ def _keygen(
 ) -> CompletedProcess[bytes]:
     """Run `ssh-keygen -Y action` on `message`. interactive: it may ask a person on the terminal.
     Raises ConfigError."""
-    import subprocess  # 200 kB, and only where a bundle was deployed
+    import subprocess  # 200 kB, needed only if a bundle was deployed
 
     try:
         return subprocess.run(
@@ -170,7 +171,7 @@ def _keygen(
         ) from e
     except (OSError, subprocess.TimeoutExpired) as e:
         raise ConfigError(
-            f"ssh-keygen cannot be asked: {e}; try `ssh-keygen -Y {action}` by hand"
+            f"ssh-keygen cannot be run: {e}; try `ssh-keygen -Y {action}` by hand"
         ) from e
 
 

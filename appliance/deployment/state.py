@@ -1,8 +1,7 @@
-"""What the store knows of each bundle beside its files. In: the bytes of bundles.json. Out: a
-StoreState, and changed ones.
+"""The state of the store's bundles, as in bundles.json.
 
-Values only; `store` reads and writes the file. A bundle is named by the sha256 of its manifest, the
-packaged one by PACKAGED.
+This module only computes; `store` reads and writes the file. Bundles are identified by their names
+(`bundle.name`), the packaged bundle by PACKAGED.
 """
 
 from __future__ import annotations
@@ -19,23 +18,25 @@ STATE_FILE, OLD_STATE_FILE = "bundles.json", "ledger.json"
 PACKAGED = ""
 """The bundle that comes with the program. It is never on trial."""
 MOST_STARTS = 3
-"""A bundle is started at most so often without being committed; the next start goes back."""
+"""Largest number of starts without a commit; the next start goes back."""
 MOST_CUTS = 10
-"""Nor may the computer be switched off so often while it is on trial: a bundle that did that would
-else stay for ever."""
+"""Largest number of power-offs during a trial. Without this limit a bundle that switches the
+computer off would stay for ever."""
 MOST_WHY = 300
-"""Characters of the reason for leaving a bundle that are kept."""
+"""Largest number of characters kept of the reason why a trial failed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
     """State of one bundle in the store.
 
-    previous: the bundle to go back to while this one is current. counter: its manifest's. starts:
-    how often it was started on trial, less those that ended in order. sweeps, streamed_s: how far
-    its trial has come, as of the last such end. why: why it was left, "" where it was not. boot: id
-    of the boot in which the last of these starts was made, "" where it was taken back. cuts: how
-    many starts ended with their boot: the power was cut, or the computer reset.
+    previous: the bundle to go back to while this bundle is current.
+    counter: of its manifest.
+    starts: number of starts on trial without an orderly end.
+    sweeps, streamed_s: progress of its trial at the last orderly end.
+    why: why its trial failed, "" if it did not.
+    boot: id of the boot of the last counted start, "" if that start is no longer counted.
+    cuts: number of starts that ended by a power cut or a reset of the computer.
     """
 
     previous: str = PACKAGED
@@ -49,8 +50,8 @@ class Standing:
     cuts: int = 0
 
     def since(self, boot: str) -> Standing:
-        """As it is at a start in this boot: a start that another boot did not outlast was ended by
-        no fault of the bundle."""
+        """The state at a start in this boot. If the last counted start was in another boot, the end
+        of that boot ended it, so it counts as a cut and not against the bundle."""
         if not self.boot or not boot or self.boot == boot:
             return self
         return replace(self, starts=self.starts - 1, cuts=self.cuts + 1, boot="")
@@ -61,8 +62,8 @@ class StoreState:
     """State of all bundles in the store.
 
     counter, highest: the highest counter that was ever committed, and its bundle. candidate: the
-    bundle that classifies beside the current one in `palpate run --shadow`, PACKAGED where there is
-    none.
+    bundle that classifies beside the current bundle in `palpate run --shadow`, PACKAGED without a
+    candidate.
     """
 
     counter: int = 0
@@ -71,17 +72,17 @@ class StoreState:
     standings: dict[str, Standing] = field(default_factory=dict)
 
     def of(self, sha: str) -> Standing:
-        """State of a bundle; one that is not recorded was put there by hand, and goes back to the
-        packaged one."""
+        """State of a bundle. A bundle without an entry was put there by hand and goes back to the
+        packaged bundle."""
         return self.standings.get(sha, Standing())
 
     def changed(self, sha: str, **changes: Any) -> StoreState:
-        """With these fields of one bundle's state changed."""
+        """The state with these fields of one bundle changed."""
         return replace(self, standings=self.standings | {sha: replace(self.of(sha), **changes)})
 
     def activated(self, sha: str, counter: int, now: str) -> StoreState:
-        """As it must be before `sha` replaces the current bundle `now`: on trial, and going back to
-        a committed bundle."""
+        """The state that must be written before `sha` replaces the current bundle `now`: `sha` is
+        on trial and goes back to a committed bundle."""
         back = now if self.of(now).committed else self.of(now).previous
         fresh = self if sha != self.candidate else replace(self, candidate=PACKAGED)
         if sha == back:
@@ -90,40 +91,41 @@ class StoreState:
         return replace(fresh, standings=standings)
 
     def committed(self, sha: str) -> StoreState:
-        """With the trial of `sha` passed: bundles with a lower counter are refused from now on."""
+        """The state after `sha` passed its trial: bundles with a lower counter are refused."""
         made = self.changed(sha, committed=True, starts=0, why="", boot="", cuts=0)
         counter = self.of(sha).counter
         return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
 
     def left(self, sha: str, why: str) -> StoreState:
-        """With the trial of `sha` failed for this reason. Its starts are used up, in case the power
-        goes before `current` changes."""
+        """The state after the trial of `sha` failed for this reason. Its starts are set to the
+        limit, in case the power fails before `current` changes."""
         text = "".join(c if c.isprintable() else " " for c in why)
         return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY], boot="")
 
     def exchanged(self, sha: str) -> StoreState:
-        """As it must be before the bundle that `sha` goes back to becomes current: going back twice
-        returns to `sha`."""
+        """The state that must be written before a rollback from `sha`: a second rollback returns
+        to `sha`."""
         return self.changed(self.of(sha).previous, previous=sha)
 
     def chain(self, sha: str) -> tuple[str, ...]:
-        """A bundle and the one it goes back to; for one on trial also the one after that, in case
-        the trial fails."""
+        """A bundle and the bundle that it goes back to. For a bundle on trial also the next in the
+        chain, which is needed if the trial fails."""
         back = self.of(sha).previous
         return (sha, back) if self.of(sha).committed else (sha, back, self.of(back).previous)
 
     def only(self, *kept: str) -> StoreState:
-        """With the states of these bundles alone."""
+        """The state with the entries of these bundles alone."""
         return replace(
             self, standings={sha: one for sha, one in self.standings.items() if sha in kept}
         )
 
     def admit(self, sha: str, counter: int) -> None:
-        """Raise BundleError where the bundle is older than one that was committed."""
+        """Raises BundleError if the bundle is older than a bundle that was committed."""
         if counter <= self.counter and sha != self.highest:
             raise BundleError(
-                f"bundle has counter {counter}, and {self.counter} was committed here before; sign it with a higher one "
-                "(palpate-train sign --counter), or use `palpate bundles rollback` to go back"
+                f"bundle has counter {counter}, and {self.counter} was committed here before; sign "
+                "it with a higher counter (palpate-train sign --counter), or use `palpate bundles "
+                "rollback` to go back"
             )
 
     def json(self) -> bytes:
@@ -132,11 +134,12 @@ class StoreState:
 
     @classmethod
     def parse(cls, text: bytes) -> StoreState:
-        """From the content of bundles.json. Raises ValueError or TypeError naming what is wrong.
+        """The state in the content of bundles.json. Raises ValueError or TypeError for wrong
+        content.
 
-        A field that this version does not know is left out: a newer program wrote it before it was
-        gone back from, and its bundles must still start. What this version writes is then without
-        it, and a newer one takes its default.
+        Unknown fields are ignored: after a downgrade the program must still read the file of a
+        newer version. The file that this version writes does not have them, and a newer version
+        takes their defaults.
         """
         raw = json.loads(text)
         if isinstance(raw, dict):
@@ -150,7 +153,7 @@ class StoreState:
 
 
 def _known(kind: type[Standing | StoreState], raw: Any) -> Any:
-    """A JSON object without the fields that `kind` does not have."""
+    """The JSON object `raw` without the fields that `kind` does not have."""
     names = {f.name for f in fields(kind)}
     return (
         {name: value for name, value in raw.items() if name in names}

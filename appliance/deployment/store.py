@@ -1,19 +1,20 @@
-"""What the box runs. In: bundles that were copied to it. Out: the one for this start, old or new,
-whole at every moment.
+"""The store of bundles on the box. It chooses the bundle for each start and stays consistent after
+a power failure at any moment.
 
-In the store's folder, `bundles/SHA/` (bundle.name) are whole, verified bundles, the symlink
-`current` names the one that runs (missing: the packaged one), and `bundles.json` holds all else
-(StoreState). Each step is one atomic rename of a file, a folder or the link, and what the step
-relies on is on the disk before:
+In the store's folder, `bundles/SHA/` (bundle.name) are complete, verified bundles. The symlink
+`current` leads to the bundle that runs; without the link the packaged bundle runs. `bundles.json`
+holds the state (StoreState). Each step is one atomic rename of a file, a folder or the link, and
+everything that the step relies on is synced to the disk before:
 
-- install: the bundle's folder gets its name; its state is written, on trial and with the bundle to go back to; then
-  `current` leads to it. The state of the bundle that was current is unchanged, and holds if the power goes in between.
-- choose, at each start: the start is counted before the bundle is touched.
+- install: the bundle's folder gets its name; then its state is written, on trial and with the
+  bundle to go back to; then `current` leads to it. The state of the previous bundle is unchanged,
+  and holds if the power fails in between.
+- choose, at each start: the start is counted before the bundle is read.
 - commit: the end of the trial and the new least counter are one write.
-- going back: the state first, with the trial's starts used up or the way forward again kept; then `current`.
+- going back: first the state, then `current`. The state has the trial's starts at the limit after
+  a failed trial, or the way forward after a rollback.
 
-So a reader that reads first the link and then the state needs no lock. A writer holds one on the
-folder.
+So a reader that reads first the link and then the state needs no lock. A writer locks the folder.
 """
 
 from __future__ import annotations
@@ -50,20 +51,20 @@ from appliance.deployment.state import (
 from appliance.deployment.trial import Trial
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")
-"""Another text after each boot (random(4))."""
+"""The kernel's id of this boot (random(4))."""
 SHA = re.compile(r"[0-9a-f]{64}")
 PACKAGER = "palpate"
-"""Who is named as the signer of the packaged bundle."""
+"""Name of the signer that is shown for the packaged bundle."""
 INCOMPLETE = "."
-"""First character of a folder's name while it is being written or removed."""
+"""First character of a folder's name while the folder is written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
-"""How long to wait for another command, which takes some fsyncs on a slow card; and how often to
-try."""
+"""Longest wait for another command, which makes several fsyncs on a slow card; and the time between
+two attempts."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignedBundle:
-    """A bundle and who signed it, with its files as they were checked."""
+    """A bundle with its signer and the checked bytes of its files."""
 
     bundle: Bundle
     signer: str
@@ -71,25 +72,26 @@ class SignedBundle:
 
     @property
     def sha(self) -> str:
-        """Its name in the store."""
+        """The bundle's name in the store."""
         return bundle.name(self.files)
 
     @property
     def base(self) -> str:
-        """The sha256 of its manifest: for a bundle with enrolled labels that of the one that they
-        were enrolled into."""
+        """The sha256 of the manifest, which is the name of the bundle without enrolled labels."""
         return self.bundle.base
 
 
 class BundleFolder:
-    """Whole, verified bundles in `folder`, each under its name. signers: the file of trusted
-    signers. key: of this box, for labels that it enrolled."""
+    """Complete, verified bundles in `folder`, each under its name.
+
+    signers: the file of trusted signers. key: this box's key for labels that it enrolled.
+    """
 
     def __init__(self, folder: Path, signers: Path, key: EnrolmentKey) -> None:
         self.folder, self._signers, self._key = folder, signers, key
 
     def at(self, sha: str) -> Path:
-        """The folder of a bundle."""
+        """The folder of the bundle `sha`."""
         return self.folder / sha
 
     def read(self, folder: Path) -> SignedBundle:
@@ -98,24 +100,25 @@ class BundleFolder:
         return self.checked(bundle.files(folder), folder)
 
     def checked(self, files: Mapping[str, bytes], folder: Path) -> SignedBundle:
-        """The bundle of these files, which were read in `folder`: as `read`."""
+        """The bundle of `files`, which were read in `folder`. Raises as `read`."""
         signer = self._signer(files, folder)
         loaded = bundle.from_files(files, str(folder))
         if version(loaded.manifest.runtime) > version(__version__):
             raise BundleError(
-                f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update the box (make install)"
+                f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update "
+                "the box (make install)"
             )
         return SignedBundle(loaded, signer, files)
 
     def _signer(self, files: Mapping[str, bytes], folder: Path) -> str:
-        """Who signed it. Labels that were enrolled need this box's signature, and what they were
-        enrolled into is either signed as every bundle is, or the packaged bundle, which is believed
-        like the program that it comes with."""
+        """The signer. Enrolled labels need the signature of this box. The bundle that they were
+        enrolled into is signed, or is the packaged bundle, which is trusted like the program."""
         enrolled = bundle.ENROLMENT in files
         if enrolled:
             if bundle.ENROLMENT_SIGNATURE not in files:
                 raise BundleError(
-                    f"{folder}: {bundle.ENROLMENT} is not signed; enrol again on this box (palpate enrol)"
+                    f"{folder}: {bundle.ENROLMENT} is not signed; enrol again on this box "
+                    "(palpate enrol)"
                 )
             self._key.verify(files[bundle.ENROLMENT], files[bundle.ENROLMENT_SIGNATURE])
         if bundle.SIGNATURE in files:
@@ -126,15 +129,16 @@ class BundleFolder:
             raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
         elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
             raise BundleError(
-                f"{folder}: the bundle that {bundle.ENROLMENT} adds labels to is not signed, and is not the one that this "
-                "version of the program has; enrol again"
+                f"{folder}: the bundle that {bundle.ENROLMENT} adds labels to is not signed, and "
+                "is not the packaged bundle of this version; enrol again"
             )
         else:
             signer = PACKAGER
         return f"{signer}, enrolled here" if enrolled else signer
 
     def get(self, sha: str) -> SignedBundle:
-        """The bundle `sha`, checked again. Raises BundleError where another one is in its place."""
+        """The bundle `sha`, checked again. Raises BundleError if its folder holds another
+        bundle."""
         signed = self.read(self.at(sha))
         if signed.sha != sha:
             raise BundleError(
@@ -143,18 +147,18 @@ class BundleFolder:
         return signed
 
     def put(self, signed: SignedBundle) -> None:
-        """Write a bundle, whole or not at all. Raises OSError."""
+        """Write a bundle, completely or not at all. Raises OSError."""
         folder = self.at(signed.sha)
         if folder.exists() and _holds(folder, signed.files):
-            storage.sync(self.folder)  # whoever renamed it may have been killed before this
+            storage.sync(self.folder)  # the program that renamed it may have been killed before
             return
         with storage.folder(folder) as new:
             for name, data in signed.files.items():
                 (new / name).write_bytes(data)
 
     def keep(self, *kept: str) -> None:
-        """Remove all other bundles, and what an interruption left. A bundle is renamed before its
-        files are removed."""
+        """Remove all other bundles and incomplete folders. A bundle is renamed before its files are
+        removed."""
         for folder in sorted(self.folder.iterdir()):  # incomplete ones first
             if folder.name in kept:
                 continue
@@ -165,7 +169,7 @@ class BundleFolder:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What a start runs. trial: None where the bundle is committed."""
+    """The bundle for a start. trial: its state, None if the bundle is committed."""
 
     bundle: Bundle
     folder: Path
@@ -173,12 +177,12 @@ class Choice:
 
 
 class Store:
-    """The bundles on this box and which of them runs.
+    """The bundles on this box, and the choice of the bundle that runs.
 
-    prove: raises where this machine does not run a bundle as it should: golden sweeps, and whether
-    it fits the settings. boot: the file with the id of this boot. The methods raise OSError for
-    trouble with the disk, BundleError for a bundle that must not run, ConfigError where the
-    settings name no trusted signers, and ApplianceError where another command holds the lock.
+    prove: raises if a bundle fails its golden sweeps on this machine or does not fit the settings.
+    boot: the file with the id of this boot. The methods raise OSError for trouble with the disk,
+    BundleError for a bundle that must not run, ConfigError if the settings have no trusted signers,
+    and ApplianceError if another command holds the lock.
     """
 
     def __init__(
@@ -197,7 +201,7 @@ class Store:
 
     @property
     def current(self) -> str:
-        """The bundle that `current` leads to, PACKAGED where there is no such link."""
+        """The bundle that `current` leads to, PACKAGED if the link does not exist."""
         try:
             target = os.readlink(self._link)
         except FileNotFoundError:
@@ -205,35 +209,36 @@ class Store:
         parent, _, sha = target.partition("/")
         if parent != self.bundles.folder.name or not SHA.fullmatch(sha):
             raise BundleError(
-                f"{self._link} leads to {target!r}, which is no bundle of the store; remove this link"
+                f"{self._link} leads to {target!r}, which is not a bundle of the store; remove "
+                "this link"
             )
         return sha
 
     @property
     def state(self) -> StoreState:
-        """The state of the bundles; empty where nothing was ever deployed.
+        """The state of the bundles; empty if nothing was ever deployed.
 
-        A store that an earlier version wrote is read from its old file until the first write.
+        In a store of an earlier version the old file is read until the first write.
         """
-        # the new file a second time: a writer may have replaced the old one between the two reads
+        # the new file is tried twice: a writer may replace the old file between the two reads
         for path in (self._state_file, self._old_state_file, self._state_file):
             with suppress(FileNotFoundError):
                 return self._parsed(path)
         return StoreState()
 
     def _parsed(self, path: Path) -> StoreState:
-        """The state in a file. Raises FileNotFoundError, and BundleError for other content."""
+        """The state in a file. Raises FileNotFoundError, and BundleError for invalid content."""
         text = path.read_bytes()
         try:
             return StoreState.parse(text)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
                 f"{path} cannot be read: {e}; without this file the current bundle counts as "
-                "committed, and any counter is taken: remove it if you can vouch for both"
+                "committed, and any counter is accepted: remove it if you can vouch for both"
             ) from e
 
     def examine(self, folder: Path) -> SignedBundle:
-        """The bundle in `folder`, checked in every way but its counter; nothing is changed."""
+        """The bundle in `folder`, after all checks except that of its counter. Changes nothing."""
         return self._proven(self.bundles.read(folder))
 
     def _proven(self, signed: SignedBundle) -> SignedBundle:
@@ -246,18 +251,18 @@ class Store:
         shadow: bool = False,
         admit: Callable[[Bundle], object] = lambda bundle: None,
     ) -> str:
-        """Install the bundle in `incoming`, so that it runs on trial from the next start on; its
-        name.
+        """Install the bundle in `incoming`, so that it runs on trial from the next start on.
+        Returns its name.
 
-        shadow: it becomes the candidate instead. admit: raises BundleError for one that is not
-        wanted now. Other files in `incoming` are ignored. Somebody else may own the folder and
-        change it meanwhile: the files are read once, and what was checked is what is written.
+        shadow: it becomes the candidate instead. admit: raises BundleError for a bundle that is not
+        wanted now. Other files in `incoming` are ignored. Another user may own the folder and
+        change it meanwhile, so the files are read once and the checked bytes are written.
         """
         return self._install(self.examine(incoming), shadow, admit)
 
     def enrol(self, files: Mapping[str, bytes]) -> str:
-        """Install the files of a bundle that this box has enrolled a label into, as `install`; its
-        name."""
+        """Install, as `install`, the files of a bundle into which this box has enrolled a label.
+        Returns its name."""
         return self._install(self._proven(self.bundles.checked(files, self.folder)))
 
     def _install(
@@ -281,7 +286,7 @@ class Store:
         return signed.sha
 
     def promote(self) -> str:
-        """Make the candidate run on trial from the next start on; its name."""
+        """Make the candidate run on trial from the next start on. Returns its name."""
         sha = self.state.candidate
         if sha == PACKAGED:
             raise BundleError(
@@ -294,18 +299,17 @@ class Store:
         return sha
 
     def candidate(self) -> Bundle | None:
-        """The bundle that is to classify beside the current one, checked; None where there is
-        none."""
+        """The checked candidate for shadow mode, None without a candidate."""
         sha = self.state.candidate
         return None if sha == PACKAGED else self.bundles.get(sha).bundle
 
     def running(self) -> SignedBundle:
-        """The current bundle, checked. This counts no start."""
+        """The current bundle, checked. The call does not count as a start."""
         return self._kept(self.current)
 
     def choose(self) -> Choice:
-        """What this start runs, checked. A bundle on trial that was started MOST_STARTS times, or
-        is refused, gives way to the bundle it goes back to."""
+        """The checked bundle for this start. A bundle on trial that was started MOST_STARTS times,
+        or is refused, is replaced by the bundle that it goes back to."""
         sha = self.current
         if self.state.of(sha).committed:
             return self._committed(sha)
@@ -319,7 +323,8 @@ class Store:
             self._go_back(sha, why)
         except OSError as e:
             log.warning(
-                f"{self.folder}: {e.strerror}, so no bundle can be on trial; what was committed runs for now"
+                f"{self.folder}: {e.strerror}, so no bundle can be on trial; the committed bundle "
+                "runs for now"
             )
             return self._committed(self.state.of(sha).previous)
         chosen = self._committed(self.current)
@@ -329,8 +334,8 @@ class Store:
         return chosen
 
     def commit(self, sha: str | None = None, wait_s: float = LOCK_S) -> bool:
-        """End the trial of the current bundle, if that is `sha` (None: any) and on trial; whether
-        it was."""
+        """End the trial of the current bundle, if that is `sha` (None: any) and on trial. Returns
+        whether it was on trial."""
         with self._locked(wait_s) as state:
             now = self.current
             if state.of(now).committed or sha not in (None, now):
@@ -339,8 +344,11 @@ class Store:
         return True
 
     def rollback(self) -> str:
-        """Go back to the bundle that was committed before, from the next start on; its name or
-        PACKAGED. Going back twice returns to the first one, unless that had failed its trial."""
+        """Go back to the previous committed bundle from the next start on. Returns its name or
+        PACKAGED.
+
+        A second rollback returns to the first bundle, unless that had failed its trial.
+        """
         with self._locked() as state:
             sha = self.current
             standing = state.of(sha)
@@ -358,8 +366,8 @@ class Store:
         return back
 
     def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come, and whether this start is one of
-        `starts`. Does not wait: ApplianceError where another command is at work."""
+        """Record the progress of the trial of `sha`, and whether this start counts in `starts`.
+        Does not wait: raises ApplianceError if another command holds the lock."""
         boot = self._boot if counted else ""
         with self._locked(0.0) as state:
             self._write(
@@ -374,7 +382,7 @@ class Store:
         return Choice(self._kept(sha).bundle, folder, None)
 
     def _kept(self, sha: str) -> SignedBundle:
-        """A bundle that is current or was, checked."""
+        """A bundle that is or was current, checked."""
         if sha == PACKAGED:
             files = bundle.files(bundle.DEFAULT)
             return SignedBundle(bundle.from_files(files, str(bundle.DEFAULT)), PACKAGER, files)
@@ -382,11 +390,12 @@ class Store:
             return self.bundles.get(sha)
         except BundleError as e:
             raise BundleError(
-                f"{e} (this bundle is committed; `palpate bundles rollback` goes back to the one before)"
+                f"{e} (this bundle is committed; `palpate bundles rollback` goes back to the "
+                "previous bundle)"
             ) from e
 
     def _on_trial(self, sha: str) -> Choice:
-        """A bundle on trial for this start, which was counted."""
+        """A bundle on trial for this start, which is counted already."""
         loaded = self.bundles.get(sha).bundle
         try:
             self._prove(loaded)
@@ -397,7 +406,7 @@ class Store:
         return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing))
 
     def _count(self, sha: str) -> str:
-        """Count a start of `sha`; the reason where it must not be started again, else ""."""
+        """Count a start of `sha`. Returns why it must not be started again, "" if it may."""
         with self._locked() as state:
             standing = state.of(sha).since(self._boot)
             if standing.starts >= MOST_STARTS:
@@ -411,23 +420,23 @@ class Store:
 
     @property
     def _boot(self) -> str:
-        """The id of this boot, "" where it cannot be read: then each start counts."""
+        """The id of this boot, "" if it cannot be read; then each start counts."""
         try:
             return self._boot_file.read_text().strip()
         except OSError:
             return ""
 
     def _go_back(self, sha: str, why: str) -> None:
-        """Let the bundle that `sha` goes back to run instead."""
+        """Make the bundle that `sha` goes back to the current bundle."""
         with self._locked() as state:
             if self.current == sha:
                 self._write(state.left(sha, why))
                 self._set_current(state.of(sha).previous)
 
     def _admit(self, signed: SignedBundle, state: StoreState) -> None:
-        """Raise BundleError where it is older than one that was committed, unless it is the one
-        that runs but for labels that were enrolled."""
-        with suppress(BundleError, ConfigError):  # what is damaged gives way
+        """Raises BundleError if the bundle is older than a committed bundle. The current bundle
+        with other enrolled labels is always accepted."""
+        with suppress(BundleError, ConfigError):  # a damaged current bundle may be replaced
             running = self.running()
             if signed.base == running.base and (signed.bundle.added or running.bundle.added):
                 return
@@ -439,7 +448,7 @@ class Store:
 
     def _write(self, state: StoreState) -> None:
         storage.put(self._state_file, state.json())
-        # only now: while both files are there, the new one holds
+        # removed last: while both files exist, the new file is valid
         self._old_state_file.unlink(missing_ok=True)
 
     def _set_current(self, sha: str) -> None:

@@ -1,9 +1,9 @@
-"""A bundle on trial. In: the box's health turn by turn, and its verdicts. Out: what the store
-records: starts that count against the bundle, its progress, and the commit once enough went well.
+"""Observes a bundle on trial and records in the store its progress, the starts that count against
+it, and the commit after enough sweeps and seconds.
 
-`Store.choose` counts a start before the bundle is touched. The count is taken back while the skin
-is away, when the program ends in order or because a device is missing, and at the next start where
-the computer was booted in between.
+`Store.choose` counts a start before the bundle is read. The start is no longer counted while the
+skin is away, after the program has ended in order or because a device is missing, and at the next
+start if the computer was booted in between.
 """
 
 from __future__ import annotations
@@ -23,40 +23,39 @@ if TYPE_CHECKING:
     from appliance.deployment.state import Standing
 
 RETRY_NS = 10_000_000_000
-"""After a write that failed, the disk is left alone for so long."""
+"""Pause after a failed write."""
 ERRORS = (OSError, ApplianceError)
-"""What a write to the store may raise: from the disk, or because another command holds the
-store."""
+"""Errors of a write to the store: of the disk, or because another command holds the lock."""
 
 
 class TrialStore(Protocol):
-    """What a trial asks of the store. Both methods raise OSError or ApplianceError where nothing
-    could be written."""
+    """The part of the store that a trial uses. Both methods raise OSError or ApplianceError if
+    nothing could be written."""
 
     @property
     def settings(self) -> StoreConfig:
-        """How many sweeps and seconds a trial lasts."""
+        """Settings with the number of sweeps and seconds of a trial."""
 
     def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Write down how far the trial of `sha` has come, and whether this start is one of
+        """Record the progress of the trial of `sha`, and whether this start counts in
         `starts`."""
 
     def commit(self, sha: str | None, wait_s: float) -> bool:
-        """End the trial of `sha`; whether it was on trial."""
+        """End the trial of `sha`. Returns whether it was on trial."""
 
 
 class Trial(Observer):
     """Observes one bundle's trial; also a context around the run.
 
-    standing: with this start counted. Never raises for the disk: a failed write is logged once and
-    tried again after RETRY_NS, and classifying goes on.
+    standing: state of the bundle with this start counted. Trouble with the disk raises no error: a
+    failed write is logged once and tried again after RETRY_NS, and classifying goes on.
     """
 
     def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
         self._store, self._sha = store, sha
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
-        self._last_ns: int | None = None  # the last turn's time, where frames came in it
+        self._last_ns: int | None = None  # time of the last turn if it had frames
         self._next_ns, self._over = 0, False
         self._log = TroubleLog(
             f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
@@ -64,7 +63,7 @@ class Trial(Observer):
 
     @property
     def text(self) -> str:
-        """How far the trial is, for a person; "" once it is over."""
+        """Progress of the trial, for a person; "" after its end."""
         if self._over:
             return ""
         settings = self._store.settings
@@ -74,12 +73,12 @@ class Trial(Observer):
         )
 
     def answered(self, verdict: Verdict) -> None:
-        """Count a sweep that the bundle gave a label."""
+        """Count a sweep to which the bundle gave a label."""
         self._sweeps += bool(verdict.label)
 
     def turn(self, health: Health) -> None:
-        """Add the time that the skin streams; record what has changed, or commit where it is
-        enough."""
+        """Add the time in which the skin streamed. Record changes, or commit after enough sweeps
+        and seconds."""
         if self._over:
             return
         if health.streams and self._last_ns is not None:
@@ -89,7 +88,7 @@ class Trial(Observer):
             self._next_ns = health.time_ns + RETRY_NS
 
     def stopping(self) -> None:
-        """The program ends in order: this start does not count."""
+        """At an orderly end of the program: do not count this start."""
         if not self._over and self._counted:
             self._log.attempt(lambda: self._note(False), ERRORS)
 
@@ -102,13 +101,14 @@ class Trial(Observer):
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        """An error of hardware or settings does not count against the bundle, nor does a signal;
-        any other does."""
+        """Count this start against the bundle, unless a signal or an error of hardware or settings
+        ended the program."""
         if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
             self.stopping()
 
     def _record(self, health: Health) -> bool:
-        """Whether the store knows all it should. A commit waits until no sweep is open."""
+        """Record or commit if needed. Returns whether the store is up to date. A commit waits until
+        no sweep is open."""
         settings = self._store.settings
         if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
             return health.sweeping or self._log.attempt(self._commit, ERRORS)
@@ -125,7 +125,7 @@ class Trial(Observer):
         done = self._store.commit(self._sha, 0.0)
         self._over = True
         if done:
-            log.info(f"bundle {self._sha[:8]} has stood its trial and is committed")
+            log.info(f"bundle {self._sha[:8]} has passed its trial and is committed")
 
 
 def _is_hardware_or_settings(error: BaseException | None) -> bool:

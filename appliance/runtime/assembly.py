@@ -1,5 +1,5 @@
-"""How a box is put together. In: settings, a bundle or none, devices. Out: a Box; the simulator is
-not known here."""
+"""Assembles a Box from settings, devices, and a bundle if there is one. The simulator is not
+imported here."""
 
 from __future__ import annotations
 
@@ -40,8 +40,11 @@ from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Answerer, Box, CommandHandler, Pipeline
 
-UNSIGNED = "bundles are allowed: classifier.allow_unsigned = true; take it out of the settings once the bundle is signed"
-"""What is told with "unsigned" before it while that setting is on."""
+UNSIGNED = (
+    "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
+    "bundle is signed"
+)
+"""Warning text, after the word "unsigned", shown while classifier.allow_unsigned is set."""
 NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
 
 
@@ -58,7 +61,8 @@ def box(
 ) -> Box:
     """The box that classifies; `stack` closes it again.
 
-    capture: of all that comes in. labels: what the class bits must hold beside the bundle's labels.
+    capture: records all inputs. labels: labels that the class bits must hold in addition to the
+    bundle's.
     """
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
@@ -88,8 +92,10 @@ def recorder(
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
 ) -> Box:
-    """The box that records sweeps of a form and needs no bundle; the class bits stay 0. ordered:
-    commands come from elsewhere than the port, too. Other parameters as for `box`."""
+    """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
+
+    ordered: commands also come from another source than the port. Other parameters as for `box`.
+    """
     check = SweepCheck(format, devices.clock)
     watching = [check, *observers]
     return _assembled(
@@ -119,7 +125,7 @@ def _assembled(
     early: EarlyExit | None = None,
     ordered: bool = False,
 ) -> Box:
-    """Put the components together. codes: labels that the class bits hold."""
+    """Put the components together. codes: number of labels that the class bits hold."""
     watching = [*observers, *([capture] if capture else [])]
     commands = {**commands, "LABEL": partial(_label, codes)}
     trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
@@ -158,13 +164,13 @@ def _trigger(
     *,
     ordered: bool,
 ) -> Trigger:
-    """What starts and stops sweeps. Raises ConfigError where the settings leave nothing that
-    could."""
+    """The trigger of the settings. Raises ConfigError if nothing could start and stop sweeps."""
     if config.mode == "serial":
         if not ordered and (port is None or isinstance(port, StdoutPort)):
             raise ConfigError(
-                'trigger.mode = "serial" takes START and STOP from the serial line, but serial.port names none; '
-                "set it, or use --trigger key, or the page of palpate record --web"
+                'trigger.mode = "serial" takes START and STOP from the serial line, but '
+                "serial.port is not set; set it, or use --trigger key, or the page of palpate "
+                "record --web"
             )
         return CommandTrigger(devices.clock)
     if config.mode == "key":
@@ -180,15 +186,15 @@ def _trigger(
     missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
     if missing == "start" or (missing and config.mode == "two-lines"):
         raise ConfigError(
-            f"trigger.{missing} names no line, so no sweep can be cut; choose a board with --board, "
-            "or do without lines: --trigger serial, key or timed"
+            f"trigger.{missing} has no GPIO line, so no sweep can be cut; choose a board with "
+            "--board, or a trigger without lines: --trigger serial, key or timed"
         )
     return stack.enter_context(GpioTrigger(config, gpio(devices)))
 
 
 def _label(labels: tuple[str, ...], code: str) -> list[object]:
     """The label with this code on the class bits, and the number of labels. Raises FormatError if
-    there is none."""
+    no label has this code."""
     if not labels:
         raise FormatError("sweeps are recorded without a bundle, so there are no labels")
     if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
@@ -197,7 +203,7 @@ def _label(labels: tuple[str, ...], code: str) -> list[object]:
 
 
 def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | None:
-    """The lines to the robot, None where none is wired."""
+    """The GPIO lines to the robot, None if none is wired."""
     out = settings.output
     if not any((out.ready, out.busy, out.result_valid, out.fault, out.decided, *out.class_bits)):
         return None
@@ -205,7 +211,7 @@ def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | No
 
 
 def gpio(devices: Devices) -> Any:
-    """The module gpiod, or its simulated double; imported only where a line is wired."""
+    """The module gpiod, or its simulated double; imported only if a GPIO line is wired."""
     if devices.gpio is not None:
         return devices.gpio
     import gpiod
@@ -214,19 +220,19 @@ def gpio(devices: Devices) -> Any:
 
 
 def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
-    """The classifier, configured as the settings say."""
+    """The classifier with these settings."""
     chosen = settings.classifier
     return Classifier(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps)
 
 
 def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
-    """What answers early, where the settings ask for it."""
+    """The early exit, None unless the settings ask for it."""
     return EarlyExit(run) if settings.classifier.early else None
 
 
 def prove(settings: Config, bundle: Bundle) -> None:
-    """Raises BundleError or ConfigError where this machine, set as it is, does not run a bundle as
-    it should."""
+    """Raises BundleError or ConfigError if this machine, with these settings, does not run a bundle
+    correctly."""
     run = classifier(settings, bundle, SystemClock())
     run.self_test()
     early_exit(settings, run)
@@ -240,9 +246,9 @@ def store(settings: Config) -> Store:
 
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:
-    """The bundle that the settings ask for: the one named, the one deployed, or the packaged one.
+    """The bundle that the settings name, else the deployed bundle, else the packaged bundle.
 
-    answers: whether a robot gets what it says. Then it has to be signed, unless
+    answers: whether a robot gets its answers. Then it must be signed, unless
     classifier.allow_unsigned is set. Raises BundleError or ConfigError.
     """
     name = settings.classifier.bundle
@@ -250,7 +256,7 @@ def running(settings: Config, *, answers: bool = True) -> SignedBundle:
 
 
 def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
-    """The bundle in `folder`, which a setting or an option names; otherwise as `running`."""
+    """The bundle in `folder`, from a setting or an option; otherwise as `running`."""
     if settings.classifier.allow_unsigned or not answers:
         files = bundles.files(folder)
         return SignedBundle(bundles.from_files(files, str(folder)), "", files)
@@ -263,8 +269,8 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
 
 
 def port(settings: Config, devices: Devices) -> Port | None:
-    """The serial line, or standard output where none is configured; not into the journal, which a
-    person reads."""
+    """The serial line, or standard output if no line is configured. Sentences are not written to
+    the journal, which people read."""
     if settings.serial.port:
         return SerialSink(settings.serial, devices.clock, devices.source)
     return None if in_journal() else StdoutPort(devices.source)

@@ -1,8 +1,7 @@
-"""The loop of the box: one thread. In: frames, edges, commands. Out: a verdict for every trigger,
-states, answers.
+"""The loop of the box, in one thread: from frames, edges and commands to verdicts, states and
+answers.
 
-Which devices these come from is decided elsewhere (assembly); nothing here knows whether they are
-real.
+`assembly` chooses the devices. The loop does not depend on whether they are real or simulated.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from appliance.io.usb_sensor import Sensor, SensorCounters
 from appliance.recording.sweep_window import SweepCutter
 
 TARE_S = 0.5
-"""How much of the latest signal a tare averages."""
+"""Length of the latest signal that a tare averages."""
 
 CommandHandler = Callable[[str], list[object]]
-"""Carries out a command: its text -> the fields of its answer. What it raises as ApplianceError is
-the answer."""
+"""Carries out a command: its text -> the fields of its answer. An ApplianceError becomes the
+answer."""
 
 
 class Panel(Protocol):
-    """The lines that show the robot the state of the box."""
+    """The GPIO lines that show the robot the state of the box."""
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
         """Drive READY, BUSY, FAULT and DECIDED."""
@@ -44,8 +43,8 @@ class Panel(Protocol):
 
 
 class Answerer(Protocol):
-    """Gives each sweep its verdict: the classifier, or while sweeps are only recorded what checks
-    them."""
+    """Gives each sweep its verdict: the classifier, or SweepCheck in recordings without a
+    bundle."""
 
     @property
     def format(self) -> SweepFormat:
@@ -54,7 +53,7 @@ class Answerer(Protocol):
 
     @property
     def model(self) -> str:
-        """The id of the bundle, "" without one."""
+        """The id of the bundle, "" without a bundle."""
         ...
 
     def __call__(self, sweep: Sweep) -> Verdict:
@@ -62,7 +61,7 @@ class Answerer(Protocol):
         ...
 
     def about(self) -> dict[str, Any]:
-        """What belongs into the sidecar of a recorded sweep, for JSON."""
+        """Entries for the sidecar of a recorded sweep, for JSON."""
         ...
 
     def describe(self) -> list[object]:
@@ -70,18 +69,17 @@ class Answerer(Protocol):
         ...
 
     def test(self) -> str:
-        """What a self-test has found. Raises ApplianceError if it fails."""
+        """Run a self-test; returns its result in words. Raises ApplianceError if it fails."""
         ...
 
     def set_tare(self, taxels: NDArray[Any]) -> str:
-        """Take frames [n, R, C] as the unloaded skin; what they show, for a person."""
+        """Take frames [n, R, C] as the unloaded skin; returns a message for a person."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """What a sweep passes on its way to a verdict. early: answers sweeps that still go on, or
-    None."""
+    """The stages between a sweep and its verdict. early: answers unfinished sweeps, or None."""
 
     sensor: Sensor
     trigger: Trigger
@@ -94,10 +92,10 @@ class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer,
     listen.
 
-    port: where verdicts and state sentences go and commands come from, or None. panel: READY, BUSY,
+    port: sends verdicts and state sentences and receives commands, or None. panel: READY, BUSY,
     FAULT, DECIDED, or None. observers: called in this order, after the port. commands: further
-    commands by name. source: where the frames come from, as sentences name it. state_s: time
-    between two state sentences.
+    commands by name. source: origin of the frames, as in sentences. state_s: time between two state
+    sentences.
     """
 
     def __init__(
@@ -121,7 +119,7 @@ class Box:
         self._answerer, self._early = pipeline.answerer, pipeline.early
         self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
         self._source, self._state_ns = source, round(state_s * 1e9)
-        # only what an observer overrides is called, so nothing is computed that nobody wants
+        # only overridden methods of observers are called, so nothing is computed in vain
         self._on_frames = [o.frames for o in observers if type(o).frames is not Observer.frames]
         self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
         self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
@@ -142,12 +140,12 @@ class Box:
 
     @property
     def counters(self) -> SensorCounters:
-        """What the sensor has counted since the start."""
+        """Counters of the sensor since the start."""
         return self._sensor.counters
 
     @property
     def format(self) -> SweepFormat:
-        """The format of the sweeps that it takes."""
+        """The format of its sweeps."""
         return self._answerer.format
 
     def newest_frame(self) -> NDArray[Any] | None:
@@ -156,7 +154,7 @@ class Box:
         return None if frames is None else frames[0]
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Take turns until `stopped()`; what is open then is answered `aborted`."""
+        """Take turns until `stopped()`; then answer an open sweep with `aborted`."""
         while not stopped():
             self.step()
         for stopping in self._on_stopping:
@@ -165,7 +163,8 @@ class Box:
         self._answer(self._cutter.finished(self._clock.now_ns()))
 
     def step(self) -> list[Verdict]:
-        """One turn; takes at most the sensor's timeout. The verdicts that were sent."""
+        """One turn, which takes at most the sensor's timeout. Returns the verdicts that were
+        sent."""
         frames = self._sensor.read()
         now = self._turn_ns = self._clock.now_ns()
         self._cutter.put(frames, now)
@@ -204,7 +203,7 @@ class Box:
             )
 
     def _decide(self, now_ns: int) -> list[Verdict]:
-        """Answer the open sweep early, where that is wanted and possible."""
+        """Answer the open sweep early, if the settings allow it and the bundle can."""
         if not self._early:
             return []
         for sweep in self._cutter.so_far(self._early.steps, now_ns):
@@ -225,8 +224,8 @@ class Box:
         return verdicts
 
     def _pass_on(self, sweeps: Sequence[Sweep], verdicts: Sequence[Verdict]) -> None:
-        """Give answered sweeps to whoever keeps them: a disk takes its time, so after all
-        answers."""
+        """Give answered sweeps to the observers that keep them. This comes after all answers,
+        because disks are slow."""
         if not (sweeps and self._on_sweep):
             return
         circumstances = self.circumstances()
@@ -242,7 +241,7 @@ class Box:
         self.answered += 1
 
     def _report(self, now_ns: int) -> None:
-        """Log what has changed, answer commands, send the state once in a while."""
+        """Log changes, answer commands, and send the state every `state_s`."""
         trouble = str(self._sensor.trouble or "")
         if trouble or self._sensor.state == "streaming":  # not before its first frame
             self._skin_log.update(trouble)
@@ -284,12 +283,11 @@ class Box:
         )
 
     def circumstances(self) -> dict[str, Any]:
-        """What belongs into the sidecar of a recorded sweep beside its frames, as it is now: for
-        JSON.
+        """The present entries for the sidecar of a recorded sweep, for JSON.
 
-        device: the board's name, serial number and firmware, None before it was asked. clock: see
-        DeviceClock.quality. trigger: see Trigger.about. loss_known: whether lost frames can be seen
-        at all.
+        device: the readout board's name, serial number and firmware, None before it was asked.
+        clock: see DeviceClock.quality. trigger: see Trigger.about. loss_known: whether lost frames
+        can be detected.
         """
         who = self._sensor.identity
         return {
@@ -326,7 +324,7 @@ class Box:
         ]
 
     def _answer_to(self, command: Command) -> bytes:
-        """Carry out a command; its ANS sentence."""
+        """Carry out a command; returns its ANS sentence."""
         if command.error:
             return sentence("ANS", command.name, "error", command.error)
         try:
@@ -335,9 +333,11 @@ class Box:
             return sentence("ANS", command.name, "error", e)
 
     def obey(self, command: Command) -> list[object]:
-        """Carry out a command, wherever it comes from; the fields of its answer. Only between two
-        turns or in an observer's `turn`. Raises ApplianceError with the reason where it is
-        refused."""
+        """Carry out a command of any origin; returns the fields of its answer.
+
+        To be called between two turns or in an observer's `turn`. Raises ApplianceError with the
+        reason for a refusal.
+        """
         for note in self._on_command:
             note(self._turn_ns, command.line)
         if command.name in self._commands:

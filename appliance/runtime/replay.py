@@ -1,8 +1,8 @@
-"""Judges recorded data again. In: a capture, a kept sweep, a folder of these. Out: their sentences,
-and whether they differ.
+"""Classifies recorded data again (captures, kept sweeps, folders of sweeps) and compares the
+verdicts.
 
-A kept sweep is judged as it was: by the same rule, with the same tare, after the same sweeps of its
-object, at the same time. So its verdict must be that of its sidecar, bit for bit.
+A kept sweep is classified under its original conditions: the same rule, tare, time, and previous
+sweeps of its object. So the verdict must equal the verdict in its sidecar, bit for bit.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
-"""SAME: the verdict, bit for bit. ALONE: the scores of this sweep, but earlier sweeps of its object
-are missing."""
+"""Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
+sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
 OLD_RULE_KEYS = {"how": "fuse", "sure": "min_probability", "most_sweeps": "max_sweeps"}
-"""Keys of the rule in sidecars up to schema 2, with the names that replaced them."""
+"""Keys of the rule in sidecars up to schema 2, with the present keys."""
 FUSIONS = get_args(get_type_hints(ClassifierConfig)["fuse"])
 
 
 class OtherBundle(FormatError):
-    """A kept sweep that another bundle has judged."""
+    """A kept sweep that another bundle has classified."""
 
 
 def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], object]) -> int:
-    """Replay the file or folder at `path`: its sentences, and for each kept sweep whether the
+    """Replay the file or folder at `path`: write its sentences, and for each kept sweep whether the
     verdict is the same.
 
-    out: takes each line. Returns 1 where a verdict differs, else 0. Raises FormatError where the
-    file is not readable, of another format or of another bundle.
+    out: called with each line. Returns 1 if a verdict differs, else 0. Raises FormatError for an
+    unreadable file, another format or another bundle.
     """
     if path.is_dir():
         return _folder(path, Judge(settings, bundle), out)
@@ -90,11 +90,11 @@ class ReplayRule:
 
 @dataclass(frozen=True, slots=True)
 class KeptSweep:
-    """A kept sweep with the content of its sidecar; older sidecars hold less.
+    """A kept sweep with the content of its sidecar; older sidecars have fewer entries.
 
-    object: the folder, run and object number that fused sweeps share. rule: None where the sidecar
-    has none. tare: [R, C] or [R, C, A] raw counts, None where the sidecar has none. bundle: its id,
-    or "". verdict: as `Verdict.as_dict` gives it, or empty.
+    object: the folder, run and object number that fused sweeps share. rule: None without an entry.
+    tare: [R, C] or [R, C, A] raw counts, None without an entry. bundle: its id, or "". verdict: as
+    `Verdict.as_dict` returns it, or empty.
     """
 
     sweep: Sweep
@@ -124,13 +124,13 @@ class KeptSweep:
             return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict)
         except (TypeError, ValueError) as e:
             raise FormatError(
-                f"{path}: its sidecar cannot be used: {e}; take one that was not changed"
+                f"{path}: its sidecar cannot be used: {e}; use a sweep that was not changed"
             ) from e
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
-    """The result for a kept sweep. verdict: None where there is none any more."""
+    """The result for a kept sweep. verdict: None if the replay gives no verdict."""
 
     verdict: Verdict | None
     outcome: str
@@ -138,40 +138,38 @@ class ReplayResult:
 
 
 class ReplayClock:
-    """A clock that stands still until it is set: a verdict is given again at the time at which it
-    was given."""
+    """A clock that stands still until it is set, so that a verdict gets its original time."""
 
     def __init__(self) -> None:
         self.t_ns = 0
 
     def now_ns(self) -> int:
-        """The time it was set to."""
+        """The time that was set."""
         return self.t_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Return at once: nothing waits in a replay."""
+        """Return at once; a replay does not wait."""
 
 
 class Judge:
-    """Judges kept sweeps again, in their order. Holds the fused probabilities of the object so
-    far."""
+    """Classifies kept sweeps again, in their order, and fuses the sweeps of each object."""
 
     def __init__(self, settings: Config, bundle: Bundle) -> None:
         self._settings, self._bundle = settings, bundle
         self._clock = ReplayClock()
         self._classifier: Classifier | None = None
-        self._made: object = None  # what the classifier was made for
+        self._made: object = None  # folder, run and rule of the classifier
         self._last: object = (
             None  # (object, sweeps fused) of the last sweep with all earlier ones of its object
         )
 
     def __call__(self, kept: KeptSweep) -> ReplayResult:
-        """The verdict on `kept`, compared with that of its sidecar. Raises FormatError where it is
-        not of the bundle."""
+        """The verdict on `kept`, compared with the verdict in its sidecar. Raises FormatError for a
+        sweep of another bundle or format."""
         if kept.bundle not in ("", self._bundle.id):
             raise OtherBundle(
-                f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is {self._bundle.id}; "
-                "name that one with --set classifier.bundle=DIR"
+                f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is "
+                f"{self._bundle.id}; name the sweep's bundle with --set classifier.bundle=DIR"
             )
         _check(f"sweep {kept.sweep.id}", kept.format, self._bundle)
         _check_length(kept.sweep, kept.format)
@@ -202,7 +200,7 @@ class Judge:
         return ReplayResult(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
 
     def _prepared(self, kept: KeptSweep) -> Classifier:
-        """The classifier as it was set then, with the sweeps that it has fused in this replay."""
+        """The classifier with the original settings, and the fused sweeps of this replay."""
         made = kept.object[:2], kept.rule
         if self._classifier is None or made != self._made:
             self._made = made
@@ -227,13 +225,14 @@ def _print(path: Path, judged: ReplayResult, out: Callable[[str], object]) -> st
 
 
 def _folder(folder: Path, judge: Judge, out: Callable[[str], object]) -> int:
-    """Replay all kept sweeps in `folder` and below; one of another bundle is named, but counts as
-    no difference."""
+    """Replay all kept sweeps in `folder` and below. A sweep of another bundle is listed, but does
+    not count as a difference."""
     outcomes: Counter[str] = Counter()
     paths = sorted(folder.rglob("*.npy"), key=_order)
     if not paths:
         raise FormatError(
-            f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black box"
+            f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black "
+            "box"
         )
     for path in paths:
         try:
@@ -250,7 +249,7 @@ def _order(path: Path) -> tuple[Path, int, str]:
 
 
 def _with_earlier(path: Path) -> list[KeptSweep]:
-    """The sweep at `path`, after the earlier sweeps of its object in the same folder. Raises
+    """The earlier sweeps of the object in the same folder, then the sweep at `path`. Raises
     FormatError."""
     found = [KeptSweep.read(path)]
     if found[0].sweep.object:
@@ -267,7 +266,8 @@ def _with_earlier(path: Path) -> list[KeptSweep]:
 def _check(what: str, format: SweepFormat, bundle: Bundle) -> None:
     if format != bundle.format:
         raise FormatError(
-            f"{what} is of {format}, the bundle wants {bundle.format}; name its bundle with --set classifier.bundle=DIR"
+            f"{what} is of {format}, the bundle wants {bundle.format}; name its bundle with --set "
+            "classifier.bundle=DIR"
         )
 
 
@@ -277,12 +277,13 @@ def _check_length(sweep: Sweep, format: SweepFormat) -> None:
         n == format.window if sweep.share == 1 else 0 < n < format.window
     ):
         raise FormatError(
-            f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {format}; take one that was not changed"
+            f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {format}; use a sweep that "
+            "was not changed"
         )
 
 
 def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
-    """Run the box on a capture, which stands for sensor, trigger, clock and commands."""
+    """Run the box on a capture, which replaces sensor, trigger, clock and commands."""
     play = Playback(path)
     _check(str(path), play.format, bundle)
     classifier = assembly.classifier(settings, bundle, play)

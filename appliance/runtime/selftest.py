@@ -1,8 +1,5 @@
-"""The self-test behind `palpate check`: bundle, golden sweeps, lines, skin, port, each by itself.
-
-In: the settings and the devices. Out: one result for each component, with its trouble where it has
-one.
-"""
+"""The self-test of `palpate check`: bundle, golden sweeps, skin, GPIO lines and port, each by
+itself."""
 
 from __future__ import annotations
 
@@ -25,15 +22,15 @@ from appliance.io.usb_sensor import fits
 from appliance.runtime.assembly import UNSIGNED, gpio
 
 LISTEN_S = 1.0
-"""How long frames of the skin are counted."""
+"""Time for which frames of the skin are counted."""
 MOST_READING = 0.5
-"""Share of a core that reading a skin may take: the loop has one, and answers, recordings and
+"""Share of a core that reading a skin may take. The loop has one core; answers, recordings and
 readers of the feed need the rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """The result for one component: ok with a detail, or not ok with what to do."""
+    """The result for one component. detail: findings, or the problem and what to do."""
 
     component: str
     ok: bool
@@ -46,8 +43,8 @@ def check(
     devices: Devices,
     spent_ns: Callable[[], int] = time.thread_time_ns,
 ) -> Iterator[CheckResult]:
-    """Check one component after another; the check goes on after one that fails. The skin needs no
-    bundle.
+    """Check all components, one after another, also after a failure. The skin is checked without a
+    bundle, too.
 
     spent_ns: processor time that this thread has taken so far.
     """
@@ -91,7 +88,7 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
 def _skin(
     settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]
 ) -> str:
-    """What the skin is, sends and costs. wanted: by the bundle.
+    """The skin's name, format and processor time, in words. wanted: format of the bundle.
 
     Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
     """
@@ -99,8 +96,8 @@ def _skin(
     sends = _listened(settings, format, devices, spent_ns)
     if wanted and not fits(format, wanted):
         raise SensorMismatch(
-            f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train one (palpate record needs none), "
-            "or deploy a bundle for this skin"
+            f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train a bundle "
+            "(palpate record needs no bundle), or deploy a bundle for this skin"
         )
     slow = skin_profile.warning(format)
     return f"{sends}; warning: {slow}" if slow else sends
@@ -109,8 +106,8 @@ def _skin(
 def _listened(
     settings: Config, format: SweepFormat, devices: Devices, spent_ns: Callable[[], int]
 ) -> str:
-    """What comes from the skin, and what reading it takes of a core once it streams: imports and
-    asking it take longer."""
+    """The frames of the skin and the share of a core for reading them, in words. Counting begins
+    with the first frame, since the start takes more processor time."""
     sensor = skins.sensor(settings, format, devices)
     now_ns = devices.clock.now_ns
     until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
@@ -127,17 +124,20 @@ def _listened(
         who = sensor.identity
         counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
-        form = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
+        sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
         lost = (
             f"{counters.lost_frames} lost"
             if sensor.loss_known
             else "whether frames were lost cannot be seen"
         )
-        sends = f"{name.strip()}, {form}, {counters.frames} frames in {LISTEN_S} s, {lost}, {100 * share:.1f} % of a core"
+        sends = (
+            f"{name.strip()}, {sent}, {counters.frames} frames in {LISTEN_S} s, {lost}, "
+            f"{100 * share:.1f} % of a core"
+        )
         if share > MOST_READING:
             raise SensorError(
-                f"{sends}: {MOST_READING:.0%} at most leave room for answers, recordings and readers; use a faster board, or "
-                "a skin that sends fewer frames a second"
+                f"{sends}: {100 * MOST_READING:.0f} % at most leave room for answers, recordings "
+                "and readers; use a faster board, or a skin that sends fewer frames a second"
             )
         return sends
     finally:
@@ -151,7 +151,7 @@ def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
         yield _try("gpio lines", lambda: _lines(settings, devices))
     else:
         hint = "choose a board with --board, or set trigger.mode to serial, key or timed"
-        yield CheckResult("gpio lines", False, f"trigger.start names no line; {hint}")
+        yield CheckResult("gpio lines", False, f"trigger.start has no GPIO line; {hint}")
 
 
 def _lines(settings: Config, devices: Devices) -> str:

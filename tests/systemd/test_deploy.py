@@ -446,7 +446,7 @@ def test_a_bundle_with_an_unknown_key_is_refused(
     assert (done.returncode, done.stdout) == (78, "")
     done = site.desktop("deploy", *at, bundle)
     assert done.returncode == 1
-    assert "FAILED: checking it there: bundle is signed by none of those" in done.stdout
+    assert "FAILED: checking it there: bundle is signed by none of the signers" in done.stdout
     assert (serves(host), host.service["MainPID"]) == (before, pid)
     assert sha(bundle) not in listed(host)
 

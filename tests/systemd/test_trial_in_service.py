@@ -154,7 +154,7 @@ def test_a_bundle_that_does_its_work_is_committed(
     lines = [line for line in service.log_lines() if line.startswith("bundle ")]
     assert lines == [
         f"bundle {new[:8]} is on trial, start 1 of 3",
-        f"bundle {new[:8]} has stood its trial and is committed",
+        f"bundle {new[:8]} has passed its trial and is committed",
     ]
     machine.get("systemctl", "restart", "palpate")
     serves(service, new)

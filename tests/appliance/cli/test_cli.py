@@ -477,11 +477,11 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     ("args", "trouble", "hint"),
     [
-        (["run"], ConfigError, "trigger.start names no line"),
+        (["run"], ConfigError, "trigger.start has no GPIO line"),
         (
             ["run", "--set", "trigger.start=A", "--set", "trigger.mode=two-lines"],
             ConfigError,
-            "trigger.stop names no line",
+            "trigger.stop has no GPIO line",
         ),
         (["run", "--virtual"], ConfigError, "--virtual needs --sim"),
         (["run", "--sim", "world"], ConfigError, "--sim world is unknown"),
@@ -546,7 +546,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
             FormatError,
             "2x2 uint8 at 10 Hz",
         ),
-        (["run", "--trigger", "serial"], ConfigError, "serial.port names none"),
+        (["run", "--trigger", "serial"], ConfigError, "serial.port is not set"),
         (["run", "--trigger", "key"], ConfigError, "standard input is not a terminal"),
         (
             ["run", "--trigger", "key", "--every", "3"],

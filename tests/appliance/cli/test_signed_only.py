@@ -109,7 +109,7 @@ def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.Captur
     assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
     warning, *_, end = capsys.readouterr().err.splitlines()
     assert SAID in warning
-    assert "trigger.start names no line" in end
+    assert "trigger.start has no GPIO line" in end
 
 
 @pytest.fixture

@@ -120,10 +120,12 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
     check_refused(
         box,
         by_nobody,
-        "is not signed, and is not the one that this version of the program has; enrol again",
+        "is not signed, and is not the packaged bundle of this version; enrol again",
     )
     unknown = deliveries.files(9, deliveries.key(tmp_path, "unknown"))
-    check_refused(box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of those")
+    check_refused(
+        box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of the signers"
+    )
     check_refused(box, good | {bundle.MEANS: good[bundle.MEANS] + b"\0"}, "means.npz was altered")
     assert box.store.enrol(good)
 
@@ -134,7 +136,9 @@ def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
     box.committed(1)
     good = grown(box)
     evil = deliveries.signed(deliveries.files(1, None, name="evil"), box.enrolment_key.folder / KEY)
-    check_refused(box, deliveries.enrolled(evil, box.enrolment_key), "signed by none of those")
+    check_refused(
+        box, deliveries.enrolled(evil, box.enrolment_key), "signed by none of the signers"
+    )
     model = bytearray(good[bundle.MODEL])
     model[len(model) // 2] ^= 1
     check_refused(box, good | {bundle.MODEL: bytes(model)}, "model.onnx was altered")
@@ -149,7 +153,9 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     (box.enrolment_key.folder / KEY).rename(box.folder / "kept")
     assert box.store.running().bundle.enrolled
     (box.enrolment_key.folder / SIGNER).unlink()
-    with pytest.raises(ConfigError, match=r"cannot be checked.*make install makes it again"):
+    with pytest.raises(
+        ConfigError, match=r"cannot be checked.*make install, which makes signer again"
+    ):
         box.store.choose()
     (box.folder / "kept").rename(box.enrolment_key.folder / KEY)
     install_scripts.enrolment_key(box.enrolment_key.folder)
@@ -167,7 +173,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
     monkeypatch.setattr(bundle, "DEFAULT", newer)
     with pytest.raises(
         BundleError,
-        match=r"not the one that this version of the program has; enrol again.*rollback",
+        match=r"not the packaged bundle of this version; enrol again.*rollback",
     ):
         box.store.choose()
     assert box.store.rollback() == PACKAGED

@@ -113,12 +113,12 @@ def unsigned(key: EnrolmentKey) -> None:
     [
         (lost, "key: No such file or directory, so nothing can be enrolled"),
         (open_to_all, r"may be read by others \(mode 444\)"),
-        (cut, "key is damaged; take it and signer away, run make install again"),
+        (cut, "key is damaged; remove it and signer, run make install again"),
         (empty, "key is damaged"),
-        (of_another, "is not the key of .*enrolled again"),
+        (of_another, "is not the key of .*enrol all labels again"),
         (
             unsigned,
-            "cannot be checked: .*signer cannot be read.*make install makes it again from key",
+            "cannot be checked: .*signer cannot be read.*make install, which makes signer again from key",
         ),
     ],
 )

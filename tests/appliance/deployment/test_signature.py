@@ -73,7 +73,7 @@ def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
         (
             signature.sign(MESSAGE, signers.theirs),
             MESSAGE,
-            "signed by none of those in .*No principal matched",
+            "signed by none of the signers in .*No principal matched",
         ),
         (other.stdout, MESSAGE, f"signature of {SIGNER} does not fit .*namespace does not match"),
         (good, MESSAGE + b" ", f"signature of {SIGNER} does not fit .*incorrect signature"),
@@ -96,8 +96,8 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "names nobody"),
-        ("# nobody\n\n", "names nobody"),
+        ("", "has no signer"),
+        ("# nobody\n\n", "has no signer"),
         (
             "anna valid-before=20300101 {key}",
             "line 1: valid-before is not used here, a box may not know the time",
@@ -114,7 +114,7 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
         ("anna ssh-ed25519 !", "line 1: it is not understood"),
         ("anna ssh-dss {blob}", "line 1: it is not understood"),
         ("anna ssh-rsa {blob}", "line 1: it is not understood"),
-        ("# anna\u2028ben {key}", "names nobody"),
+        ("# anna\u2028ben {key}", "has no signer"),
         ("anna\u00a0{key}", "line 1: it is not understood"),
         ("{line}anna ssh-ed25519 {blob}\r\n", "line 2: it is not understood"),
         ("anna no-such-option {key}", "line 1: it is not understood"),

@@ -223,7 +223,7 @@ def piped(box: Delivery) -> Path:
 
 BAD: dict[str, tuple[Ways, str]] = {
     "unsigned": (unsigned, "is not signed"),
-    "another's key": (strange, "signed by none of those in"),
+    "another's key": (strange, "signed by none of the signers in"),
     "no bundle": (lambda box: box.folder, "no bundle at"),
     "too new": (lambda box: box.made(1, runtime="99.0.0"), r"needs palpate 99\.0\.0"),
     "never counted": (lambda box: box.made(0), "has counter 0"),

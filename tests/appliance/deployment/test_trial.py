@@ -185,7 +185,7 @@ def test_enough_sweeps_commit(box: Trying, logged: list[str]):
     assert not box.standing.committed
     trial.turn(health(3))
     assert box.standing.committed
-    assert logged[-1] == f"bundle {box.two[:8]} has stood its trial and is committed"
+    assert logged[-1] == f"bundle {box.two[:8]} has passed its trial and is committed"
     assert (box.store.state.counter, box.store.state.highest, trial.text) == (2, box.two, "")
     trial.stopping()
     trial.turn(health(4, streams=False))
