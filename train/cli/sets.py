@@ -137,15 +137,15 @@ def _print(report: pull.PullReport, out: Path) -> None:
         (
             report.relabelled,
             (
-                f"another description on the box; what is in {out} stays: remove its .npy and "
-                ".json to take the box's"
+                f"the box has another description; the files in {out} stay: "
+                "remove .npy and .json there to fetch the box's"
             ),
         ),
         (
             report.different,
             (
-                f"another sweep on the box under the same name; the one in {out} stays: remove "
-                "it, or pull into another folder"
+                f"the box has another sweep of the same name; the sweep in {out} stays: "
+                "remove it, or pull into another folder"
             ),
         ),
         (report.refused, "refused"),

@@ -131,7 +131,7 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
     if "samples" in arrays and arrays["samples"].ndim == 5 and "labels" not in arrays:
         if "rate_hz" not in arrays:
             arrays["rate_hz"] = np.array(TACTMAT_HZ)
-            source = f"{path.name} (names no rate, taken for {TACTMAT_HZ:g} Hz)"
+            source = f"{path.name} (states no rate; {TACTMAT_HZ:g} Hz assumed)"
         arrays = _tactmat(arrays, source)
     return build(arrays, source, kind)
 
@@ -178,8 +178,8 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     x, materials = arrays["samples"], arrays.get("materials", np.empty(0, str))
     if len(materials) != len(x):
         raise FormatError(
-            f"{source}: samples {list(x.shape)} are of {len(x)} materials, "
-            f"{len(materials)} are named"
+            f"{source}: samples {list(x.shape)} hold {len(x)} materials, "
+            f"but there are {len(materials)} names"
         )
     if x.dtype.kind in "iuf":
         with np.errstate(invalid="ignore"):
@@ -238,9 +238,9 @@ def _advice(folder: Path) -> str:
         if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
     )
     if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
-        return f"{sets} .npz or HDF5 files are: name one of them, or {IMPORT.format(folder)}"
+        return f"it holds {sets} .npz or HDF5 files: name one of them, or {IMPORT.format(folder)}"
     if others:
-        return f"{others.total()} {' and '.join(others)} files are: {IMPORT.format(folder)}"
+        return f"it holds {others.total()} {' and '.join(others)} files: {IMPORT.format(folder)}"
     return "record some, or name another folder"
 
 
@@ -353,7 +353,8 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
     path, n = one.path, len(one.sweep.frames)
     if one.format != wanted or n != wanted.window:
         raise FormatError(
-            f"{path}: {n} frames of {one.format}; others have {wanted}: give each its folder"
+            f"{path}: {n} frames of {one.format}; others have {wanted}: "
+            "keep each format in a folder of its own"
         )
     if not one.sweep.material:
         raise FormatError(

@@ -80,7 +80,7 @@ class Dataset(sweep_set.SweepSet):
         for text in conditions:
             keep &= self._matches(text)
         if not keep.any():
-            raise self._error(f"no sweep fulfils {' and '.join(conditions)}; ask for less at once")
+            raise self._error(f"no sweep fulfils {' and '.join(conditions)}; use fewer conditions")
         part = self.take(keep).require_materials()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))

@@ -191,7 +191,7 @@ def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Ar
         )
     if len(np.unique(labels[train])) < 2:
         raise FormatError(
-            f"{what}: {train.sum()} sweeps of less than two materials are left to train on"
+            f"{what}: {train.sum()} sweeps of fewer than two materials are left to train on"
         )
     return np.flatnonzero(train), np.flatnonzero(test)
 
@@ -230,7 +230,7 @@ def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
     if fewest < 2:
         raise FormatError(
             f"{sweeps.source}: a material has one recording; "
-            "two of each are needed to choose a model by"
+            "choosing a model needs two of each, so record more"
         )
     drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
     return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]

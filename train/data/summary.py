@@ -184,7 +184,7 @@ def _confounded(values: Sequence[str], holds: Array, materials: Sequence[str]) -
         yield f"one material only at {shortened([values[v] for v in single])}"
     for k in np.flatnonzero(holds.sum(axis=0) == 1).tolist():
         place = values[int(holds[:, k].argmax())]
-        yield f"{materials[k]!r} only at {place}; leaving that out leaves none to train on"
+        yield f"{materials[k]!r} only at {place}; without it the material cannot be trained on"
 
 
 def known() -> str:

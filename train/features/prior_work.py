@@ -69,7 +69,8 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
     x = time_series.of(taxels)
     if x.shape[1] < 4 * TIME_BINS:
         raise FormatError(
-            f"{x.shape[1]} frames are too few for a spectrogram; use at least {4 * TIME_BINS}, or L"
+            f"{x.shape[1]} frames are too few for a spectrogram; "
+            f"use at least {4 * TIME_BINS}, or L-features"
         )
     weights = time_series.weights(x, axes(taxels))
     parts = []
@@ -108,7 +109,8 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     time_series.check_rate(rate_hz)
     if x.shape[1] < 3:
         raise FormatError(
-            f"{x.shape[1]} frames are too few for a change of the change; use at least 3, or L"
+            f"{x.shape[1]} frames are too few for a change of the change; "
+            "use at least 3, or L-features"
         )
     centred = x - x.mean(axis=1, keepdims=True)
     varying = centred[centred.var(axis=1) > time_series.FLOOR]

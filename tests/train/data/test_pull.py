@@ -209,7 +209,7 @@ def test_another_sweep_of_the_same_name_is_never_written_over(
     with pytest.raises(FormatError, match="1 recordings of user@box were not taken"):
         ground.pull()
     assert (
-        "run 0/sweep-000000: another sweep on the box under the same name; the one in"
+        "run 0/sweep-000000: the box has another sweep of the same name; the sweep in"
         in capsys.readouterr().out
     )
     assert files(ground.here) == before
@@ -227,7 +227,8 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
     ground.pull()
     out = capsys.readouterr().out
     assert out.startswith(
-        "fetched 0, there already 2, refused 0\nrun 0/sweep-000000, run 0/sweep-000001: described"
+        "fetched 0, there already 2, refused 0\n"
+        "run 0/sweep-000000, run 0/sweep-000001: the box has another description"
     )
     assert files(ground.here) == before
 

@@ -210,7 +210,7 @@ def test_tactmat_is_read(tmp_path: Path, dtype: str):
     s = sets.load(str(tmp_path / "t.h5"))
     assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
     assert s.materials == ("cork", "felt", "tile")
-    assert s.source == "t.h5 (names no rate, taken for 750 Hz)"
+    assert s.source == "t.h5 (states no rate; 750 Hz assumed)"
     np.testing.assert_array_equal(s.labels, np.repeat([0, 1, 2], 4))
     np.testing.assert_array_equal(s.groups["repetition"], [0, 1, 2, 3] * 3)
     np.testing.assert_array_equal(s.samples[7], samples[1, 3])
@@ -226,7 +226,7 @@ def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
 def test_a_broken_tactmat_is_refused(tmp_path: Path):
     """Missing names or a wrong number of names, counts beyond a byte, unexpected labels."""
     for more, message in (
-        ({"materials": ["cork", "felt"]}, "are of 3 materials, 2 are named"),
+        ({"materials": ["cork", "felt"]}, "hold 3 materials, but there are 2 names"),
         ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
         (
             {"labels": np.arange(12) % 3, "rate_hz": 1.0},
@@ -450,7 +450,7 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
         sets.load(str(path))
     with pytest.raises(
         FormatError,
-        match=f"1 {suffix.lower()} files are: palpate-train import .* makes a set of such files",
+        match=f"it holds 1 {suffix.lower()} files: palpate-train import .* makes a set of such files",
     ):
         sets.load(str(tmp_path))
 
@@ -458,7 +458,7 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
 def test_a_folder_of_sets_names_them(tmp_path: Path):
     """The message names the sets: the user probably meant one of them."""
     write(tmp_path / "a.npz")
-    with pytest.raises(FormatError, match=r"1 \.npz or HDF5 files are: name one of them"):
+    with pytest.raises(FormatError, match=r"it holds 1 \.npz or HDF5 files: name one of them"):
         sets.load(str(tmp_path))
 
 

@@ -146,7 +146,7 @@ def test_a_recording_of_several_materials_is_refused():
 def test_nothing_left_to_train_on_is_refused():
     """If a group is the material, leaving out one of two leaves only one."""
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
-    with pytest.raises(FormatError, match="2 sweeps of less than two materials are left"):
+    with pytest.raises(FormatError, match="2 sweeps of fewer than two materials are left"):
         Protocol("leave:session").folds(sweeps, 1)
 
 

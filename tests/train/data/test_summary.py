@@ -56,9 +56,9 @@ def test_what_is_confounded_is_told():
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
     text = [
         "    confounded: one material only at 1",
-        "    confounded: 'low' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'middle' only at 0; leaving that out leaves none to train on",
-        "    confounded: 'high' only at 1; leaving that out leaves none to train on",
+        "    confounded: 'low' only at 0; without it the material cannot be trained on",
+        "    confounded: 'middle' only at 0; without it the material cannot be trained on",
+        "    confounded: 'high' only at 1; without it the material cannot be trained on",
     ]
     assert lines(s)[1:] == [
         "  recordings: 2, of 4 to 8 each",
@@ -80,8 +80,8 @@ def test_positions_and_sessions_are_counted_in_tables():
     assert lines(s)[3:] == [
         "  position: 2: 0, 10",
         "    confounded: one material only at 0",
-        "    confounded: 'middle' only at 10; leaving that out leaves none to train on",
-        "    confounded: 'high' only at 10; leaving that out leaves none to train on",
+        "    confounded: 'middle' only at 10; without it the material cannot be trained on",
+        "    confounded: 'high' only at 10; without it the material cannot be trained on",
         "            0  10  all",
         "    low     3   1    4",
         "    middle  ·   4    4",
