@@ -87,7 +87,7 @@ def _add_fit(add: Add) -> None:
         "--row-shift",
         type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
         metavar="SHARE",
-        dest="moved",
+        dest="displaced",
         help="share of training sweeps with a displacement of up to a row (default 0.5)",
     )
     command.add_argument(
@@ -206,7 +206,9 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     Raises FormatError if options contradict each other.
     """
     changes = {
-        name: share for name in ("moved", "stretch") if (share := getattr(args, name)) is not None
+        name: share
+        for name in ("displaced", "stretch")
+        if (share := getattr(args, name)) is not None
     }
     architecture = replace(ARCHITECTURES.get(args.size, recipe.FIXED), mains_hz=float(args.mains))
     augmentation = replace(

@@ -168,7 +168,7 @@ def check(found: Parity) -> None:
             f"{lost.float_right}: "
             f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
         )
-    expected, moved, moved_mean = (
+    expected, largest, mean = (
         apart.expected_loss,
         apart.probability_difference,
         apart.probability_mean,
@@ -179,11 +179,11 @@ def check(found: Parity) -> None:
             "probabilities "
             f"(limit {100 * MOST_LOST}); {hint}"
         )
-    if not (moved <= MOST_PROBABILITY_DIFFERENCE and moved_mean <= MOST_MEAN_DIFFERENCE):
+    if not (largest <= MOST_PROBABILITY_DIFFERENCE and mean <= MOST_MEAN_DIFFERENCE):
         raise ExportRefused(
-            f"int8 moves a probability of held-out sweeps by up to {moved:.3f} (limit "
+            f"int8 moves a probability of held-out sweeps by up to {largest:.3f} (limit "
             f"{MOST_PROBABILITY_DIFFERENCE}), "
-            f"by {moved_mean:.3f} on average (limit {MOST_MEAN_DIFFERENCE}); {hint}"
+            f"by {mean:.3f} on average (limit {MOST_MEAN_DIFFERENCE}); {hint}"
         )
     if round(lost.total * (1 - apart.agreement)) > max(1, (1 - LEAST_AGREEMENT) * lost.total):
         raise ExportRefused(

@@ -53,7 +53,7 @@ class Augmentation:
     """Largest displacement of the skin along the rows, in rows, in both directions; uniform, and
     interpolated between rows. A row that enters over the edge carries between nothing and all of
     the load at the edge. A single line of taxels is not displaced."""
-    moved: float = 0.5
+    displaced: float = 0.5
     """Share of the sweeps that are displaced."""
     gain: float = 0.2
     """Spread of the logarithm of the gain of all taxels together: force, skin, amplifier."""
@@ -82,7 +82,7 @@ class Augmentation:
     """Share of the taxels that are clipped from above, anywhere within two of their own deviations
     of their mean."""
 
-    def displaced(self) -> Augmentation:
+    def without_faults(self) -> Augmentation:
         """The effects of another position of the skin alone, without those of its electronics.
 
         Noise and silent taxels make copies so much harder to name than any displaced skin is that
@@ -110,7 +110,7 @@ def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> 
     `Network.prepare`); it is not changed.
     """
     x = _attached(x, rows, augmentation, rng)  # new memory, which may be written to
-    for change in (_stretched, _filtered, _disturbed, _clipped):
+    for change in (_stretched, _filtered, _with_faults, _clipped):
         x = change(x, augmentation, rng)
     return x
 
@@ -119,7 +119,11 @@ def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -
     """Attach the skin anew: another position, other gains, failed taxels."""
     n, taxels, _ = x.shape
     gain = np.ones((n, taxels, 1), np.float32)
-    x = _moved(x, rows, augmentation, rng) if augmentation.shift and 1 < rows < taxels else x.copy()
+    x = (
+        _shifted(x, rows, augmentation, rng)
+        if augmentation.shift and 1 < rows < taxels
+        else x.copy()
+    )
     if augmentation.gain:
         gain *= np.exp(augmentation.gain * _normal(rng, n, 1, 1))
     if augmentation.gains:
@@ -130,18 +134,18 @@ def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -
     return x
 
 
-def _moved(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
+def _shifted(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
     """Displace a share of the sweeps along the rows."""
     n, row = len(x), np.arange(rows, dtype=np.float32)
     source = row + augmentation.shift * _symmetric(rng, n, 1) * _chosen(
-        augmentation.moved, rng, n, 1
+        augmentation.displaced, rng, n, 1
     )
     # the load on the row that enters is unknown: that of its neighbour, nothing, or something in
     # between
     level = np.where((source < 0) | (source > rows - 1), _uniform(rng, n, rows), np.float32(1))
     near = np.maximum(1 - np.abs(source.clip(0, rows - 1)[..., None] - row), 0)
-    moved: Array = np.matmul(near * level[..., None], x.reshape(n, rows, -1)).reshape(x.shape)
-    return moved
+    shifted: Array = np.matmul(near * level[..., None], x.reshape(n, rows, -1)).reshape(x.shape)
+    return shifted
 
 
 def _stretched(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
@@ -181,7 +185,7 @@ def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
     return filtered
 
 
-def _disturbed(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
+def _with_faults(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
     """Add the faults of the sensor: noise, an offset that drifts, hum."""
     n, taxels, frames = x.shape
     if augmentation.noise or augmentation.noisy:

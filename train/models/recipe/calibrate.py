@@ -133,7 +133,7 @@ class Calibration:
         def part(kind: type[Part], name: str) -> Part:
             return kind(**{k.name: arrays[f"{name}.{k.name}"] for k in fields(kind)})
 
-        early, moved = figures["rule"]["early"], figures["displacement"]
+        early, displaced = figures["rule"]["early"], figures["displacement"]
         early = early and Early(tuple(early["least"]), early["agree"])
         return cls(
             part(Embedding, "embedding"),
@@ -141,8 +141,8 @@ class Calibration:
             arrays["bias"],
             steps=part(Heads, "steps"),
             rule=EarlyRule(**figures["rule"] | {"early": early}),
-            displacement=moved
-            and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**moved)),
+            displacement=displaced
+            and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**displaced)),
             held=part(HeldOut, "held"),
             **{name: figures[name] for name in NUMBERS},
         )

@@ -41,7 +41,7 @@ WHAT = "a fit (made by palpate-train fit)"
 HELD_COPIES_SEED, FAULTS_SEED = 1, 2
 """Added to a fit's seed for the copies of its held-out sweeps, and for the copies with faults."""
 FAULTS = Augmentation(
-    moved=0.0,
+    displaced=0.0,
     gain=0.1,
     gains=0.05,
     silent=0.06,
@@ -98,7 +98,7 @@ class Fit:
     @property
     def augmentation(self) -> Augmentation:
         """The augmentation of its training."""
-        return Augmentation(**self.about["recipe"]["scene"])
+        return Augmentation(**self.about["recipe"]["augmentation"])
 
     def network(self) -> Compact:
         """The network in PyTorch, ready to run; of a fit without a filter bank."""
@@ -262,7 +262,7 @@ def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
     trunk, seed, features = fit.trunk(), fit.about["seed"], []
     for sweeps, change, drawn in (
         (fit.train, fit.augmentation, seed),
-        (fit.held, fit.augmentation.displaced(), seed + HELD_COPIES_SEED),
+        (fit.held, fit.augmentation.without_faults(), seed + HELD_COPIES_SEED),
     ):
         features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
     labels = [np.tile(sweeps.labels, COPIES) for sweeps in (fit.train, fit.held)]

@@ -298,7 +298,7 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
     about = {
         "seed": setup.seed,
         "recipe": {
-            "scene": vars(setup.augmentation),
+            "augmentation": vars(setup.augmentation),
             "steps": settings.steps,
             "keep_means": False,
             "reattached": settings.reattached,

@@ -265,8 +265,7 @@ class FitRecipe(training.TrainingRecipe):
 
     def json(self) -> dict[str, Any]:
         """The entry `recipe` of a fit and of the manifest of its bundle."""
-        fields = asdict(self)
-        return fields | {"scene": fields.pop("augmentation")}
+        return asdict(self)
 
 
 def fit_network(

@@ -54,7 +54,7 @@ def test_nothing_varies_at_zero_and_nothing_is_drawn():
     "settings",
     [
         Augmentation(),
-        replace(OFF, shift=1.0, moved=0.5),
+        replace(OFF, shift=1.0, displaced=0.5),
         *(replace(OFF, **{k: 0.5}) for k in NAMES),
     ],
 )
@@ -86,7 +86,7 @@ def test_a_shift_reads_between_rows_and_fills_the_edge():
     """Each row becomes a mixture of two neighbours, with the same shares in all rows; the row that
     comes in is part of the row at the edge."""
     x = sweeps(200, frames=50)
-    now = varied(x, shift=1.0, moved=0.5).reshape(200, 4, 200)
+    now = varied(x, shift=1.0, displaced=0.5).reshape(200, 4, 200)
     mixtures = now @ np.linalg.pinv(x.reshape(200, 4, 200))
     by = (mixtures[:, 1] * np.arange(4)).sum(axis=1) - 1  # how far the second row was moved
     assert 0.4 < (np.abs(by) < 1e-4).mean() < 0.6
@@ -107,7 +107,7 @@ def test_a_line_of_taxels_is_not_moved(rows: int):
     """With one row, or one taxel in each row, the distance of the taxels along the slide is
     unknown."""
     x = sweeps()
-    np.testing.assert_array_equal(varied(x, rows, shift=1.0, moved=1.0), x)
+    np.testing.assert_array_equal(varied(x, rows, shift=1.0, displaced=1.0), x)
 
 
 def test_gains_are_of_all_taxels_or_of_each():
@@ -240,7 +240,7 @@ def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames
 def test_copies_that_judge_are_moved_and_nothing_else():
     """Position, contact and gains of the skin change; noise and failures of the sensor are off."""
     usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
-    judging = usual.displaced()
+    judging = usual.without_faults()
     assert (
         judging.noise,
         judging.noisy,
