@@ -1,9 +1,9 @@
 """Delivers a bundle to boxes, and prints a line for each box.
 
-A box does not trust the copied files: `palpate bundles install` checks signature, manifest, model and
-golden sweeps with the box's runtime, and the bundle runs on trial from the next start on. If the
-delivery is interrupted at any moment, the box has the old bundle or the new bundle; run the command
-again to finish.
+A box does not trust the copied files: `palpate bundles install` checks signature, manifest, model
+and golden sweeps with the box's runtime, and the bundle runs on trial from the next start on. If
+the delivery is interrupted at any moment, the box has the old bundle or the new bundle; run the
+command again to finish.
 """
 
 from __future__ import annotations
@@ -94,7 +94,10 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
     file, incoming = f".palpate-{packed.sha[:16]}.tar", f"{store}/incoming"
     box.put(io.BytesIO(packed.archive), file)
     # also removes files of an interrupted delivery
-    fresh = f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && mkdir {incoming}/{packed.sha}"
+    fresh = (
+        f"umask 077; mkdir -p {incoming} && find {incoming} -mindepth 1 -delete && "
+        f"mkdir {incoming}/{packed.sha}"
+    )
     box.run("copying", f"{fresh} && tar -x -C {incoming}/{packed.sha}", user="palpate", stdin=file)
     box.run("tidying up", f"rm {file}")
     how = (" --shadow" if shadow else "") + (" --other-skin" if other_skin else "")

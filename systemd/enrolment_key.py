@@ -23,8 +23,10 @@ if [ ! -s key ] && [ ! -s signer ]; then
   rm key.new.pub
 fi
 if [ -s key ] && [ ! -s signer ]; then
-  public=$(ssh-keygen -y -f key < /dev/null) || {{ echo '{folder}/key is damaged; remove it' >&2; exit 1; }}
-  printf 'box namespaces="palpate-enrolment" %s\\n' "$(printf %s "$public" | cut -d ' ' -f 1,2)" > signer.new
+  public=$(ssh-keygen -y -f key < /dev/null) \\
+    || {{ echo '{folder}/key is damaged; remove it' >&2; exit 1; }}
+  printf 'box namespaces="palpate-enrolment" %s\\n' \\
+    "$(printf %s "$public" | cut -d ' ' -f 1,2)" > signer.new
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi
 )"""

@@ -138,7 +138,10 @@ class FleetBox:
 
     def service(self) -> dict[str, str]:
         """Properties of the service, from systemd. `Now`: seconds since the box was switched on."""
-        ask = f"systemctl show palpate -p {','.join(PROPERTIES)}; sed 's/^/Now=/; s/ .*//' /proc/uptime"
+        ask = (
+            f"systemctl show palpate -p {','.join(PROPERTIES)}; sed 's/^/Now=/; "
+            "s/ .*//' /proc/uptime"
+        )
         output = self.run("asking for the service", ask, user="root")
         return dict(line.partition("=")[::2] for line in output.splitlines())
 

@@ -57,7 +57,10 @@ LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS
     "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
 }
 """Symlinks on a box, and their targets."""
-PIP = "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index --root-user-action=ignore"
+PIP = (
+    "-m pip --disable-pip-version-check -q install --no-cache-dir --no-index "
+    "--root-user-action=ignore"
+)
 SELF_TEST = """
 import sys; from pathlib import Path; from appliance.bundle import bundle
 from appliance.cli.common import load_bundle; from appliance.core import clock, config, errors
@@ -196,7 +199,10 @@ def packages(box: FleetBox) -> None:
     if not missing:
         return
     box.report(f"installing {missing}")
-    get = f"DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=120 install --no-install-recommends {missing}"
+    get = (
+        "DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=120 install "
+        f"--no-install-recommends {missing}"
+    )
     try:
         box.run(
             "apt-get",
@@ -223,7 +229,8 @@ def build(release: str) -> str:
 exec 9> /run/palpate-install.lock; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
 rm -rf {release}; mkdir {release}; tar -x --no-same-owner -C {release}
 python3 -m venv {release}
-{release}/bin/python {PIP} --find-links {release}/wheels --require-hashes -r {release}/wheels/requirements.lock
+{release}/bin/python {PIP} --find-links {release}/wheels --require-hashes \\
+  -r {release}/wheels/requirements.lock
 {release}/bin/python {PIP} --no-deps {release}/wheels/palpate-*.whl
 rm -r {release}/wheels
 sync -f {release}
@@ -254,7 +261,10 @@ def prepare(release: str, board: str, signers: str) -> str:
     if board:
         file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
         # all other settings stay
-        new = f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; }} > {file}.new"
+        new = (
+            f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; "
+            f"}} > {file}.new"
+        )
         lines += [
             f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f "
             f"{file}.new &&"

@@ -1,9 +1,9 @@
 """The manual's references, made from the code, and the manual as one text for the box.
 
-A page below docs/ holds a pair of markers, `<!-- palpate: settings -->` and `<!-- /palpate -->`, where
-a reference belongs; the text between them is for readers of the source. The site and the text for
-the box replace it by tables of the settings or commands of this checkout. So no reference can be
-stale.
+A page below docs/ holds a pair of markers, `<!-- palpate: settings -->` and `<!-- /palpate -->`,
+where a reference belongs; the text between them is for readers of the source. The site and the text
+for the box replace it by tables of the settings or commands of this checkout. So no reference can
+be stale.
 """
 
 from __future__ import annotations

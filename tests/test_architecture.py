@@ -168,15 +168,20 @@ def test_no_test_imports_another():
 def test_a_fresh_process_loads_nothing_of_the_desktop():
     """After a whole virtual run, PyTorch, scikit-learn, scipy and train are not in the process."""
     code = (
-        "import sys; from appliance.__main__ import main; main(['run', '--sim', 'skin', '--virtual', '--sweeps', '1']);"
-        "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'sklearn', 'scipy', 'train', 'onnx', 'pandas'}))"
+        "import sys; from appliance.__main__ import main; "
+        "main(['run', '--sim', 'skin', '--virtual', '--sweeps', '1']);"
+        "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'sklearn', 'scipy', "
+        "'train', 'onnx', 'pandas'}))"
     )
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
 
 
 def test_the_simulator_is_not_loaded_unless_named():
     """`palpate config` and everything it imports leave appliance.sim alone."""
-    code = "import sys; from appliance.__main__ import main; main(['config']); print([m for m in sys.modules if '.sim' in m])"
+    code = (
+        "import sys; from appliance.__main__ import main; main(['config']); "
+        "print([m for m in sys.modules if '.sim' in m])"
+    )
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
 
 
@@ -184,8 +189,10 @@ def test_onnxruntime_starts_no_thread_of_its_own():
     """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one
     thread."""
     code = (
-        "import os; from appliance.bundle import bundle; from appliance.core import clock; from appliance.inference import classifier; import onnxruntime;"
-        "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); box.self_test();"
+        "import os; from appliance.bundle import bundle; from appliance.core import clock; "
+        "from appliance.inference import classifier; import onnxruntime;"
+        "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); "
+        "box.self_test();"
         "print(len(os.listdir('/proc/self/task')))"
     )
     env = {k: v for k, v in os.environ.items() if not k.startswith("ORT_")} | {

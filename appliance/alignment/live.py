@@ -145,7 +145,10 @@ class ContactTracker:
         least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
         if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
-            hint = f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies on the skin"
+            hint = (
+                f"a taxel has not read less than {least:.0f} raw counts{above} yet: something "
+                "lies on the skin"
+            )
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
             return self._view(
@@ -154,9 +157,15 @@ class ContactTracker:
         if trained is None:
             hint = "this bundle does not say where the skin sat in training; export it again"
             if self._expected.bundle == NO_BUNDLE:
-                hint = "no bundle fits this skin, so there is no trained position; palpate record needs none"
+                hint = (
+                    "no bundle fits this skin, so there is no trained position; "
+                    "palpate record needs none"
+                )
             elif self._expected.threshold is None:
-                hint = "this bundle cannot tell contact, so it has no trained position; train one on sweeps of palpate record"
+                hint = (
+                    "this bundle cannot tell contact, so it has no trained position; "
+                    "train one on sweeps of palpate record"
+                )
             return self._view(
                 "no-positions", "the contact's centre alone", hint, **shown, centre=found
             )

@@ -282,5 +282,6 @@ def _check_labels(labels: tuple[str, ...]) -> None:
     for label in labels:
         if not isinstance(label, str) or not LABEL.fullmatch(label):
             raise BundleError(
-                f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+                f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' "
+                "or '-'"
             )

@@ -14,7 +14,8 @@ MAX_LINE = 128
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 """Characters that no field may contain."""
 _PATTERN = re.compile(
-    rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<kind>[A-Za-z]{0,16})(?:[, ](?P<text>[ -#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
+    rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<kind>[A-Za-z]{0,16})(?:[, ](?P<text>[ "
+    rb"-#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
 )
 
 

@@ -179,8 +179,10 @@ class Classifier:
         wrong = np.flatnonzero(computed.argmax(1) != expected.argmax(1))
         if len(wrong) or not worst <= GOLDEN_TOLERANCE:
             raise BundleError(
-                f"golden sweeps {wrong.tolist()} get another label and probabilities differ by {worst:.3g} "
-                f"(limit {GOLDEN_TOLERANCE}): this machine does not run the model as it was exported"
+                f"golden sweeps {wrong.tolist()} get another label and probabilities differ "
+                f"by {worst:.3g} "
+                f"(limit {GOLDEN_TOLERANCE}): this machine does not run the model as it was "
+                "exported"
             )
         if self._means:
             self._test_means(self._means)

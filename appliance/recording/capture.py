@@ -116,7 +116,8 @@ def _set_aside(path: Path) -> None:
     free = next((name for name in kept if not name.exists()), None)
     if not free:
         raise ConfigError(
-            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them away"
+            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; "
+            "move them away"
         )
     path.rename(free)
     log.info(f"capture: {path} was there, of an earlier start; it is {free.name} now")
@@ -139,7 +140,8 @@ class Playback:
             ) from e
         if not data.startswith(MAGIC):
             raise FormatError(
-                f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` writes one"
+                f"{path}: not a capture (it begins with {data[:8]!r}); "
+                "`palpate run --capture` writes one"
             )
         begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
         try:
@@ -248,7 +250,8 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
         whole = len(body) == size
         if kind >= len(RecordKind) or (whole and not _written(kind, t_ns, body)):
             raise FormatError(
-                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture again"
+                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; "
+                "capture again"
             )
         if whole:
             yield RecordKind(kind), t_ns, body

@@ -37,7 +37,10 @@ class RecordingProgress:
         wood at 2: 7"."""
         if not material:
             return "no material, so it cannot be trained on; name it with MATERIAL or --material"
-        return f"{_name(material, position)}: {self._count[material, position]} of {self.target}; {self.missing()}"
+        return (
+            f"{_name(material, position)}: {self._count[material, position]} "
+            f"of {self.target}; {self.missing()}"
+        )
 
     def missing(self) -> str:
         """What is still missing, as far as materials and positions are known."""
@@ -55,7 +58,10 @@ class RecordingProgress:
             return f"missing: {', '.join(lacking[:MOST_SHOWN])}" + f" and {more} more" * (more > 0)
         if len(materials) < 2:
             return "missing: another material, since a model tells at least two apart"
-        return f"nothing is missing of {len(materials)} materials at {len(positions)} position{'s'[: len(positions) > 1]}"
+        return (
+            f"nothing is missing of {len(materials)} materials at {len(positions)} "
+            f"position{'s'[: len(positions) > 1]}"
+        )
 
 
 def _name(material: str, position: str) -> str:

@@ -146,7 +146,8 @@ class Labels:
             text = getattr(self, name)
             if text and not LABEL.fullmatch(text):
                 raise ConfigError(
-                    f"{name} {text!r} cannot be used: take 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+                    f"{name} {text!r} cannot be used: take 1 to 24 letters, digits, spaces, '.', "
+                    "'_' or '-'"
                 )
 
 
@@ -247,7 +248,8 @@ class RecordingSession(Observer):
         if not self._answered:
             return
         log.info(
-            f"record: sweeps of this run in {self._folder.folder}: {self.stored}; {self._progress.missing()}"
+            "record: sweeps of this run "
+            f"in {self._folder.folder}: {self.stored}; {self._progress.missing()}"
         )
 
     def _count_earlier(self, format: SweepFormat) -> None:
@@ -267,7 +269,8 @@ class RecordingSession(Observer):
             if form != format.json():
                 self._folder.close()
                 raise ConfigError(
-                    f"{path} holds another form of sweeps than {format}, and a model is trained on one form; "
+                    f"{path} holds another form of sweeps than {format}, and a model is trained "
+                    "on one form; "
                     "name another folder with --out"
                 )
             self._count(labels, status)
@@ -331,7 +334,8 @@ class RecordingSession(Observer):
         number, labels, status = self._stored[-1]
         if which and which != str(number - self._folder.run):
             raise ApplianceError(
-                f"the last stored sweep is {number - self._folder.run}, not {which}; look at it first"
+                f"the last stored sweep is {number - self._folder.run}, not {which}; "
+                "look at it first"
             )
         try:
             self._folder.remove(number, reserve=True)

@@ -29,8 +29,8 @@ SLIDE_S, REST_S = 3.0, 0.1
 """Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
 it."""
 LEAD_S = 0.5
-"""Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and last
-frame are repeated for this time."""
+"""Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and
+last frame are repeated for this time."""
 LIFTED_SET_S = 0.4
 """Time for which the finger is lifted before a sweep of a set. A set does not record the unloaded
 skin, so all counts are 0."""

@@ -109,7 +109,10 @@ def _token(path: Path) -> str:
     try:
         token = path.read_text("ascii").strip()
     except PermissionError as e:
-        join = f"add this user to its group with usermod -aG GROUP USER (ls -ld {path.parent} shows it)"
+        join = (
+            f"add this user to its group with usermod -aG GROUP USER (ls -ld {path.parent} "
+            "shows it)"
+        )
         raise ConfigError(
             f"{path} may not be read by this user; {join}, or set watch.address to {HERE}"
         ) from e

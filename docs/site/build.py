@@ -195,7 +195,8 @@ def linked(page: Path, text: str, out: Path, lost: list[str]) -> str:
 
 
 def contents(names: list[str]) -> str:
-    """The contents of the site, for the margin: each page once, in the first chapter that has it."""
+    """The contents of the site, for the margin: each page once, in the first chapter that has
+    it."""
     taken: set[str] = {"README.md"}
     text = "\n"
     for caption, patterns in CHAPTERS.items():

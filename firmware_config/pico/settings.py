@@ -15,4 +15,5 @@ SETTLE_US = 5  # wait between switching to a taxel and reading it; README.md, "B
 TRIGGER_PIN = None  # GPIO of the robot's trigger line, if it is wired to the Pico as well
 # connect to GND at power-on to get the prompt of MicroPython instead of the firmware
 SERVICE_PIN = 22
-HARD_TIMER = True  # frames are taken even while MicroPython collects garbage; needs MicroPython 1.26 or later
+# frames are taken even while MicroPython collects garbage; needs MicroPython 1.26 or later
+HARD_TIMER = True

@@ -253,7 +253,8 @@ class Shop:
         names = ANSWER.findall(output)
         if code or len(names) != 1 or not set(names) <= ids:
             return [
-                f"{when}: exit code {code}, answers by {names} instead of {sorted(ids)}: {_end(output)}"
+                f"{when}: exit code {code}, answers by {names} instead "
+                f"of {sorted(ids)}: {_end(output)}"
             ]
         return []
 

@@ -260,7 +260,8 @@ def table(content: dict[str, Any]) -> str:
         )
         edge = "{p99:.1f} / {max:.1f} ms".format(**one["edge_ms"])
         rows.append(
-            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} | {edge} "
+            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} "
+            f"| {edge} "
             f"| {100 * one['share']:.2f} % | {one['before_mib']}, {one['most_mib']} MiB |"
         )
     bore = [f"{kind} {seen['attempts']:,}" for kind, seen in peers.items()]

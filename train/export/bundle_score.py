@@ -145,7 +145,8 @@ class BundleScore:
         if self.displaced:
             most = self.displaced.most_common(1)[0][0]
             lines.append(
-                f"outside the trained positions: {self.displaced.total()} sweeps, most often {most}; "
+                f"outside the trained positions: {self.displaced.total()} sweeps, most "
+                f"often {most}; "
                 "record there, too, or align the skin"
             )
         wide = max(map(len, (*self.answered, *self.foreign)))

@@ -31,10 +31,14 @@ def table(figures: Json) -> str:
 def _caption(figures: Json) -> str:
     machine, load = figures["machine"], figures["load_average"]
     return (
-        f"Measured by `make bench` with the simulated skin, on {machine['cores']} cores of {machine['processor'] or 'a machine'} "
-        f"({machine['arch']}, {machine['system']}, Python {machine['python']}, onnxruntime {machine['onnxruntime']}), one "
-        f"thread; {figures['date']}, commit {figures['commit']}, seed {figures['seed']}, bundle {figures['bundle']}. Load "
-        f"average of the machine, which other work shares: {load['before'][0]:.1f} before, {load['after'][0]:.1f} after."
+        f"Measured by `make bench` with the simulated skin, on {machine['cores']} cores "
+        f"of {machine['processor'] or 'a machine'} "
+        f"({machine['arch']}, {machine['system']}, Python {machine['python']}, "
+        f"onnxruntime {machine['onnxruntime']}), one "
+        f"thread; {figures['date']}, commit {figures['commit']}, seed {figures['seed']}, "
+        f"bundle {figures['bundle']}. Load "
+        f"average of the machine, which other work shares: {load['before'][0]:.1f} "
+        f"before, {load['after'][0]:.1f} after."
     )
 
 
@@ -45,7 +49,8 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
     low, high = (100 * value for value in accuracy["interval"])
     growth = round(memory["growth_next_900"], 1) + 0.0  # 0 has no sign
     yield (
-        f"simulated sweeps named rightly (not the skin's accuracy), n = {n}, with 95 % interval; `unknown` counts as wrong",
+        f"simulated sweeps named rightly (not the skin's accuracy), n = {n}, with 95 % interval; "
+        "`unknown` counts as wrong",
         f"{right} of {n}: {100 * right / n:.1f} % [{low:.1f}, {high:.1f}]",
     )
     yield "frames lost in these sweeps", str(figures["frames_lost"])
@@ -54,7 +59,8 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         _times(figures["edge_to_sentence_ms"]),
     )
     yield (
-        "from the STOP edge to its being in hand, with the last frame (glitch filter, rest of a USB packet)",
+        "from the STOP edge to its being in hand, with the last frame (glitch filter, rest of a "
+        "USB packet)",
         _times(figures["edge_seen_ms"]),
     )
     yield "inference of the packaged bundle (int8)", _times(inference["int8"])

@@ -207,7 +207,8 @@ def table(result: dict[str, Any]) -> str:
     """A line for each point, for a person."""
     size, seed, centred = result["about"][:3]
     lines = [
-        f"{size}{', means removed' * centred}, seed {seed}; printed {PRINTED['new']} and {PRINTED['hard']}",
+        f"{size}{', means removed' * centred}, seed {seed}; "
+        f"printed {PRINTED['new']} and {PRINTED['hard']}",
         f"{'iteration':>9}  {'training':<9} {'new positions':<24} T-HARD",
     ]
     for point in result["points"]:

@@ -60,5 +60,6 @@ def draw(results: Json) -> str:
     n, attachments = (results["moved"]["rows"][0][name] for name in ("n", "attachments"))
     return to_svg(
         figure,
-        f"Share of {n} simulated sweeps ({attachments} attachments) that are named rightly, and marked as moved",
+        f"Share of {n} simulated sweeps ({attachments} attachments) that are named rightly, and "
+        "marked as moved",
     )

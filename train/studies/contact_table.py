@@ -118,9 +118,12 @@ def table(result: Json) -> str:
     with bundle, sets and commit."""
     rows = [("T-HARD, a row ahead and all else anew", result["T-HARD"]), *_moved(result)]
     caption = (
-        f"Bundle {result['bundle']}, commit {result['commit']}, {result['machine']}: {result['T-HARD']['n']} sweeps of "
-        f"{result['T-HARD']['set']} at {result['T-HARD']['attachments']} attachments; all other lines {result['other positions']['n']} "
-        f"of {result['other positions']['set']} at {result['other positions']['attachments']}, moved. Per cent [95 %], else sweeps."
+        f"Bundle {result['bundle']}, "
+        f"commit {result['commit']}, {result['machine']}: {result['T-HARD']['n']} sweeps of "
+        f"{result['T-HARD']['set']} at {result['T-HARD']['attachments']} attachments; "
+        f"all other lines {result['other positions']['n']} "
+        f"of {result['other positions']['set']} at {result['other positions']['attachments']}, "
+        "moved. Per cent [95 %], else sweeps."
     )
     lines = [
         f"| {' | '.join(row)} |"
@@ -137,8 +140,10 @@ def sentence(result: Json) -> str:
     )
     right = [percent(point["accuracy"][0], 0) for point in (still, row, far)]
     return (
-        f"On the simulated skin {right[0]} of the sweeps are answered correctly in the trained place, {right[1]} one row of\n"
-        f"taxels away ({percent(row['network'][0], 0)} by label alone, `unsure` and `unknown` aside), {right[2]} one and a half."
+        f"On the simulated skin {right[0]} of the sweeps are answered correctly in the trained "
+        f"place, {right[1]} one row of\n"
+        f"taxels away ({percent(row['network'][0], 0)} by label alone, `unsure` and `unknown` "
+        f"aside), {right[2]} one and a half."
     )
 
 

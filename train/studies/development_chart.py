@@ -63,14 +63,18 @@ PUBLISHED = {
 
 def plain_case(case: Json) -> str:
     """The test of a case in words: "7 fabrics: a force it never felt"."""
-    return f"{case['case'].partition(', ')[0]}: {PROTOCOLS.get(case['protocol'], (case['protocol'],))[0]}"
+    protocol = PROTOCOLS.get(case["protocol"], (case["protocol"],))[0]
+    return f"{case['case'].partition(', ')[0]}: {protocol}"
 
 
 def about_case(case: Json) -> str:
     """The test of a case as a sentence without a full stop."""
     name = case["case"].partition(", ")[0]
     what = "simulated sweeps" if case["simulated"] else PUBLISHED.get(name, "real sweeps")
-    return f"{what}, {case['materials']} classes: {PROTOCOLS.get(case['protocol'], ('', case['protocol']))[1]}"
+    return (
+        f"{what}, {case['materials']} "
+        f"classes: {PROTOCOLS.get(case['protocol'], ('', case['protocol']))[1]}"
+    )
 
 
 def axes(cases: Sequence[Json], shared: Sequence[str]) -> dict[str, ChartAxis]:
@@ -145,7 +149,8 @@ def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
 
 
 def quickest(times: Iterable[Json]) -> dict[str, float]:
-    """Median time of a sweep in ms by method, in the precision and library in which it is quickest."""
+    """Median time of a sweep in ms by method, in the precision and library in which it is
+    quickest."""
     ms: dict[str, float] = {}
     for one in times:
         ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))

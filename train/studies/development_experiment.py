@@ -204,7 +204,8 @@ def _require_same_sweeps(run: Json, earlier: Json) -> None:
     for case in run["cases"]:
         if known.get(case["case"], case["digest"]) != case["digest"]:
             raise FormatError(
-                f"{case['case']!r} was of other sweeps in a run that is joined; run its methods again"
+                f"{case['case']!r} was of other sweeps in a run that is joined; "
+                "run its methods again"
             )
 
 

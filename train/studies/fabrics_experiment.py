@@ -18,7 +18,8 @@ PROTOCOLS = (
     (SEVEN, ("leave:force", "leave:speed", "leave:rep")),
     (FOUR, ("leave:force", "leave:speed", "leave:direction")),
 )
-"""Two selections of the set with all combinations of their conditions, and the protocols of each."""
+"""Two selections of the set with all combinations of their conditions, and the protocols of
+each."""
 SEED = 1
 
 

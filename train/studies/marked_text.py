@@ -16,6 +16,7 @@ def insert(document: str, name: str, text: str, path: str) -> str:
     _, closed, after = rest.partition(end)
     if not found or not closed or begin in after:
         raise FormatError(
-            f"{path} has not one pair of markers {begin} and {end}; put them where the table belongs"
+            f"{path} has not one pair of markers {begin} and {end}; "
+            "put them where the table belongs"
         )
     return f"{before}{begin}\n{text}\n{end}{after}"

@@ -12,11 +12,13 @@ number of weights."""
 NAMES = {
     SHIPPED: (
         f"{OURS}, as shipped",
-        "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; int8",
+        "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; "
+        "int8",
     ),
     "default-reattached": (
         f"{OURS}, for a skin put back",
-        "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, filters only where they are better; int8",
+        "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, "
+        "filters only where they are better; int8",
     ),
     "filter-bank": (
         f"{OURS}, filters alone",
@@ -28,7 +30,8 @@ NAMES = {
     ),
     "minirocket": (
         "MiniRocket",
-        "10,000 features of fixed small filters and ridge regression: the usual quick choice for time series",
+        "10,000 features of fixed small filters and ridge regression: the usual quick choice for "
+        "time series",
     ),
     "minirocket-augmented": (
         "MiniRocket, augmented",

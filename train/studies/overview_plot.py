@@ -64,7 +64,10 @@ def draw(material: str, seed: int = SEED) -> str:
     _finger(page, samples)
     _signal(add_axes(figure, 0.355, 0.665, 0.80, 0.17), samples)
     _answer(page, verdict, loaded.manifest.labels)
-    about = f"A finger slides along a tube of {material}; the signal of 16 taxels; the box answers {verdict.label}"
+    about = (
+        f"A finger slides along a tube of {material}; the signal of 16 taxels; "
+        f"the box answers {verdict.label}"
+    )
     return to_svg(figure, about + " (simulated)")
 
 

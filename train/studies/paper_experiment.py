@@ -231,7 +231,8 @@ def with_curve(found: Json, curve: Json) -> Json:
     curve of another training."""
     if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
         raise FormatError(
-            "this curve is not of the CNN as printed; run python -m train.studies cnn-curve --size whole"
+            "this curve is not of the CNN as printed; run python -m train.studies cnn-curve "
+            "--size whole"
         )
     return joined(as_printed(curve, FULL) | {"quick": found["quick"]}, found)
 
@@ -281,7 +282,8 @@ def as_printed(curve: Json, cases: Mapping[str, StudyCase]) -> Json:
 def _outcomes(
     cases: Mapping[str, StudyCase], steps: Sequence[Step], how: StudyRun
 ) -> Iterator[Outcome]:
-    """Run step by step. After each fold `log` gets the progress and an estimate of the time left."""
+    """Run step by step. After each fold `log` gets the progress and an estimate of the time
+    left."""
     todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
     expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
     pace = 1 / (os.cpu_count() or 1)
@@ -339,7 +341,8 @@ def summary(
 
 
 def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
-    """One line of the table. attachments: their number, and the accuracy of the worst and the best."""
+    """One line of the table. attachments: their number, and the accuracy of the worst and the
+    best."""
     right, place = (
         np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place")
     )

@@ -44,7 +44,8 @@ COSTS = {
     "ms_p99": ChartAxis("longest time", "processor time that 99 of 100 sweeps stay within", "ms"),
     "macs": ChartAxis(
         "multiply-adds",
-        "multiplications of a sweep, each with its addition: the graph's, and the Fourier transforms of features",
+        "multiplications of a sweep, each with its addition: the graph's, and the Fourier "
+        "transforms of features",
     ),
     "file_kb": ChartAxis("model file", "the model alone, 1000 bytes each", "KB"),
     "rss_mb": ChartAxis(
@@ -52,7 +53,8 @@ COSTS = {
     ),
     "touch_s": ChartAxis(
         "how long it must touch",
-        "the part of a sweep that it needs: all of it, or less where it may answer early at a loss of half a point",
+        "the part of a sweep that it needs: all of it, or less where it may answer early at a "
+        "loss of half a point",
         "s",
     ),
     "weights": ChartAxis("weights", "numbers found by training"),
@@ -63,27 +65,32 @@ TUBES, FABRICS = 1 / len(MATERIALS), 1 / 7
 ACCURACIES = {
     "speed": ChartAxis(
         "a speed it never felt",
-        "seven real fabrics (FabricSlide): trained on sweeps of all speeds but one, tested on that one, for each in turn",
+        "seven real fabrics (FabricSlide): trained on sweeps of all speeds but one, tested on "
+        "that one, for each in turn",
         chance=FABRICS,
     ),
     "force": ChartAxis(
         "a force it never felt",
-        "seven real fabrics (FabricSlide): trained on sweeps of all forces but one, tested on that one, for each in turn",
+        "seven real fabrics (FabricSlide): trained on sweeps of all forces but one, tested on "
+        "that one, for each in turn",
         chance=FABRICS,
     ),
     "lopo": ChartAxis(
         "a position it never felt (simulated)",
-        "six simulated tubes (T-REAL): the skin sits in nine slightly different positions, each left out of training in turn",
+        "six simulated tubes (T-REAL): the skin sits in nine slightly different positions, each "
+        "left out of training in turn",
         chance=TUBES,
     ),
     "hard": ChartAxis(
         "skin taken off and put back (simulated)",
-        "six simulated tubes (T-HARD): trained on one skin, tested after it was taken off and put back, twenty times",
+        "six simulated tubes (T-HARD): trained on one skin, tested after it was taken off and "
+        "put back, twenty times",
         chance=TUBES,
     ),
     "stress": ChartAxis(
         "the disturbance that hurts it most (simulated)",
-        "six simulated tubes, new positions: of each method its own worst disturbance, mean from mild to severe",
+        "six simulated tubes, new positions: of each method its own worst disturbance, mean from "
+        "mild to severe",
         chance=TUBES,
     ),
 } | {

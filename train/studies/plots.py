@@ -164,7 +164,8 @@ def sweeps(
     printed: Mapping[str, Sequence[float | None]],
     about: str,
 ) -> str:
-    """A panel for each method: accuracy after one, two, three … sweeps, by "product" and by "vote"."""
+    """A panel for each method: accuracy after one, two, three … sweeps, by "product" and by
+    "vote"."""
     lowest = min(e[1] for rules in ours.values() for line in rules.values() for e in line)
     bottom, figure = max(np.floor(lowest * 10) / 10, 0), Figure((WIDTH, 2.7))
     for i, (name, rules) in enumerate(ours.items()):

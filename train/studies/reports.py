@@ -100,7 +100,8 @@ def names() -> list[str]:
 
 
 def named(wanted: Sequence[str]) -> list[ResultFile]:
-    """The reports `wanted` in the order of REPORTS, or all. Raises FormatError for an unknown one."""
+    """The reports `wanted` in the order of REPORTS, or all. Raises FormatError for an unknown
+    one."""
     if unknown := [name for name in wanted if name not in names()]:
         raise FormatError(f"no report {', '.join(unknown)}; there are {', '.join(names())}")
     return [report for report in REPORTS if not wanted or report.name in wanted]

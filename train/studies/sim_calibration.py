@@ -79,7 +79,8 @@ def draw(
 
 
 def accuracies(sweeps: sets.Dataset, seed: int) -> Array:
-    """The accuracies, float64 [figures, methods], on the sets of `draw`. seed: of the random folds."""
+    """The accuracies, float64 [figures, methods], on the sets of `draw`. seed: of the random
+    folds."""
     inputs = {kind: methods.model_inputs(kind, sweeps) for kind in ("L", "H")}
     shares = np.zeros(PRINTED.shape)
     for i, figure in enumerate(FIGURES):
@@ -196,7 +197,8 @@ def table(result: dict[str, Any]) -> str:
         ]
         text.append((name.ljust(32) + "".join(cell.ljust(20) for cell in cells)).rstrip())
     text.append(
-        f"{_difference(result)}; {len(result['seeds'])} seeds, {result['attachments']} attachments of T-HARD each"
+        f"{_difference(result)}; {len(result['seeds'])} seeds, {result['attachments']} "
+        "attachments of T-HARD each"
     )
     if result["without"]:
         text += [

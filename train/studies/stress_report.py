@@ -28,7 +28,8 @@ SHOWN = 3
 
 
 def render(result: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. Raises FormatError if no method has a result."""
+    """The page (HTML) and its pictures (SVG) by name. Raises FormatError if no method has a
+    result."""
     entries = {
         plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
     }
@@ -122,7 +123,8 @@ def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
     near = sum(difference >= -NEAR - ROUNDING for difference in differences)
     return [
         {
-            "what": f"lines of the table below in which {ours} is at most one point below {EARLIER}, the recipe before it",
+            "what": f"lines of the table below in which {ours} is at most one point "
+            f"below {EARLIER}, the recipe before it",
             "target": f"{len(differences)} of {len(differences)}",
             "here": f"{near} of {len(differences)}",
             "met": near == len(differences),

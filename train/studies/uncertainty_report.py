@@ -214,7 +214,8 @@ def _targets(figures: Json) -> Iterator[Json]:
         }
         (limit,) = (one for one in figures["unknown"]["limits"] if one["factor"] == 1)
         yield {
-            "what": f"the same where two sweeps must agree ({formatting.percent(limit['kept_twice'])} of known ones kept)",
+            "what": "the same where two sweeps must agree "
+            f"({formatting.percent(limit['kept_twice'])} of known ones kept)",
             "target": "≤ 10 %",
             "here": formatting.percent(limit["false_known_twice"]),
             "met": limit["false_known_twice"] <= TARGETS["false_known"],
@@ -222,7 +223,8 @@ def _targets(figures: Json) -> Iterator[Json]:
         for point in figures["enrolment"]["points"]:
             if point["sweeps"] == 5:
                 yield {
-                    "what": f"a material enrolled from five sweeps, {point['where']}: share of the accuracy of full training",
+                    "what": f"a material enrolled from five sweeps, {point['where']}: share of "
+                    "the accuracy of full training",
                     "target": "≥ 90 %",
                     "met": point["share"] >= TARGETS["enrolment"],
                     "here": formatting.estimate([point["share"], point["low"], point["high"]]),

@@ -36,7 +36,8 @@ def test_the_settings_of_a_new_box():
     )
     with pytest.raises(
         ConfigError,
-        match=r'serial\.port = "" is not a serial line .* set serial\.port = "/run/palpate-tcp/line"',
+        match=r'serial\.port = "" is not a serial line .* set serial\.port = '
+        r'"/run/palpate-tcp/line"',
     ):
         settled("tcp")
 

@@ -209,7 +209,8 @@ from rclpy.utilities import get_default_context
 from appliance.bridges import ros
 def end():
     context = get_default_context()
-    context._Context__context.shutdown()  # as the signal handler does it: its waking of the executor has passed
+    # as the signal handler does it: its waking of the executor has passed
+    context._Context__context.shutdown()
 threading.Timer(2, end).start()
 ros.run([])
 """

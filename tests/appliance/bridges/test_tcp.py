@@ -208,8 +208,8 @@ def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
-    """The task does not go on, as it did with asyncio.wait_for of Python 3.11: then the bridge never
-    ended after SIGTERM."""
+    """The task does not go on, as it did with asyncio.wait_for of Python 3.11: then the bridge
+    never ended after SIGTERM."""
 
     async def run() -> bool:
         bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
@@ -314,7 +314,10 @@ def test_bridges_need_neither_numpy_nor_onnxruntime():
         "appliance.bridges.tcp;"
         "print({m.split('.')[0] for m in sys.modules} & {'numpy', 'onnxruntime', 'usb', 'gpiod'})"
     )
-    options = "import sys; import appliance.cli.parser; print({'asyncio', 'appliance.bridges.server'} & {*sys.modules})"
+    options = (
+        "import sys; import appliance.cli.parser; print({'asyncio', "
+        "'appliance.bridges.server'} & {*sys.modules})"
+    )
     for text in (code, options):
         done = subprocess.run(
             [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=True

@@ -43,34 +43,75 @@ BROKE = {
     "capture/rows-with-a-point": "rows = 4.0 in its head: TypeError at the first frame",
     "capture/state-that-is-no-text": "UnicodeDecodeError while it played",
     "capture/time-of-64-bits": "a time that is no int64: OverflowError",
-    "command/checksum-beside-noise": "a byte above 127 and a checksum: UnicodeEncodeError, and one noisy line ended the box",
-    "command/end-of-a-long-line": "a line of over 128 bytes, read in two parts: its end was carried out as a command",
-    "command/name-without-end": "a command's name of 120 letters took `error` and its reason out of the answer",
-    "enrolment/member-that-is-no-array": "numpy gives the bytes of what does not begin as an array: AttributeError",
-    "import-mat/name-of-a-control-character": "an array called NUL: it stood in the message as it is",
+    "command/checksum-beside-noise": "a byte above 127 and a checksum: UnicodeEncodeError, and one "
+    "noisy "
+    "line "
+    "ended "
+    "the "
+    "box",
+    "command/end-of-a-long-line": "a line of over 128 bytes, read in two parts: its end was "
+    "carried "
+    "out "
+    "as "
+    "a "
+    "command",
+    "command/name-without-end": "a command's name of 120 letters took `error` and its reason out "
+    "of "
+    "the "
+    "answer",
+    "enrolment/member-that-is-no-array": "numpy gives the bytes of what does not begin as an "
+    "array: "
+    "AttributeError",
+    "import-mat/name-of-a-control-character": "an array called NUL: it stood in the message as it "
+    "is",
     "manifest/brackets-in-brackets": "5000 brackets: RecursionError",
     "manifest/dead-taxels-of-many-digits": "a number of 401 digits was taken",
-    "manifest/figures-in-figures": "figures 800 levels deep were read, but enrolment could not write them: RecursionError",
+    "manifest/figures-in-figures": "figures 800 levels deep were read, but enrolment could not "
+    "write "
+    "them: "
+    "RecursionError",
     "manifest/files-as-text": "`files` was a text that held all names: TypeError",
     "manifest/key-with-a-line-end": "a message of two lines",
-    "manifest/name-of-half-a-character": "a name that no terminal shows: UnicodeEncodeError in `palpate check`",
+    "manifest/name-of-half-a-character": "a name that no terminal shows: UnicodeEncodeError in "
+    "`palpate "
+    "check`",
     "manifest/number-of-many-digits": "early.least of 401 digits: OverflowError",
-    "manifest/rows-with-a-point": "rows = 4.0 came past the golden sweeps: TypeError when the first array was made",
+    "manifest/rows-with-a-point": "rows = 4.0 came past the golden sweeps: TypeError when the "
+    "first "
+    "array "
+    "was "
+    "made",
     "manifest/threshold-as-text": 'contact = "10" was taken: TypeError at the first sweep',
     "manifest/threshold-nan": "contact = NaN was taken: every sweep `no-contact`",
     "recording/brackets-in-brackets": "5000 brackets in its sidecar: RecursionError",
     "recording/format-out-of-range": "the message did not say which file",
     "recording/number-as-text": 'id = "1" was taken',
-    "recording/table-head-without-end": "a table whose head is cut: tokenize.TokenError out of numpy",
+    "recording/table-head-without-end": "a table whose head is cut: tokenize.TokenError out of "
+    "numpy",
     "recording/table-of-a-petabyte": "a table that says it is 21 PiB: MemoryError",
     "settings/brackets-in-brackets": "2000 brackets: RecursionError",
-    "settings/delete-character": "a text with a control character was taken, and what `palpate config` printed did not load",
+    "settings/delete-character": "a text with a control character was taken, and what `palpate "
+    "config` "
+    "printed "
+    "did "
+    "not load",
     "settings/key-with-a-line-end": "a message of two lines",
-    "settings/number-of-many-digits": "silence_ms of 4817 digits: ValueError while the message was made",
-    "settings/tables-in-tables": "1500 tables in a value: RecursionError while the message was made",
-    "settings/zero-character": "a path with a zero was taken: ValueError when the bundle was opened",
-    "skin-papillarray/tail-of-a-later-packet": "a changed byte; with the next thirteen packets the sum fitted: a frame of no skin",
-    "unpack/restart-in-one-transfer": "frames before the restart were neither given out nor counted",
+    "settings/number-of-many-digits": "silence_ms of 4817 digits: ValueError while the message was "
+    "made",
+    "settings/tables-in-tables": "1500 tables in a value: RecursionError while the message was "
+    "made",
+    "settings/zero-character": "a path with a zero was taken: ValueError when the bundle was "
+    "opened",
+    "skin-papillarray/tail-of-a-later-packet": "a changed byte; with the next thirteen packets the "
+    "sum "
+    "fitted: "
+    "a "
+    "frame "
+    "of "
+    "no "
+    "skin",
+    "unpack/restart-in-one-transfer": "frames before the restart were neither given out nor "
+    "counted",
 }
 
 

@@ -183,7 +183,10 @@ def test_its_default_is_the_setting_of_the_box():
 
 def test_a_reader_loads_no_numpy():
     """Nothing but Python's own modules and a little of the box."""
-    code = "import sys, appliance.client.feed; print(sorted({'numpy', 'serial', 'usb', 'onnxruntime'} & set(sys.modules)))"
+    code = (
+        "import sys, appliance.client.feed; print(sorted({'numpy', 'serial', 'usb', "
+        "'onnxruntime'} & set(sys.modules)))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )

@@ -80,7 +80,8 @@ made = bundle.load(Path(sys.argv[1]))
 run = Classifier(made, SystemClock())
 for golden in made.golden:
     run.logits(golden)
-print(made.memory, next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+status = open("/proc/self/status")
+print(made.memory, next(line.split()[1] for line in status if line.startswith("VmHWM")))
 """
 
 

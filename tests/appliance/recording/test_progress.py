@@ -13,7 +13,8 @@ def test_each_material_is_wanted_at_every_position():
     progress.add("a", "1")
     progress.add("a", "2")
     assert progress.line("a", "1") == (
-        "a at 1: 2 of 2; missing: a at 2: 1, b at 1: 1, b at 2: 2, c at 1: 1, c at 2: 2, d at 1: 1 and 1 more"
+        "a at 1: 2 of 2; missing: a at 2: 1, b at 1: 1, b at 2: 2, c at 1: 1, c at 2: 2, d at 1: "
+        "1 and 1 more"
     )
 
 

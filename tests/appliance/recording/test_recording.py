@@ -337,12 +337,17 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
     desk.sweep(5)
     desk.sweep(6, status=Status.SHORT)
     assert logged == [
-        "<4>sweep 1: no answer, saturated: too many raw counts at full scale; press less; it is not counted",
-        "sweep 2: recorded; wood at 1: 2 of 2; missing: another material, since a model tells at least two apart",
+        "<4>sweep 1: no answer, saturated: too many raw counts at full scale; press less; "
+        "it is not counted",
+        "sweep 2: recorded; wood at 1: 2 of 2; missing: another material, since a model tells at "
+        "least two apart",
         "sweep 3: recorded; metal at 1: 1 of 2; missing: metal at 1: 1",
-        "sweep 4: recorded; metal at 2: 1 of 2; missing: metal at 1: 2, metal at 2: 1, wood at 2: 2",
-        "sweep 5: recorded; no material, so it cannot be trained on; name it with MATERIAL or --material",
-        "<4>sweep 6: no answer, short: the stop edge came before a window's length had passed; it is not counted",
+        "sweep 4: recorded; metal at 2: 1 of 2; missing: metal at 1: 2, metal at 2: 1, wood at "
+        "2: 2",
+        "sweep 5: recorded; no material, so it cannot be trained on; "
+        "name it with MATERIAL or --material",
+        "<4>sweep 6: no answer, short: the stop edge came before a window's length had passed; "
+        "it is not counted",
     ]
 
 

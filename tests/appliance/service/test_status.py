@@ -163,7 +163,8 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     text = status_file.text().splitlines()
     assert (
         text[0]
-        == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source usb)"
+        == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source "
+        "usb)"
     )
     assert text[1:5] == [
         "skin     streaming (5,000,000 frames, 3 lost)",

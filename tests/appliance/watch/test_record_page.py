@@ -238,8 +238,11 @@ def test_only_the_sweep_that_was_seen_is_discarded(
     until(lambda: seen.text("#discard") == f"Discard sweep {number - 1}")
     late = seen.page.evaluate(
         """async () => {
-          const key = await new Promise((got) => new EventSource("/events").addEventListener("key", (e) => got(JSON.parse(e.data))));
-          const answer = await fetch("/order", {method: "POST", body: '{"command": "DISCARD", "text": "1"}',
+          const events = new EventSource("/events");
+          const key = await new Promise((got) =>
+            events.addEventListener("key", (e) => got(JSON.parse(e.data))));
+          const answer = await fetch("/order", {
+            method: "POST", body: '{"command": "DISCARD", "text": "1"}',
             headers: {"Content-Type": "application/json", "X-Palpate-Key": key}});
           return [answer.status, await answer.text()];
         }"""
@@ -306,22 +309,30 @@ def other_site(folder: Path) -> Iterator[str]:
 
 
 ATTACKS = """async (page) => {
-  const body = '{"command": "MATERIAL", "text": "evil"}', json = {"Content-Type": "application/json"};
+  const body = '{"command": "MATERIAL", "text": "evil"}';
+  const json = {"Content-Type": "application/json"};
   const tries = [
-    ["cors", {method: "POST", body, headers: json}], ["cors", {method: "POST", body, headers: {...json, "X-Palpate-Key": "x"}}],
-    ["no-cors", {method: "POST", body}], ["no-cors", {method: "POST", body, headers: {"Content-Type": "text/plain"}}],
+    ["cors", {method: "POST", body, headers: json}],
+    ["cors", {method: "POST", body, headers: {...json, "X-Palpate-Key": "x"}}],
+    ["no-cors", {method: "POST", body}],
+    ["no-cors", {method: "POST", body, headers: {"Content-Type": "text/plain"}}],
   ];
   const said = [];
-  for (const [mode, what] of tries) said.push(await fetch(`${page}/order`, {...what, mode, credentials: "include"}).then((a) => a.status, () => "blocked"));
+  for (const [mode, what] of tries) {
+    const answer = fetch(`${page}/order`, {...what, mode, credentials: "include"});
+    said.push(await answer.then((a) => a.status, () => "blocked"));
+  }
   said.push(navigator.sendBeacon(`${page}/order`, body));
   said.push(await new Promise((got) => {
     const source = new EventSource(`${page}/events`);
     source.addEventListener("key", (event) => got(event.data));
     source.onerror = () => { source.close(); got("no key"); };
   }));
-  const form = Object.assign(document.createElement("form"), {method: "POST", action: `${page}/order`, enctype: "text/plain", target: "frame"});
-  form.append(Object.assign(document.createElement("input"), {name: body.slice(0, -1), value: "}"}));
-  document.body.append(Object.assign(document.createElement("iframe"), {name: "frame"}), form);
+  const made = (tag, fields) => Object.assign(document.createElement(tag), fields);
+  const sent = {method: "POST", action: `${page}/order`, enctype: "text/plain", target: "frame"};
+  const form = made("form", sent);
+  form.append(made("input", {name: body.slice(0, -1), value: "}"}));
+  document.body.append(made("iframe", {name: "frame"}), form);
   form.submit();
   return said;
 }"""
@@ -386,8 +397,10 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
     """Sections, fields, pictures and buttons have names for screen readers, which speak changes."""
     seen = opened(browser, recorded)
     unnamed = seen.page.evaluate(
-        """() => [...document.querySelectorAll("section, canvas, button, input, table, [role]")].filter((e) => !(e.textContent.trim()
-        || e.labels?.length || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby"))).map((e) => e.id)"""
+        """() => [...document.querySelectorAll("section, canvas, button, input, table, [role]")]
+        .filter((e) => !(e.textContent.trim() || e.labels?.length
+          || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
+        .map((e) => e.id)"""
     )
     assert set(unnamed) <= {"banner", "said"}
     assert seen.page.get_attribute("#said", "role") == "status"

@@ -378,8 +378,10 @@ def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
     changes."""
     seen = opened(browser, shown)
     unnamed = seen.page.evaluate(
-        """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")].filter((e) => !(e.textContent.trim()
-        || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby"))).map((e) => e.outerHTML.slice(0, 80))"""
+        """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")]
+        .filter((e) => !(e.textContent.trim()
+          || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
+        .map((e) => e.outerHTML.slice(0, 80))"""
     )
     assert [one for one in unnamed if 'id="banner"' not in one] == []
     assert seen.page.get_attribute("#banner", "role") == "status"

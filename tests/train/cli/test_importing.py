@@ -1,5 +1,5 @@
-"""palpate-train import, as a user calls it: the five commands of docs/how-to/import.md, its report, its
-exit codes."""
+"""palpate-train import, as a user calls it: the five commands of docs/how-to/import.md, its report,
+its exit codes."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     assert [*caplog.messages, *re.findall(".*[Ww]arning.*|.*Gemm.*", err)] == []
     assert "they also helped to choose the model" in out
     assert (
-        "which no part of the fit has seen; after export: palpate-train score BUNDLE --set build/rest.npz\n"
-        in out
+        "which no part of the fit has seen; after export: palpate-train score BUNDLE --set "
+        "build/rest.npz\n" in out
     )
     assert (
         f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
@@ -131,7 +131,8 @@ def test_real_sweeps_come_back_from_csv(tmp_path: Path):
     real = sets.load(str(Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"))
     real = real.take(np.arange(len(real)) % 20 == 0)
     for i, counts in enumerate(real.samples):
-        name = f"{real.materials[real.labels[i]]}/{real.groups['force'][i]}_{real.groups['speed'][i]}_{i}.csv"
+        force, speed = real.groups["force"][i], real.groups["speed"][i]
+        name = f"{real.materials[real.labels[i]]}/{force}_{speed}_{i}.csv"
         write(tmp_path / "r" / name, counts.reshape(len(counts), -1), real.rate_hz)
     args = [
         "import",

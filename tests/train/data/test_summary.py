@@ -119,7 +119,8 @@ def test_recordings_are_described_by_name(tmp_path: Path):
     record(tmp_path / "run0" / "9.npy", "", Status.GAP, frames=0, lost=100)
     s = sets.load(str(tmp_path))
     assert summary.describe(str(tmp_path)).splitlines() == [
-        f"{tmp_path} (left out: 1 gap): 6 sweeps of 0.16 s; 2x3 int16 at 50 Hz, window 8; digest {sets.digest(s)}",
+        f"{tmp_path} (left out: 1 gap): 6 sweeps of 0.16 s; 2x3 int16 at 50 Hz, window 8; "
+        f"digest {sets.digest(s)}",
         "  recordings: 6, of 1 each",
         "  materials: 2: a 3, b 3",
         "  position: 2: 0 side, 1 tip",

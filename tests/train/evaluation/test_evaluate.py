@@ -559,7 +559,8 @@ def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[s
         main(["evaluate", "--list"])
     lines = capsys.readouterr().out.splitlines()
     promised = (
-        "L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm st-hmp paper-cnn "
+        "L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm "
+        "st-hmp paper-cnn "
         "tactnet2 recurrent minirocket compact"
     )
     assert {line.split()[0] for line in lines} >= set(promised.split())

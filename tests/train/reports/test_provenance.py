@@ -155,7 +155,8 @@ def test_every_table_has_a_frame(tmp_path: Path):
     """Whatever a template writes: heads have a scope, wide tables take the focus; what a template
     says itself stays."""
     (tmp_path / "a.html.j2").write_text(
-        '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead><tr><th scope="row">b</th></tr></table></div>'
+        '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead><tr><th '
+        'scope="row">b</th></tr></table></div>'
     )
     page = html.render("a.html.j2", tmp_path)
     assert '<th scope="col" class="text">a</th>' in page

@@ -12,9 +12,12 @@ from tests.factories import rendered
 from train.reports import html, plot_style
 
 LONG = "an_unbroken_name_" * 12
-GOOD = """{% extends "base.html.j2" %}{% import "parts.html.j2" as parts %}{% block title %}Good{% endblock %}{% block body %}
-{{ parts.targets([{"what": "accuracy where the skin was put back elsewhere", "target": "≥ 97 %", "here": "98.1 % [96.1, 99.3]", "met": false}]) }}
-{{ parts.table(["a", "b", "c", "d", "e", "f"], [["99.1 % [99.0, 99.2]"] * 6]) }}<figure>{{ svg }}</figure>{% endblock %}"""
+GOOD = """{% extends "base.html.j2" %}{% import "parts.html.j2" as parts %}
+{% block title %}Good{% endblock %}{% block body %}
+{{ parts.targets([{"what": "accuracy where the skin was put back elsewhere", "target": "≥ 97 %",
+  "here": "98.1 % [96.1, 99.3]", "met": false}]) }}
+{{ parts.table(["a", "b", "c", "d", "e", "f"], [["99.1 % [99.0, 99.2]"] * 6]) }}
+<figure>{{ svg }}</figure>{% endblock %}"""
 
 
 def page(folder: Path, body: str, **figure: str) -> str:
@@ -45,7 +48,8 @@ def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, sche
         ("page wider than the window", f"<p style='white-space: nowrap'>{LONG}</p>"),
         (
             "verdict out of sight",
-            "<div class='wide' tabindex='0' role='region'><table><tr><td style='padding-left: 30rem'></td>"
+            "<div class='wide' tabindex='0' role='region'><table><tr><td style='padding-left: "
+            "30rem'></td>"
             "<td class='verdict'>reached</td></tr></table></div>",
         ),
         ("scrolls without keyboard", f"<div style='overflow-x: auto'><pre>{LONG}</pre></div>"),
@@ -60,7 +64,8 @@ def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, sche
         ("low contrast", "<p style='color: #999'>pale</p>"),
         (
             "low contrast",
-            "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/><text y='14' font-size='9' fill='#111'>dark</text></svg>",
+            "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/><text y='14' "
+            "font-size='9' fill='#111'>dark</text></svg>",
         ),
         ("raw brace", "<p>sim:T-REAL:{{ '{w}' }}</p>"),
     ],

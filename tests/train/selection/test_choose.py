@@ -491,8 +491,10 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     nothing from outside."""
     skin().save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text(
-        'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds = 3\naccuracy = 0.8\n'
-        'methods = ["L-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\nms = 50\nkb = 500\nmb = 500\nslower = 3\n'
+        'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds '
+        "= 3\naccuracy = 0.8\n"
+        'methods = ["L-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\nms = 50\nkb = '
+        "500\nmb = 500\nslower = 3\n"
     )
     args = [
         "choose",

@@ -91,8 +91,8 @@ def test_figures_of_an_older_bundle_say_so_first(figures: dict[str, Any]):
     figures["bundle"] = "0badbead"
     first, _, rest = bench_table.table(figures).partition("\n\n")
     assert (
-        first
-        == f"**Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now.**"
+        first == "**Made with an older default, bundle 0badbead; "
+        f"the box ships bundle {score.shipped()} now.**"
     )
     assert rest.startswith("Measured by")
 
@@ -103,7 +103,8 @@ def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
     text = bench_table.table(figures)
     right, n = figures["accuracy"]["right"], figures["accuracy"]["total"]
     assert re.search(
-        rf"simulated.*n = {n}, with 95 % interval.*\| {right} of {n}: \d+\.\d % \[\d+\.\d, \d+\.\d\] \|",
+        rf"simulated.*n = {n}, with 95 % interval.*\| {right} of {n}: \d+\.\d % \[\d+\.\d, "
+        r"\d+\.\d\] \|",
         text,
     )
     for words, value in (

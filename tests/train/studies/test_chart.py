@@ -333,15 +333,16 @@ def test_the_files(tmp_path: Path):
     assert "quick run" in text
     assert "quick run" not in chart_page.render(DOTS)[0]
     assert not re.search(
-        r'(src|href)="(?!#|chart\.json|data:text/csv|\.\./)|https?://(?!www\.w3\.org)|@import|url\((?!#)',
+        r'(src|href)="(?!#|chart\.json|data:text/csv|\.\./)|https?://(?!www\.w3\.org)|@import|'
+        r"url\((?!#)",
         text,
     )
     assert "{{" not in text
 
 
 def test_what_the_box_answers_stands_beside_what_networks_name(tmp_path: Path):
-    """The page takes it from the results of `alignment`; without them, or if they are older, it says
-    nothing."""
+    """The page takes it from the results of `alignment`; without them, or if they are older, it
+    says nothing."""
     share = [0.88, 0.85, 0.91]
     point = {
         "n": 432,
@@ -460,8 +461,8 @@ def test_what_fell_short_stands_beside_what_did_not():
     and what that means."""
     text = PageReader(chart_page.html(DOTS, "")).text.replace("\N{NO-BREAK SPACE}", " ")
     assert (
-        "a speed it never felt within a point −1.0 [−3.8, +1.8] 95.0 % 93.0 – 97.0 % 96.0 % 94.0 – 98.0 % MiniRocket"
-        in text
+        "a speed it never felt within a point −1.0 [−3.8, +1.8] 95.0 % 93.0 – 97.0 % 96.0 % 94.0 "
+        "– 98.0 % MiniRocket" in text
     )
     assert (
         "(simulated) falls short −3.0 [−5.8, −0.2] 93.0 % 91.0 – 95.0 % 96.0 % 94.0 – 98.0 % H, SVM"

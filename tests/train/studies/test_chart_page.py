@@ -285,7 +285,8 @@ def test_what_the_box_ships_stands_out(seen: BrowsedChart):
     saying that they are ours."""
     ringed = seen.page.eval_on_selector_all(
         ".dot",
-        "all => all.filter((d) => getComputedStyle(d.querySelector('.ship')).stroke !== 'none').map((d) => Number(d.dataset.i))",
+        "all => all.filter((d) => getComputedStyle(d.querySelector('.ship')).stroke !== "
+        "'none').map((d) => Number(d.dataset.i))",
     )
     assert ringed == [2]
     names = seen.page.locator("#names text").all_text_contents()

@@ -40,23 +40,31 @@ def test_the_page_shows_every_figure():
     read = PageReader(pages["index"])
     text = read.text.replace("\N{NO-BREAK SPACE}", " ")
     facts = (
-        "names 90.0 % of sweeps rightly, the mean of 1 tests on real data; QUANT, the best peer there, 85.0 %: a difference of +5.0",
-        "It falls short by more than a point in 1 of 2 lines: two: a force it never felt (−5.5 [−12.6, +1.6] to QUANT)",
-        "lines in which it is no more than one point below the best peer wanted: 2 of 2 1 of 2 missed",
-        "ahead of QUANT, the best peer on the mean of 1 real and published lines wanted: ≥ 1.0 +5.0 [−2.1, +12.1] reached",
+        "names 90.0 % of sweeps rightly, the mean of 1 tests on real data; "
+        "QUANT, the best peer there, 85.0 %: a difference of +5.0",
+        "It falls short by more than a point in 1 of 2 lines: two: a force it never felt (−5.5 "
+        "[−12.6, +1.6] to QUANT)",
+        "lines in which it is no more than one point below the best peer wanted: 2 of 2 1 of 2 "
+        "missed",
+        "ahead of QUANT, the best peer on the mean of 1 real and published lines wanted: ≥ 1.0 "
+        "+5.0 [−2.1, +12.1] reached",
         "points that int8 loses of its own float, on the mean wanted: ≤ 0.5 1.0 missed",
         "time of a sweep, MiniRocket’s = 1 wanted: ≤ 1/100 1/100 reached",
-        "one: a force it never felt ahead, not certain +5.0 [−2.1, +12.1] 90.0 % 85.0 – 95.0 % 85.0 % 80.0 – 90.0 % QUANT",
-        "one: a force it never felt 90.0 % 85.0 – 95.0 % 2 seeds 80.0 % 75.0 – 85.0 % 2 seeds 85.0 % 80.0 – 90.0 % 2 seeds",
+        "one: a force it never felt ahead, not certain +5.0 [−2.1, +12.1] 90.0 % 85.0 – 95.0 % "
+        "85.0 % 80.0 – 90.0 % QUANT",
+        "one: a force it never felt 90.0 % 85.0 – 95.0 % 2 seeds 80.0 % 75.0 – 85.0 % 2 seeds "
+        "85.0 % 80.0 – 90.0 % 2 seeds",
         "two: a force it never felt 70.0 % 65.0 – 75.0 % 2 seeds – 75.5 % 70.5 – 80.5 % 2 seeds",
         "1 lines: real and published ahead, not certain +5.0 [−2.1, +12.1] 90.0 % 85.0 – 95.0 %",
-        "2 lines: all, the simulated ones too within a point −0.2 [−5.3, +4.8] 80.0 % 76.5 – 83.5 % 80.2 % 76.7 – 83.8 % QUANT",
+        "2 lines: all, the simulated ones too within a point −0.2 [−5.3, +4.8] 80.0 % 76.5 – "
+        "83.5 % 80.2 % 76.7 – 83.8 % QUANT",
         "Palpate, as shipped 90.0 % 91.0 % 1.0 1",
         "quick <b>, two: a window of 8 frames",
         "time of a sweep, MiniRocket’s = 1 1/100 – 2.2",
         "one: a force it never felt Palpate, as shipped 50.0 % 45.0 – 55.0 % 2 seeds – – 90.0 %",
         "one: a force it never felt one.npz, force<=180 leave:force digest of one",
-        "one: a force it never felt : real sweeps, 4 classes: trained on sweeps of all forces but one",
+        "one: a force it never felt : real sweeps, 4 classes: trained on sweeps of all forces "
+        "but one",
         "default, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores",
         "QUANT 1.50",
         "QUANT float onnx 22.0 44.0",
@@ -163,7 +171,8 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
     """An error says what to do, and nothing is written."""
     with pytest.raises(
         FormatError,
-        match="no result of default or default-reattached or filter-bank or compact-50k; run the command",
+        match="no result of default or default-reattached or filter-bank or compact-50k; "
+        "run the command",
     ):
         published("development", figures(results=[entry("one", "quant", 0.9)]), tmp_path)
     assert not (tmp_path / "pages").exists()
@@ -413,15 +422,15 @@ def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
     )
     text = PageReader(pages["index"]).text.replace("\N{NO-BREAK SPACE}", " ")
     assert (
-        "3 lines: real and published falls short −10.0 [−17.1, −2.9] 80.0 % 75.0 – 85.0 % 90.0 % 85.0 – 95.0 % QUANT"
-        in text
+        "3 lines: real and published falls short −10.0 [−17.1, −2.9] 80.0 % 75.0 – 85.0 % 90.0 % "
+        "85.0 – 95.0 % QUANT" in text
     )
     assert (
         "1 lines: real and published that every method has falls short −15.0 [−22.1, −7.9]" in text
     )
     assert (
-        "On the mean of 1 lines: real and published that every method has it falls short: −15.0 [−22.1, −7.9] to DS-CNN."
-        in text
+        "On the mean of 1 lines: real and published that every method has it falls short: −15.0 "
+        "[−22.1, −7.9] to DS-CNN." in text
     )
     assert "DS-CNN: two: a force it never felt; three: a force it never felt" in text
 

@@ -1,5 +1,5 @@
-"""Results below docs/data, the pages that are drawn of them, and the pictures of written pages: each
-is in a list that commands know, has its header, and can be read."""
+"""Results below docs/data, the pages that are drawn of them, and the pictures of written pages:
+each is in a list that commands know, has its header, and can be read."""
 
 from __future__ import annotations
 
@@ -132,7 +132,8 @@ def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, drawn: 
     page.goto(rendered.address(drawn / name))
     page.keyboard.press("Tab")
     found = page.evaluate(
-        "[document.activeElement.getAttribute('href'), getComputedStyle(document.activeElement).outlineStyle]"
+        "[document.activeElement.getAttribute('href'), "
+        "getComputedStyle(document.activeElement).outlineStyle]"
     )
     context.close()
     assert found == [html.HOME, "solid"]

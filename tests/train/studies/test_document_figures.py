@@ -40,7 +40,8 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_documents_show_the_figures_of_their_results(name: str):
-    """To the letter, and nothing else: what differs is written again by `python -m train.studies figures`."""
+    """To the letter, and nothing else: what differs is written again by `python -m train.studies
+    figures`."""
     assert (ROOT / name).read_text(encoding="utf-8") == document_figures.written(name, ROOT)
 
 

@@ -1,5 +1,5 @@
-"""`python -m train.studies fabrics`: which tests it runs, what of an earlier run stays, and what it says
-where something is missing."""
+"""`python -m train.studies fabrics`: which tests it runs, what of an earlier run stays, and what it
+says where something is missing."""
 
 from __future__ import annotations
 

@@ -64,15 +64,22 @@ def certainty_facts(figures: Any) -> Facts:
     """Targets, calibration, sequences, materials, enrolment, early exit, origin."""
     let_through = figures["unknown"]["mean"]["false_known"]
     if let_through > 0.1:
-        yield f"Missed: sweeps of unknown materials that get a known name, {number(let_through)} % (wanted ≤ 10 %)"
+        yield (
+            f"Missed: sweeps of unknown materials that get a known name, {number(let_through)} "
+            "% (wanted ≤ 10 %)"
+        )
     worst, its = max(
         figures["unknown"]["materials"].items(), key=lambda item: item[1]["false_known"]
     )
     yield f"the one most often taken for a known one: {worst}, {number(its['false_known'])} %."
     for p in (p for held in figures["sequence"].values() for p in held["points"] if p["wanted"]):
-        yield f"{p['sweeps']:.2f} {three(p['accuracy'], p['low'], p['high'])} {number(p['decided'])} %"
+        share = three(p["accuracy"], p["low"], p["high"])
+        yield f"{p['sweeps']:.2f} {share} {number(p['decided'])} %"
     for name, m in figures["unknown"]["materials"].items():
-        shares = f"{number(m['false_known'])} % {number(m['kept'])} % {three(m['auroc'], m['low'], m['high'])}"
+        shares = (
+            f"{number(m['false_known'])} % {number(m['kept'])} "
+            f"% {three(m['auroc'], m['low'], m['high'])}"
+        )
         yield f"{name} {shares} {number(m['false_known_at_95'])} % {m['known']} / {m['unknown']}"
     for name, value in figures["unknown"]["scores"].items():
         yield f"{name} {number(value)} %"
@@ -111,7 +118,10 @@ def stress_facts(result: Any) -> Facts:
         for mean, low, high in at_targets(those).values():
             yield f"{number(mean)} % {number(low)} – {number(high)} %"
     yield f"{result['test_sweeps']} of {result['test']} ({result['test_digest']})"
-    yield f"bundle {result['box']['bundle']['name']} {result['box']['bundle']['version']}, {result['box']['bundle']['id']}"
+    yield (
+        f"bundle {result['box']['bundle']['name']} {result['box']['bundle']['version']},"
+        f" {result['box']['bundle']['id']}"
+    )
 
 
 def soak_facts(records: Any) -> Facts:
@@ -132,17 +142,32 @@ def soak_facts(records: Any) -> Facts:
 def choice_facts(choice: Any) -> Facts:
     """The choice and why; all models; what is enough; budget and origin."""
     honest = choice["honest"]
-    yield f"{choice['chosen']} with 0.5 s of each sweep is enough to distinguish 3 materials: a bundle of 12 kB, 0.118 ms"
+    yield (
+        f"{choice['chosen']} with 0.5 s of each sweep is enough to distinguish 3 materials: a "
+        "bundle of 12 kB, 0.118 ms"
+    )
     yield f"Accuracy to expect at work: {three(honest['mean'], honest['low'], honest['high'])}"
     yield "(4 × compact-4k, 1 × compact-10k): place 92.8 % [87.8, 96.8]; day 94.0 % [89.0, 98.0]."
     yield "Reached: 90 % is wanted; it is not certain, since the interval begins at 87.8 %."
-    yield "Not smaller: compact-1k names 12.3 [10.3, 14.3] points fewer rightly, and is 13.1 points behind the best, compact-10k,"
-    yield "Not larger: compact-10k names 0.8 [−1.2, 2.8] points more rightly, where one standard error is 1.2 points."
-    yield "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points. In the bundle; set window so."
+    yield (
+        "Not smaller: compact-1k names 12.3 [10.3, 14.3] points fewer rightly, and is 13.1 "
+        "points behind the best, compact-10k,"
+    )
+    yield (
+        "Not larger: compact-10k names 0.8 [−1.2, 2.8] points more rightly, where one standard "
+        "error is 1.2 points."
+    )
+    yield (
+        "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points. In the bundle; "
+        "set window so."
+    )
     yield "everything; 375 Hz loses 6.0 [4.0, 8.0] points."
     yield "4: 92.8 % of 93.5 %. Not in the bundle; set taxels so: 1.1 1.4 4.1 4.4 (row.column)."
     yield "The bundle, with that left out: 93.0 % [88.0, 97.0]; this loses 0.5 [−1.5, 2.5] points."
-    yield "1 % of 50 ms, 2 % of 500 kB; one ms here is taken for 3 on the board, which is an assumption."
+    yield (
+        "1 % of 50 ms, 2 % of 500 kB; one ms here is taken for 3 on the board, which is an "
+        "assumption."
+    )
     yield "Note: trained for 0.5 of the usual time; all sweeps are simulated."
 
 

@@ -1,5 +1,5 @@
-"""`python -m train.studies reports`: which results are stale and why, which commands run for them, and
-what happens if one fails."""
+"""`python -m train.studies reports`: which results are stale and why, which commands run for them,
+and what happens if one fails."""
 
 from __future__ import annotations
 
@@ -71,11 +71,13 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
     missing and what it needs."""
     assert main(["reports", "--list"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"older    stale: Made with an older default, bundle 0badbead; the box ships bundle {score.shipped()} now",
+        "older    stale: Made with an older default, bundle 0badbead; "
+        f"the box ships bundle {score.shipped()} now",
         "         python -m train older",
         "current  of today",
         "         python -m train current --out x",
-        f"lacking  stale: docs/data/lacking.json: No such file or directory; left out: it needs {NEED}",
+        "lacking  stale: docs/data/lacking.json: No such file or directory; "
+        f"left out: it needs {NEED}",
         "         python -m tests.lacking",
         "new      stale: docs/data/new.json: No such file or directory",
         "         palpate new",

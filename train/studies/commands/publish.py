@@ -75,7 +75,8 @@ def _add_matrix(add: Add) -> None:
         "--page",
         type=Path,
         metavar="FILE.md",
-        help="write a table, ours beside the best of the others, between its <!-- matrix --> markers",
+        help="write a table, ours beside the best of the others, between its <!-- matrix --> "
+        "markers",
     )
 
 

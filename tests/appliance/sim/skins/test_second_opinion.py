@@ -28,13 +28,14 @@ frames = [sample[1:] for sample in AnySkinBase(num_mags=5, port=port).get_data(n
 """,
     "reskin": """
 from anyskin import AnySkinBase
-frames = [sample[1:] for sample in AnySkinBase(num_mags=5, port=port, burst_mode=False).get_data(n + 1)][1:]
+skin = AnySkinBase(num_mags=5, port=port, burst_mode=False)
+frames = [sample[1:] for sample in skin.get_data(n + 1)][1:]
 """,
     "robotiq-tsf": """
 from pyrobotiqtactile import RobotiqTactileSensor
 sensor = RobotiqTactileSensor().connect(port)
 sensor.configure(update_period_ms=16)
-seen = {}  # by the skin's time: the package returns what it has whenever a byte comes, be it the same again
+seen = {}  # by the skin's time: the package returns its frame whenever a byte comes, also twice
 while len(seen) < n:
     frame = sensor.read_frame(timeout=10)
     seen.update({int(frame.timestamp[0]): frame} if frame.timestamp[0] else {})
@@ -54,7 +55,10 @@ def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
     digits."""
     end = "\nprint(json.dumps([np.asarray(f).ravel().tolist() for f in frames]))"
     with played(name) as player:
-        program = f"import json, numpy as np\nport, n = {str(player.path)!r}, {FRAMES}\n{READERS[name]}{end}"
+        program = (
+            "import json, numpy as np\nport, n "
+            f"= {str(player.path)!r}, {FRAMES}\n{READERS[name]}{end}"
+        )
         done = subprocess.run(
             [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
         )
