@@ -25,8 +25,9 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
-from train.evaluation.corruptions import Corruption, EvaluationSweeps, applicable
+from train.evaluation.corruptions import Corruption, applicable
 from train.evaluation.evaluate import Where
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import fingerprint
 from train.metrics.score import interval
 from train.models import methods

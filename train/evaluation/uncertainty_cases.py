@@ -22,7 +22,8 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration.displacement import AugmentedCopies
 from train.calibration.heads import HeadPlan
-from train.data.sets import Dataset, digest
+from train.data.sets import Dataset, digest, join
+from train.data.splitters import Protocol
 from train.evaluation import parallel
 from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
@@ -153,16 +154,35 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     )
 
 
-def tasks(
-    sweeps: Dataset, folds: Sequence[tuple[Array, Array]], method: str, effort: Effort, seed: int
-) -> list[CaseTask]:
-    """Every fold with all materials, and without each of them in turn if at least two remain."""
-    out = [NONE_LEFT_OUT, *(range(len(sweeps.materials)) if len(sweeps.materials) > 2 else [])]
-    return [
-        CaseTask(method, effort, seed, i, *fold, left)
-        for left in out
-        for i, fold in enumerate(folds)
-    ]
+@dataclass(frozen=True)
+class Trainings:
+    """The sweeps of a study and its folds, pairs (training, test) of sweep numbers."""
+
+    sweeps: Dataset
+    protocol: str
+    folds: Sequence[tuple[Array, Array]]
+
+    @classmethod
+    def of(cls, train: Dataset, test: Dataset | None, protocol: str, seed: int) -> Trainings:
+        """Train on one set and test on another; without `test`, divide `train` by the protocol.
+
+        Raises FormatError if the sets or the protocol do not fit.
+        """
+        if test is not None:
+            train = join([train.require_materials(), test])
+            protocol = "split:set=0->1"
+        return cls(train, protocol, Protocol(protocol).folds(train, seed))
+
+    def tasks(self, method: str, effort: Effort, seed: int) -> list[CaseTask]:
+        """Every fold with all materials, and without each of them if at least two remain."""
+        out = [NONE_LEFT_OUT]
+        if len(self.sweeps.materials) > 2:
+            out += range(len(self.sweeps.materials))
+        return [
+            CaseTask(method, effort, seed, i, *fold, left)
+            for left in out
+            for i, fold in enumerate(self.folds)
+        ]
 
 
 def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:

@@ -16,7 +16,8 @@ from appliance.inference.classifier import Classifier
 from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.evaluation import robustness
-from train.evaluation.corruptions import EvaluationSweeps, applicable
+from train.evaluation.corruptions import applicable
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_score
 
 Array = NDArray[Any]

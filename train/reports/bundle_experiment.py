@@ -1,8 +1,7 @@
-"""What a bundle answers to a set, and what it costs: the figures of the command `report`. In: a
-bundle's folder, labelled sweeps. Out: the figures as JSON.
+"""The figures of the command `report`: a bundle's answers to labelled sweeps, and its cost.
 
-All of it comes from the box's classifier, so `unsure`, `unknown` and refused sweeps count as they
-do on the box.
+All answers come from the box's classifier, so `unsure`, `unknown` and refused sweeps count as on
+the box.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
 from train.data.sets import Dataset
 from train.evaluation import uncertainty
-from train.evaluation.corruptions import EvaluationSweeps
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.robustness import breaks_first
 from train.export import bundle_score, bundle_stress, measure
 from train.metrics.score import interval
@@ -30,12 +29,12 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
 NOT_NAMED = (f"({Status.UNSURE})", f"({Status.UNKNOWN})")
-"""Answers without a label that are no refusal, as BundleScore has them."""
+"""Answers without a label that are not refusals, in the notation of BundleScore."""
 
 
 def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
-    """The figures. seed: of the corruptions. Raises FormatError where the set is not of the
-    bundle's format or has none of its materials, BundleError where the bundle does not load."""
+    """The figures. seed: of the corruptions. Raises FormatError if the set differs from the bundle
+    in format or has none of its materials, and BundleError if the bundle does not load."""
     loaded = bundle.load(folder)
     classifier = Classifier(loaded, SystemClock())
     m = loaded.manifest
@@ -66,8 +65,8 @@ def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
 
 
 def named(known: Dataset, found: bundle_score.BundleScore) -> Json:
-    """Of the sweeps whose material the bundle has: how many are named rightly, wrongly and not at
-    all, and how many of these are called unknown."""
+    """Counts of the sweeps whose material the bundle has: right, wrong and without a label; and the
+    number of the latter that are called unknown."""
     answers = sum(found.answered.values(), Counter())
     right, unknown = int(found.right.sum()), answers[f"({Status.UNKNOWN})"]
     silent = sum(n for answer, n in answers.items() if answer.startswith("("))
@@ -82,8 +81,8 @@ def named(known: Dataset, found: bundle_score.BundleScore) -> Json:
 
 
 def foreign_named(found: bundle_score.BundleScore) -> list[float]:
-    """Of the sweeps of other materials the share that gets a label of the bundle, with its
-    interval; empty without any."""
+    """The share of sweeps of other materials that get a label of the bundle, with its interval;
+    empty if there are none."""
     answers = sum(found.foreign.values(), Counter())
     return _share(
         sum(n for answer, n in answers.items() if not answer.startswith("(")), answers.total()
@@ -91,8 +90,8 @@ def foreign_named(found: bundle_score.BundleScore) -> list[float]:
 
 
 def material(name: str, found: bundle_score.BundleScore) -> Json:
-    """One material: its sweeps, how many of them are named rightly, not named or refused, and how
-    many of those that get its name are of it."""
+    """Counts for one material: its sweeps; those with the right label, without a label and refused;
+    and the number of answers with its label that are right."""
     given = found.answered[name]
     others = sum(
         answers[name] for of, answers in (found.answered | found.foreign).items() if of != name
@@ -112,7 +111,7 @@ def material(name: str, found: bundle_score.BundleScore) -> Json:
 
 
 def _commonest(given: Mapping[str, int], name: str) -> list[Any]:
-    """The wrong label that it gets most often and how often; empty where it gets none."""
+    """The most frequent wrong label and its count; empty if there is none."""
     wrong = Counter(
         {answer: n for answer, n in given.items() if answer != name and not answer.startswith("(")}
     )
@@ -120,13 +119,13 @@ def _commonest(given: Mapping[str, int], name: str) -> list[Any]:
 
 
 def _share(right: int, n: int) -> list[float]:
-    """A share with its 95 % interval; empty where there is nothing to count."""
+    """A share with its 95 % interval; empty if there is nothing to count."""
     return [right / n, *interval(np.arange(n) < right)] if n else []
 
 
 def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
-    """How often the most probable label is right, by its probability; of answers with a label,
-    `unsure` among them."""
+    """The share of right labels by the probability of the most probable label, over all answers
+    with a label, including `unsure`."""
     said, right = [], []
     for i, verdict in bundle_score.verdicts(classifier, sweeps):
         if verdict.status.classified:
@@ -141,10 +140,10 @@ def calibration(classifier: Classifier, sweeps: Dataset) -> Json:
 
 
 def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: int) -> list[Json]:
-    """How many of the sweeps the box names rightly and wrongly when one thing goes wrong, what
-    breaks it first on top.
+    """Counts of right and wrong answers under each corruption, ordered by how soon it breaks the
+    box.
 
-    falls: the severity at which five points are lost; None where none is.
+    falls: the severity at which five points are lost; None if they never are.
     """
     given = bundle_stress.under_corruptions(classifier, test, (seed,), log)
     right, wrong = given["rightly"], given["wrongly"]

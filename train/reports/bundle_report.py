@@ -1,7 +1,6 @@
-"""The report on one bundle, a page to hand to a colleague. In: the figures of bundle_experiment,
-the sweeps. Out: HTML.
+"""The report on one bundle as an HTML page to hand on.
 
-Nothing is computed here but shares of counts.
+It computes only shares of the counts in the figures of bundle_experiment.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from train.reports.plot_style import ACCENT, FAINT, GREY, SMALL, set_ticks, sing
 Array = NDArray[Any]
 Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
-"""Labels up to which the confusion matrix can be read on a phone; with more there is the table
-alone."""
+"""Number of labels up to which the confusion matrix can be read on a phone. With more labels there
+is only the table."""
 MOST_SHOWN = 6
-"""Materials of which a sweep is shown."""
+"""Number of materials with an example sweep."""
 MATERIALS = [
     "material",
     "sweeps",
@@ -94,7 +93,7 @@ def page(figures: Json, sweeps: Dataset) -> str:
 
 
 def _in_short(figures: Json) -> Iterator[list[str]]:
-    """What was reached and what was missed, a line each."""
+    """Rows of the summary: results, weaknesses and cost."""
     named, n = figures["named"], figures["named"]["n"]
     for what in ("right", "wrong", "not_named"):
         text = {
@@ -135,7 +134,7 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
 
 
 def _left_out(found: Json | None) -> list[list[str]]:
-    """A line for each material that was left out of training, and their mean."""
+    """A row for each material that was left out of training, and their mean."""
     if not found:
         return []
     rows = [
@@ -171,7 +170,7 @@ def _material(row: Json) -> list[str]:
 
 
 def _corruption(row: Json) -> list[str]:
-    """One thing that goes wrong, and what becomes of the sweeps at its largest severity."""
+    """A row for one corruption with the answers at its largest severity."""
     most, right, wrong = row["severities"][-1], row["right"][-1], row["wrong"][-1]
     falls = "–" if row["falls"] is None else level(row, row["falls"])
     shares = " / ".join(
@@ -181,7 +180,7 @@ def _corruption(row: Json) -> list[str]:
 
 
 def _examples(sweeps: Dataset) -> list[int]:
-    """A sweep of each of the first materials: the middle one of its own."""
+    """Numbers of example sweeps: the middle sweep of each of the first materials."""
     labels = np.unique(sweeps.labels)[:MOST_SHOWN]
     return [
         int(own[len(own) // 2])
@@ -191,14 +190,15 @@ def _examples(sweeps: Dataset) -> list[int]:
 
 
 def confusion(figures: Json) -> str:
-    """Which label the sweeps of each material get, those that get one: rows the truth."""
+    """The labels that the sweeps of each material get; rows are the true materials. Answers without
+    a label are left out."""
     names = figures["labels"]
     counts = [[figures["answers"].get(of, {}).get(named, 0) for named in names] for of in names]
     return confusion_plot.draw(np.array(counts), names, "materials by the labels that they get")
 
 
 def calibration(found: Json) -> str:
-    """Predicted probability against the share right; a larger dot is of more sweeps."""
+    """Share of right labels over the predicted probability; a larger dot stands for more sweeps."""
     figure, axes = single_axes(3.0, left=0.14, right=0.97, top=0.15, bottom=0.5)
     axes.plot([0, 1], [0, 1], color=FAINT, linewidth=1.2)
     said, right = [b["said"] for b in found["bins"]], [b["right"] for b in found["bins"]]
@@ -216,7 +216,7 @@ def calibration(found: Json) -> str:
 
 
 def curve(points: Sequence[Json]) -> str:
-    """Share right over the sweeps of each material that were trained on."""
+    """Share of right answers over the number of training sweeps of each material."""
     figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.15, bottom=0.5)
     each, share = [p["each"] for p in points], [p["share"] for p in points]
     axes.fill_between(

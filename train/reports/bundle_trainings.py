@@ -1,9 +1,8 @@
-"""What a report on a bundle needs trainings for: how accuracy grows with sweeps, and whether a
-material that was left out is noticed. In: the sweeps that the bundle was fitted to, those that it
-is tested on. Out: figures as JSON.
+"""Figures of a report on a bundle that need trainings: the learning curve, and whether a material
+that was left out of training is noticed.
 
-Trained is the method of the bundle by its usual settings; finished trainings are kept, as those of
-evaluate are.
+The trainings use the bundle's method with its usual settings. Finished trainings are kept, as those
+of `evaluate` are.
 """
 
 from __future__ import annotations
@@ -26,7 +25,8 @@ from train.models.recipe.fitted import Fit
 Json = dict[str, Any]
 Log = Callable[[str], None]
 SIZES = (5, 10, 20, 40, 80, 160, 320)
-"""Sweeps of each material at the points of a learning curve, below what there is."""
+"""Sweeps of each material at the points of a learning curve; points beyond the available sweeps are
+left out."""
 SPLIT = "split:set=0->1"
 """Trains on the first of two joined sets and tests on the second."""
 
@@ -39,9 +39,9 @@ def run(
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
 ) -> Json:
-    """`trained`: what was trained; `curve`: points of the learning curve; `left_out`: of each
-    material left out of training; `why_not`: why there is no such figure. made: of the bundle's
-    manifest. Raises FormatError where the sets do not fit."""
+    """`trained`: the trained method. `curve`: points of the learning curve. `left_out`: figures for
+    each material left out of training. `why_not`: the reason if there are no such figures. made:
+    from the bundle's manifest. Raises FormatError if the sets do not fit together."""
     method = made.get("method", SHIPPED if "chosen" in made else "")
     if not method:
         return {"why_not": "the bundle was fitted with settings of its own, which no method has"}
@@ -57,7 +57,7 @@ def run(
     figures["curve"] = curve(method, train, test, where, log, effort)
     if len(train.materials) > 2:
         try:
-            found = uncertainty.run(train, test, "", method, where, log, effort)["unknown"]
+            found = uncertainty.left_out(train, test, method, where, log, effort)
             figures["left_out"] = {"materials": found["materials"], "mean": found["mean"]}
         except FormatError as e:  # a method that knows no novelty
             figures["why_not"] = str(e)
@@ -65,7 +65,7 @@ def run(
 
 
 def whole(fit: Fit) -> Dataset:
-    """All sweeps of a fit, those that were held out behind those that were trained on."""
+    """All sweeps of a fit: the training sweeps, then the held-out ones."""
     parts = (fit.train, fit.held)
     groups = {
         name: np.concatenate([part.groups[name] for part in parts]) for name in fit.train.groups
@@ -80,7 +80,7 @@ def curve(
     method: str, train: Dataset, test: Dataset, where: Where, log: Log, effort: Effort
 ) -> list[Json]:
     """Accuracy on `test` after training on some sweeps of each material: `each`, `share`, `low`,
-    `high`, `n`; the last point is of all of `train`, and its `each` the mean."""
+    `high`, `n`. The last point is of all sweeps of `train`, and its `each` is the mean."""
     both = sets.join([train, test])
     counts = np.bincount(train.labels, minlength=len(train.materials))
     points = []
@@ -103,9 +103,9 @@ def curve(
 
 
 def aligned(test: Dataset, train: Dataset) -> Dataset:
-    """The sweeps of `test` whose material is one of `train`, with the materials in its order.
+    """The sweeps of `test` with a material of `train`, with the materials in the order of `train`.
 
-    Raises FormatError where their formats differ.
+    Raises FormatError if the formats differ.
     """
     if test.format != train.format:
         raise FormatError(

@@ -14,12 +14,13 @@ from train.reports.plot_style import ACCENT, BLACK, GREY, SMALL, single_axes, ti
 
 Array = NDArray[Any]
 STRONGEST = 0.6
-"""Of the accent colour behind a number: text stays readable on it, in light and in dark."""
+"""Strongest share of the accent colour behind a number: text stays readable on it, in light and in
+dark."""
 
 
 def draw(matrix: Array, names: Sequence[str], about: str, printed: Array | None = None) -> str:
-    """Counts or shares [K, K], rows the truth: each row in per cent, and below in small the values
-    printed."""
+    """Draw counts or shares [K, K] with the true materials as rows: each row in per cent, and the
+    printed values below in small type."""
     k = len(names)
     rows = np.asarray(matrix, float) / np.maximum(np.sum(matrix, 1, keepdims=True), 1e-9)
     figure, axes = single_axes(

@@ -1,5 +1,4 @@
-"""Numbers as pages, pictures and the terminal show them. In: shares, differences and times. Out:
-text."""
+"""Shares, differences and times as text for pages, pictures and the terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ def percent(share: float, places: int = 1) -> str:
 
 
 def exact_percent(share: float) -> str:
-    """A share as per cent with no more decimals than it has: 0.86 is "86 %", 0.923 is "92.3 %"."""
+    """A share as per cent without superfluous decimals: 0.86 is "86 %", 0.923 is "92.3 %"."""
     return f"{round(100 * share, 6):g} %"
 
 
@@ -31,7 +30,7 @@ def estimate(shares: Sequence[float], places: int = 1) -> str:
 
 
 def points(difference: float, sign: bool = False) -> str:
-    """A difference of shares in percentage points: "2.3", "−0.4"; sign: also a plus."""
+    """A difference of shares in percentage points: "2.3", "−0.4". sign: write a plus as well."""
     rounded = round(100 * difference, 1) + 0.0  # no −0
     return f"{rounded:{'+' if sign else ''}.1f}".replace("-", "−")
 
@@ -57,8 +56,8 @@ def seconds(value: float) -> str:
 
 
 def level(curve: Mapping[str, Any], severity: float) -> str:
-    """A severity for readers: "35 %", "3 % of full load", "1 taxel", "0.7 rows". A part of a taxel
-    counts as one."""
+    """A severity for readers: "35 %", "3 % of full load", "1 taxel", "0.7 rows". A fraction of a
+    taxel counts as a whole one."""
     unit = curve["unit"]
     if unit.startswith(("share", "of ")):
         return f"{100 * severity:.2g} % {unit.removeprefix('share')}".rstrip()

@@ -1,10 +1,9 @@
-"""Pages from templates. In: a template's name and its data. Out: one HTML file that needs nothing
-else.
+"""Renders templates as HTML pages, each a single file.
 
-No font and no address outside: a page opens from a folder without a network and reads on a phone.
-Whatever a template prints is escaped, but for pictures, which `picture` marks as SVG. A page of the
-project itself has a way back to its README (`home`), a `header` and, where its figures are of an
-older default, a first line that says so.
+A page loads no font and no other file, so that it opens from a folder without a network; it can be
+read on a phone. All values in a template are escaped, except pictures, which `picture` marks as
+SVG. A page of the project itself has a link to its README (`home`), a `header` and, if its figures
+are of an older default, a warning in the first line.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ FRAMES = (
         '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways"',
     ),
 )
-"""What every table has, whichever template wrote it: a screen reader knows what its head is of, and
-arrow keys scroll it."""
+"""Attributes of every table, in all templates: a screen reader announces the headings, and the
+arrow keys scroll the table."""
 PERCENT: dict[str, Callable[..., str]] = {
     "percent": formatting.percent,
     "exact_percent": formatting.exact_percent,
@@ -41,7 +40,7 @@ PERCENT: dict[str, Callable[..., str]] = {
     "estimate": formatting.estimate,
 }
 UNBROKEN = "\N{NO-BREAK SPACE}%"
-"""What keeps number and sign in one line of a page."""
+"""Keeps number and sign on one line of a page."""
 FILTERS: dict[str, Callable[..., str]] = {
     "points": formatting.points,
     "seconds": formatting.seconds,
@@ -53,7 +52,7 @@ FILTERS: dict[str, Callable[..., str]] = {
         " ".join(text.split())
     ),  # what is escaped stays so, and is not escaped twice
 }
-"""Of all templates; those of PERCENT keep number and sign in one line of a page."""
+"""Filters of all templates; those of PERCENT keep number and sign on one line of a page."""
 
 
 def render(
@@ -80,7 +79,7 @@ def render(
 
 
 def render_text(template: str, **data: Any) -> str:
-    """Plain text for a terminal, in which nothing is escaped."""
+    """Render plain text for a terminal, without escapes."""
     return _environment(TEMPLATES, False).get_template(template).render(**data)
 
 

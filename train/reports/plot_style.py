@@ -1,9 +1,8 @@
-"""The style that all pictures share. In: what was drawn with matplotlib. Out: SVG text, the same in
-every run.
+"""The style of all pictures: turns matplotlib figures into SVG text that is the same in every run.
 
-A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …) that a
-page sets for light and dark, and that a picture by itself sets, too: in Markdown it is as dark as
-its reader has chosen.
+A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …). A
+page sets them for light and dark. A picture outside of a page sets them itself: in Markdown it
+follows the reader's choice of light or dark.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, Formatter, NullForma
 
 ACCENT, BLACK, GREY, FAINT, WHITE = "#0b66c3", "#1f2328", "#59636e", "#d1d9e0", "#fefefe"
 ORANGE, GREEN, PURPLE = "#b04a00", "#007a5e", "#8b3fb8"
-"""Where pictures need more colours than one; each has a contrast of 5 and more on the
+"""Further colours for pictures with several; each has a contrast of at least 5 on the
 background."""
 ROLES = {
     "accent": ACCENT,
@@ -35,7 +34,7 @@ ROLES = {
     "purple": PURPLE,
 }
 COLOURS = {colour: f"var(--{role}, {colour})" for role, colour in ROLES.items()}
-"""What stands in an SVG for each of them."""
+"""The text in an SVG for each colour."""
 DARK_ROLES = {
     "accent": "#58a6ff",
     "text": "#e6edf3",
@@ -51,11 +50,11 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu 
 WIDTH = 5.0
 """Inches, of 72 units each."""
 MEDIUM, SMALL = 10.5, 9.0
-"""Sizes of text, in units."""
+"""Sizes of text in units."""
 PLACES = 2
 """Decimals of coordinates: a hundredth of a unit cannot be seen."""
 DIGITS = 6
-"""Significant digits of a tick label, where the tick needs so many."""
+"""Largest number of significant digits in a tick label."""
 
 
 def _variables(roles: Mapping[str, str]) -> str:
@@ -63,11 +62,14 @@ def _variables(roles: Mapping[str, str]) -> str:
 
 
 LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
-SCHEMES = f"<style>:root {{ {LIGHT} }} @media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}</style>"
-"""What makes a picture light or dark by itself. A page has the same rules: there it changes
-nothing."""
+SCHEMES = (
+    f"<style>:root {{ {LIGHT} }} "
+    f"@media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}</style>"
+)
+"""The rules that make a picture light or dark by itself. A page has the same rules, so that they
+change nothing there."""
 AXIS = "axis:"
-"""Begins the id of an axis with numbers while it is drawn; its title follows."""
+"""Prefix of the id of an axis with numbers while it is drawn; the axis title follows."""
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 NUMBERS = {"x", "y", "x1", "y1", "x2", "y2", "width", "height"}
 """Attributes that hold one coordinate."""
@@ -76,7 +78,7 @@ ElementTree.register_namespace("xlink", XLINK)
 
 
 class TickFormatter(Formatter):
-    """Labels that show each tick's value in full: as many decimals as it needs, up to DIGITS
+    """Labels that show the full value of each tick: with the necessary decimals, up to DIGITS
     significant digits.
 
     factor: a label is the tick's value times this. unit: follows the last label.
@@ -101,14 +103,15 @@ class TickFormatter(Formatter):
 def single_axes(
     height: float, left: float, right: float, top: float, bottom: float
 ) -> tuple[Figure, Axes]:
-    """A picture `height` inches high with one plot; left, right: its ends as shares; top, bottom:
-    inches around it."""
+    """A picture `height` inches high with one plot. left, right: its ends as shares. top, bottom:
+    margins in inches."""
     figure = Figure((WIDTH, height))
     return figure, add_axes(figure, left, right, 1 - top / height, bottom / height)
 
 
 def add_axes(figure: Figure, left: float, right: float, top: float, bottom: float) -> Axes:
-    """One more plot, its ends as shares of the picture; no frame, the grid behind all else."""
+    """Add a plot, with its ends as shares of the picture; without a frame and with the grid in the
+    background."""
     axes = figure.add_axes((left, bottom, right - left, top - bottom))
     axes.set_axisbelow(True)
     axes.patch.set_visible(False)
@@ -118,8 +121,8 @@ def add_axes(figure: Figure, left: float, right: float, top: float, bottom: floa
 
 
 def set_titles(axes: Axes, x: str = "", y: str = "") -> None:
-    """What an axis shows, with its unit: below the horizontal one, and level above the upper end of
-    the vertical one."""
+    """Write the titles of the axes, with units: below the horizontal axis, and horizontally above
+    the upper end of the vertical one."""
     axes.set_xlabel(x, color=GREY, size=SMALL)
     axes.set_ylabel(y, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
     axes.yaxis.set_label_coords(0, 1.02)
@@ -146,22 +149,22 @@ def set_ticks(
 ) -> None:
     """Ticks without strokes, labelled with their values times `factor`, the last one with the unit.
 
-    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside one
-    that has them.
+    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside a
+    labelled one.
     """
     unit, factor = ("%", 100.0) if percent else (unit, factor)
     _place_ticks(axis, ticks, NullFormatter() if bare else TickFormatter(factor, unit))
 
 
 def round_ticks(low: float, high: float, most: int) -> list[float]:
-    """Round values from `low` to `high`, at most `most` and one more."""
+    """Round values from `low` to `high`, at most `most` + 1 of them."""
     step = 10.0 ** np.floor(np.log10(max(high - low, 1e-6)))
     step *= next(k for k in (0.1, 0.2, 0.5, 1, 2, 5) if (high - low) / (k * step) <= most or k == 5)
     return list(np.arange(np.ceil(low / step), np.floor(high / step) + 1) * step)
 
 
 def set_categories(axis: Axis, at: Iterable[float], names: Sequence[str]) -> None:
-    """Ticks that stand for things with names, not for values."""
+    """Label ticks with names instead of values."""
     _place_ticks(axis, at, FixedFormatter(names))
 
 
@@ -181,11 +184,11 @@ def write(
     size: float = MEDIUM,
     **style: Any,
 ) -> None:
-    """Text at a point in the plot's units, also outside of it; centred there unless `style` says
-    otherwise.
+    """Write text at a point in the plot's units, also outside the plot; centred unless `style`
+    differs.
 
-    Of several lines the last one is there and the others stand above it, each a text of its own, so
-    that they stay in line in a reader's own font.
+    Of several lines, the last one stands at the point and the others above it. Each is a text of
+    its own, so that they keep their distance in a reader's own font.
     """
     given: dict[str, Any] = {
         "color": colour,
@@ -201,10 +204,10 @@ def write(
 
 
 def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
-    """The picture as SVG text. about: its title, for those who cannot see it. plain: with colours
-    in place of roles, for programs that know no style sheets.
+    """The picture as SVG text. about: its title, for readers who cannot see it. plain: use fixed
+    colours instead of roles, for programs that ignore style sheets.
 
-    Each axis with numbers has its title as the attribute data-axis, "" where it has none.
+    Each axis with numbers has its title as the attribute data-axis, "" if it has none.
     """
     figure.patch.set_facecolor(WHITE)
     for axes in figure.axes:
@@ -233,8 +236,8 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
 
 
 def _named(axis: Axis, shared: str) -> str | None:
-    """The id under which an axis with numbers is drawn: its title, or the one that all of the
-    picture share."""
+    """The id under which an axis with numbers is drawn: its title, or the title shared by the
+    picture."""
     if not isinstance(axis.get_major_formatter(), TickFormatter) or not len(
         axis.get_majorticklocs()
     ):
@@ -243,7 +246,7 @@ def _named(axis: Axis, shared: str) -> str | None:
 
 
 def _drop_empty_groups(parent: ElementTree.Element) -> None:
-    """Ticks without length leave groups that hold nothing."""
+    """Remove the empty groups of ticks without length."""
     for child in list(parent):
         _drop_empty_groups(child)
         if child.tag == f"{{{SVG}}}g" and not len(child):
@@ -251,8 +254,8 @@ def _drop_empty_groups(parent: ElementTree.Element) -> None:
 
 
 def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
-    """Colours as `colours` says, no font of matplotlib's, no names of groups, coordinates no finer
-    than can be seen."""
+    """Replace colours by `colours`; remove matplotlib's fonts and the names of groups; round
+    coordinates to a precision that can be seen."""
     attributes = element.attrib
     if element.tag == f"{{{SVG}}}g":
         name = attributes.pop("id", "")  # two pictures of a page would share them
@@ -277,7 +280,7 @@ def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
 
 
 def _short(number: str) -> str:
-    """A coordinate with at most PLACES decimals; what has a unit stays as it is."""
+    """A coordinate with at most PLACES decimals; numbers with a unit are unchanged."""
     try:
         text = f"{float(number):.{PLACES}f}".rstrip("0").rstrip(".")
     except ValueError:

@@ -1,9 +1,8 @@
-"""The header of pages, pictures and results: of which commit, bundle, sets, seeds and date they
-are.
+"""The header of pages, pictures and results with their commit, bundle, sets, seeds and date.
 
-In: figures, as a results.json holds them, whose parts name their origin (metrics.score.provenance).
-Out: a Provenance; it stands in HTML as JSON of a script, in SVG as metadata, in Markdown as a
-comment, and `read` finds it in each of them.
+`of` collects it from the figures of a results.json, whose parts name their origin
+(metrics.score.provenance). It is written into HTML as a script with JSON, into SVG as metadata and
+into Markdown as a comment; `read` reads it from each of them.
 """
 
 from __future__ import annotations
@@ -21,24 +20,25 @@ from train.models.methods import PACKAGED, SHIPPED
 
 NAME = "provenance"
 SETS, TEMPLATE = ("set", "sets", "test", "train"), "{"
-"""Keys that name sets; a name with TEMPLATE in it stands for several, which their results name."""
+"""Keys of the names of sets; a name with TEMPLATE stands for several sets, which their results
+name."""
 FOUND = {
     ".html": rf'<script type="application/json" id="{NAME}">(.*?)</script>',
     ".svg": rf'<metadata id="{NAME}">(.*?)</metadata>',
     ".md": rf"<!-- {NAME} (.*?) -->.*?<!-- /{NAME} -->",
 }
-"""Where the header stands, by the file's suffix."""
+"""Position of the header, by the file's suffix."""
 ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "--": "\\u002d\\u002d"}
-"""What no header holds as it is, so that the same text can stand in HTML, in SVG and in a
+"""Characters that a header escapes, so that the same text is valid in HTML, in SVG and in a
 comment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where figures are from. Several runs may be joined in them.
+    """The origin of figures, which may come from several runs.
 
-    bundle: ids of the bundles that were measured, or that were packaged when the default recipe was
-    run; empty where the figures do not say, or where the default is not among their methods. date:
+    bundle: ids of the bundles that were measured, or that were packaged when the default recipe
+    ran; empty if the figures do not state them, or if the default is not among their methods. date:
     of the last run, YYYY-MM-DD or "".
     """
 
@@ -50,7 +50,7 @@ class Provenance:
 
     @property
     def json(self) -> str:
-        """As a header, in one line."""
+        """The header, in one line."""
         text = json.dumps(asdict(self))
         for sign, code in ESCAPED.items():
             text = text.replace(sign, code)
@@ -58,21 +58,24 @@ class Provenance:
 
     @property
     def older(self) -> str:
-        """Why these figures are not of the default that is packaged now, as the first line of a
-        page; "" where they are."""
+        """A warning for the first line of a page if these figures are not of the packaged default;
+        otherwise ""."""
         now = score.shipped()
         others = [name for name in self.bundle if name != now]
         if others:
             part = "in part " if now in self.bundle else ""
-            return f"Made {part}with an older default, bundle {' and '.join(others)}; the box ships bundle {now} now."
+            return (
+                f"Made {part}with an older default, bundle {' and '.join(others)}; "
+                f"the box ships bundle {now} now."
+            )
         return (
             "" if self.bundle else f"Made without the default that the box ships now, bundle {now}."
         )
 
 
 def of(figures: Any) -> Provenance:
-    """What `figures` say of their origin, wherever they say it. Methods other than the default have
-    no bundle."""
+    """The origin that `figures` state anywhere in them. Methods other than the default have no
+    bundle."""
     found: dict[str, list[Any]] = {field.name: [] for field in fields(Provenance)}
     for part in _parts(figures):
         found["commit"] += _texts(part.get("commit"))
@@ -97,15 +100,15 @@ def of(figures: Any) -> Provenance:
 
 
 def in_svg(svg: str, about: Provenance) -> str:
-    """The picture with its header, in place of one that it may have."""
+    """The picture with its header, which replaces an earlier one."""
     return without(svg).replace(
         "</title>", f'</title><metadata id="{NAME}">{about.json}</metadata>', 1
     )
 
 
 def in_markdown(text: str, about: Provenance) -> str:
-    """The page with its header behind the title, and with a first line that says so where its
-    figures are older."""
+    """The page with its header below the title, and with a first line that warns if its figures are
+    older."""
     title, _, rest = without(text).partition("\n")
     first = f"\n> **{about.older}**\n" if about.older else ""
     return f"{title}\n\n<!-- {NAME} {about.json} -->{first}<!-- /{NAME} -->\n\n{rest.lstrip()}"
@@ -119,7 +122,7 @@ def without(text: str) -> str:
 
 
 def read(path: Path) -> Provenance:
-    """The header of a page, of a picture or of a file of results. Raises FormatError where it has
+    """The header of a page, of a picture or of a file of results. Raises FormatError if it has
     none."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -137,8 +140,8 @@ def read(path: Path) -> Provenance:
 
 
 def _parts(figures: Any) -> Iterator[dict[str, Any]]:
-    """All objects in what was read from JSON, the outer ones first; not how a bundle was made,
-    which is another run."""
+    """All objects in parsed JSON, the outer ones first; without the description of how a bundle was
+    made, which is another run."""
     if isinstance(figures, dict):
         yield figures
     values = (
@@ -149,13 +152,13 @@ def _parts(figures: Any) -> Iterator[dict[str, Any]]:
 
 
 def _bundle(value: Any) -> list[str]:
-    """The id of a bundle that was measured: itself, or with its name beside it."""
+    """The id of a measured bundle, given alone or beside its name."""
     return _texts(value.get("id") if isinstance(value, dict) else value)
 
 
 def _has_default(part: dict[str, Any]) -> bool:
-    """Whether the default recipe, or that of the packaged bundle, is among the methods of a part;
-    True where it names none."""
+    """Whether the default recipe, or the recipe of the packaged bundle, is among the methods of a
+    part; True if the part names no method."""
     methods = [name for key in ("method", "methods") for name in _list(part.get(key))]
     return not methods or SHIPPED in methods or PACKAGED in methods
 

@@ -1,4 +1,4 @@
-"""The two pictures of a choice of model. In: parts of choice.json. Out: SVG text."""
+"""The two pictures of a choice of model, drawn from choice.json as SVG text."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ TITLES = {
     "classes": "materials distinguished",
 }
 COLUMNS = (1.42, 1.75, 2.05)
-"""Right ends of the columns of numbers beside `sizes`, in widths of the plot."""
+"""Right ends of the columns of numbers beside `sizes`, as multiples of the plot's width."""
 
 
 def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> str:
-    """Accuracy with its interval of each model that was tried, cheapest on top; the chosen one in
-    the accent colour."""
+    """Accuracy with its interval of each tried model, the cheapest on top and the chosen one in the
+    accent colour."""
     tried = [entry for entry in entries if entry["accuracy"]]
     figure, axes = single_axes(len(tried) * 0.29 + 0.6, left=0.27, right=0.62, top=0.3, bottom=0.28)
     lows = [entry["accuracy"]["low"] for entry in tried]
@@ -70,7 +70,7 @@ def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> st
 
 
 def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
-    """One row: the interval with its mean, and name, accuracy, ms and kB as text."""
+    """Draw one row: the interval with its mean, and name, accuracy, ms and kB as text."""
     accuracy, colour = entry["accuracy"], ACCENT if chosen else GREY
     axes.plot(
         [accuracy["low"], accuracy["high"]], [y, y], color=colour, linewidth=2.2 if chosen else 1.4
@@ -92,10 +92,10 @@ def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
 
 
 def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
-    """A panel for each curve: accuracy over what is kept, from everything to little.
+    """A panel for each curve: accuracy over the share that is kept, from all to little.
 
-    A dot is filled where it loses no more than one standard error; the least that is enough is in
-    the accent colour.
+    A dot is filled if it loses at most one standard error; the smallest sufficient share has the
+    accent colour.
     """
     rows, above, each = -(-len(curves) // columns), 0.1, 1.35
     figure = Figure((WIDTH, above + rows * each))

@@ -1,7 +1,6 @@
-"""Why a model was chosen. In: choice.json as a dict. Out: the same sentences for a terminal and for
-a page.
+"""The reasons for a choice of model, as the same sentences for a terminal and for a page.
 
-Nothing is computed here but shares and points; every number is in choice.json.
+It computes only shares and points; every number is in choice.json.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ HEAD = ["model", "ms", "kB", "MB", "of the budget", "right", "behind the best, i
 
 
 def text(choice: Json) -> str:
-    """For the terminal."""
+    """The reasons for the terminal."""
     return html.render_text("selection.txt.j2", choice=choice, **_facts(choice)).rstrip()
 
 
@@ -44,7 +43,7 @@ def page(choice: Json) -> str:
 
 
 def _facts(choice: Json) -> dict[str, Any]:
-    """What the sentences need beside the choice itself."""
+    """Values for the sentences that choice.json does not state directly."""
     models, smaller = choice["rungs"], choice["smaller"]
     right = [
         model
@@ -76,7 +75,7 @@ def _facts(choice: Json) -> dict[str, Any]:
 
 
 def _row(model: Json, best: str) -> list[str]:
-    """One line of the table of models."""
+    """One row of the table of models."""
     costs = (
         ["–"] * 3
         if model["ms"] is None
@@ -95,8 +94,7 @@ def _row(model: Json, best: str) -> list[str]:
 
 
 def _curves(choice: Json) -> Iterator[dict[str, Any]]:
-    """What is enough of each thing: of the window, the rate …; whole: nothing may be left out of
-    it."""
+    """The smallest sufficient window, rate and so on; whole: nothing may be left out."""
     for curve in choice["less"]:
         tried = [point for point in curve["points"] if "accuracy" in point]
         kept = next(point for point in tried if point["name"] == curve["kept"])
@@ -115,7 +113,7 @@ def _curves(choice: Json) -> Iterator[dict[str, Any]]:
 
 
 def _merged(choice: Json) -> dict[str, Any] | None:
-    """Which materials might as well be one, and what that gives; None where there are none."""
+    """The materials that could be merged, and the gain; None if there are none."""
     curve = next((curve for curve in choice["less"] if curve["kind"] == "classes"), None)
     if curve is None or not curve["proposed"]:
         return None
@@ -127,7 +125,7 @@ def _merged(choice: Json) -> dict[str, Any] | None:
 
 
 def _caveats(choice: Json) -> Iterator[str]:
-    """What limits the worth of the figures."""
+    """Reasons to doubt the figures."""
     if not choice["varies"]:
         yield "nothing varies in this scene, so recordings were left out at random: that flatters"
     if choice["effort"] != 1:

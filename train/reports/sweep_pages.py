@@ -1,8 +1,8 @@
-"""A page to leaf through a set. In: the sweeps to show. Out: one HTML file, a picture of each, the
-arrow keys turn it.
+"""A page to leaf through a set: one HTML file with a picture of each sweep, turned with the arrow
+keys.
 
-A page is no larger than about MOST_BYTES, so that a browser opens it at once; of larger sets sweeps
-from all over it are shown.
+A page has at most about MOST_BYTES, so that a browser opens it at once. For a larger set it shows
+sweeps spread over the whole set.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from train.reports import html, sweep_plot
 from train.reports.sweep_plot import SweepSource
 
 MOST, MOST_BYTES = 100, 20_000_000
-"""Of a page: sweeps where none are named, and bytes of their pictures."""
+"""Largest number of sweeps on a page if none are named, and largest size of their pictures in
+bytes."""
 
 
 def chosen(found: SweepSource, numbers: range | None) -> list[int]:
-    """The numbers of the sweeps that a page shows: those named by `numbers`, else MOST at most from
-    all over the set.
+    """The numbers of the sweeps on a page: those in `numbers`, otherwise at most MOST, spread over
+    the set.
 
-    Raises FormatError where the set has no such sweeps, or where more are named than a page holds.
+    Raises FormatError if the set has no such sweeps, or if `numbers` are more than a page holds.
     """
     if not found.count:
         raise FormatError(

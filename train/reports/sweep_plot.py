@@ -1,9 +1,8 @@
-"""The picture of one sweep. In: a recording or a sweep of a set. Out: SVG text, twice as wide as a
-phone.
+"""The picture of one sweep, of a recording or of a set, as SVG text twice as wide as a phone.
 
-Each taxel over time where it lies on the skin, all on one scale of raw counts; below, spectrum and
-spectrogram of all. A skin of more than MOST rows or columns is one image, a line for each taxel,
-row after row. Several axes of a taxel share its plot.
+Each taxel is drawn over time at its place on the skin, all on one scale of raw counts. Below are
+the spectrum and the spectrogram of all taxels. A skin with more than MOST rows or columns is one
+image with a line for each taxel, row after row. Several axes of a taxel share its plot.
 """
 
 from __future__ import annotations
@@ -42,41 +41,41 @@ from train.reports.plot_style import (
 )
 
 WIDE, SKIN, SPECTRUM, SPECTROGRAM, HIGH = 2 * WIDTH, (0.95, 4.55), (5.6, 7.2), (8.1, 9.7), 10.25
-"""Inches: the picture's width, from where to where skin, spectrum and spectrogram are, and the
-height of all."""
+"""Inches: the width of the picture; start and end of skin, spectrum and spectrogram; total
+height."""
 LEFT, RIGHT = 0.08, 0.985
-"""Ends of what is drawn, as shares of the width."""
+"""Ends of the drawing, as shares of the width."""
 NUMBER = 0.14
-"""Inches: the height of a taxel's number."""
+"""Height in inches of a taxel's number."""
 MOST = 8
 """Rows and columns up to which each taxel has a plot of its own."""
 FINEST = 160
-"""Steps in time of one taxel's line: of each the least and the highest count is drawn, so that no
-peak is lost."""
+"""Steps in time of one taxel's line: the lowest and the highest count of each step are drawn, so
+that every peak is visible."""
 PIXELS = (640, 480)
-"""Of the image, at most: steps in time, and taxels; where there are more, means of neighbours."""
+"""Largest size of the image: steps in time, and taxels. Beyond it, neighbours are averaged."""
 LINE = 130
 """Characters that fit in a line."""
 VERDICT = ("status", "label", "probability", "detail")
-"""What is shown of a verdict."""
+"""Fields of a verdict that are shown."""
 LEAST = 8
 """Frames that a spectrum needs."""
 LEAST_PIECES, PIECE, RANGE_DB = 64, 128, 40
-"""Of a spectrogram: the frames that it needs, those of a piece at most, and the power that is shown
-below the largest."""
+"""For a spectrogram: the frames that it needs, the largest length of a piece, and the range of
+power in dB below the maximum."""
 LONGEST = 256
-"""Frames of a segment of the spectrum, or those of one second where they are more (Welch 1967)."""
+"""Frames of a segment of the spectrum; the frames of one second if they are more (Welch 1967)."""
 SHADES = LinearSegmentedColormap.from_list("shades", [to_rgba(ACCENT, 0.0), to_rgba(ACCENT)])
-"""From nothing to the accent, so that an image lies on a light page as on a dark one."""
+"""From transparent to the accent, so that an image fits a light and a dark page."""
 
 
 @dataclass(frozen=True)
 class ShownSweep:
     """One sweep with its title and notes.
 
-    taxels: raw counts [T, R, C] or [T, R, C, A]. time_s: float [T], since what `since` says. tare:
-    raw counts [R, C] or [R, C, A] of the skin at rest, where known. gaps: int [n], the frames after
-    which some are missing.
+    taxels: raw counts [T, R, C] or [T, R, C, A]. time_s: float [T], seconds from the event `since`.
+    tare: raw counts [R, C] or [R, C, A] of the skin at rest, if known. gaps: int [n], the frames
+    before missing ones.
     """
 
     taxels: Array
@@ -97,8 +96,8 @@ class ShownSweep:
 
 @dataclass(frozen=True)
 class SweepSource:
-    """Sweeps that can be shown one by one. name: as it was given; get: the sweep of a number, from
-    0 to `count` - 1."""
+    """Sweeps that can be shown one by one. name: as given by the user. get: returns the sweep of a
+    number from 0 to `count` - 1."""
 
     name: str
     count: int
@@ -106,7 +105,7 @@ class SweepSource:
 
 
 def source(what: str) -> SweepSource:
-    """The sweeps of a recording (.npy), a folder of recordings or a set. Raises FormatError where
+    """The sweeps of a recording (.npy), a folder of recordings or a set. Raises FormatError if
     there are none."""
     path = Path(what)
     if path.suffix == ".npy":
@@ -120,8 +119,8 @@ def source(what: str) -> SweepSource:
 
 
 def load(what: str, number: int | None = None) -> ShownSweep:
-    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError where there
-    is no such sweep."""
+    """The recording `what` (.npy), or a set's sweep of this number. Raises FormatError if there is
+    no such sweep."""
     found = source(what)
     if Path(what).suffix == ".npy":
         if number is not None:
@@ -136,7 +135,7 @@ def load(what: str, number: int | None = None) -> ShownSweep:
 
 
 def _recorded(one: RecordedSweep) -> ShownSweep:
-    """A recording with what its sidecar holds."""
+    """A recording with the content of its sidecar."""
     sweep, about = one.sweep, one.about
     if not len(sweep.frames):
         raise FormatError(
@@ -188,7 +187,7 @@ def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
 
 
 def _grid(path: Path, tare: Any, grid: tuple[int, ...]) -> Array:
-    """The tare as float [R, C] or [R, C, A]. Raises FormatError where the sidecar's has another
+    """The tare as float [R, C] or [R, C, A]. Raises FormatError if the sidecar's has another
     shape."""
     try:
         made = np.array(tare, float)
@@ -214,7 +213,7 @@ def _plain(value: Any) -> str:
 
 
 def draw(sweep: ShownSweep, plain: bool = True) -> str:
-    """The picture. plain: with colours of its own, not those of a page."""
+    """The picture. plain: with its own colours instead of those of a page."""
     figure = Figure((WIDE, HIGH))
     page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(HIGH, 0))
@@ -242,25 +241,30 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
         _spectrogram(
             add_axes(figure, LEFT, RIGHT, *_ends(SPECTROGRAM)), sweep, moving, sweep.time_s[first]
         )
-        text = f"Hz over {sweep.since}: the taxels' mean power; the stronger the colour the more, over {RANGE_DB} dB"
+        text = (
+            f"Hz over {sweep.since}: mean power of the taxels; "
+            f"stronger colour for more, over {RANGE_DB} dB"
+        )
     _caption(page, SPECTROGRAM[0] - 0.13, text)
     return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=plain)
 
 
 def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
-    """The parts [n, taxels] between which frames are missing, each with the number of its first
-    frame."""
+    """The parts [n, taxels] between missing frames, each with the number of its first frame."""
     starts = [0, *(int(frame) + 1 for frame in sweep.gaps)]
     return list(zip(starts, np.split(taxels, sweep.gaps + 1), strict=True))
 
 
 def _about_spectrum(format: SweepFormat, still: int) -> str:
-    """What the caption says of a spectrum; still: taxels that are not in it."""
+    """The caption of a spectrum. still: number of constant taxels, which are left out."""
     rounding = (
         "" if format.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
     )
-    left_out = f"; without {still} that stand still" if still else ""
-    return f"raw counts per √Hz over Hz: the taxels' mean power; light: their range{rounding}{left_out}"
+    left_out = f"; without {still} constant taxels" if still else ""
+    return (
+        "raw counts per √Hz over Hz: mean power of the taxels; light: their range"
+        f"{rounding}{left_out}"
+    )
 
 
 def _ends(inches: tuple[float, float]) -> tuple[float, float]:
@@ -269,7 +273,7 @@ def _ends(inches: tuple[float, float]) -> tuple[float, float]:
 
 
 def _caption(page: Axes, y: float, text: str) -> None:
-    """What a plot shows, at its left end; y: inches."""
+    """Write the caption of a plot at its left end. y: inches."""
     write(page, LEFT * WIDE, y, text, GREY, SMALL, ha="left", parse_math=False)
 
 
@@ -288,8 +292,8 @@ def _head(page: Axes, sweep: ShownSweep) -> None:
 
 
 def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
-    """A plot for each taxel where it lies on the skin; what the caption adds. taxels: float [T, R *
-    C * A]."""
+    """Plot each taxel at its place on the skin; returns an addition to the caption. taxels: float
+    [T, R * C * A]."""
     rows, columns = sweep.taxels.shape[1:3]
     lines = taxels.reshape(len(taxels), rows, columns, -1)
     tare = None if sweep.tare is None else sweep.tare.reshape(lines.shape[1:])
@@ -335,8 +339,8 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
 
 
 def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
-    """All taxels as lines of one image, darker where the counts are higher; what the caption
-    adds."""
+    """Draw all taxels as lines of one image, darker for higher counts; returns an addition to the
+    caption."""
     rows, columns = sweep.taxels.shape[1:3]
     each = f", of each its {sweep.format.axes} axes" if sweep.format.axes > 1 else ""
     times, lines = (_edges(n, most) for n, most in zip(taxels.shape, PIXELS, strict=True))
@@ -353,12 +357,15 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     axes.set_xlabel("s", color=GREY, size=SMALL, labelpad=1)
     first = np.arange(0, rows, -(-rows // 10))
     set_categories(axes.yaxis, first + 0.5, [f"row {row + 1}" for row in first])
-    return f", from light, {means.min():.4g}, to dark, {means.max():.4g}; in each row its {columns} taxels{each}"
+    return (
+        f", from light, {means.min():.4g}, to dark, {means.max():.4g}; "
+        f"in each row its {columns} taxels{each}"
+    )
 
 
 def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
-    """Mean power of all taxels and their range as amplitudes per root hertz, with the noise of
-    rounding. taxels: [T, n]."""
+    """Plot the mean power of all taxels and their range as amplitudes per root hertz, with the
+    noise of rounding. taxels: [T, n]."""
     hz, power = welch(
         taxels,
         format.rate_hz,
@@ -389,8 +396,8 @@ def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
 
 
 def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
-    """Mean power of all taxels [T, n] in decibels over time and frequency, on the time axis of the
-    signals."""
+    """Draw the mean power of all taxels [T, n] in decibels over time and frequency, on the time
+    axis of the signals."""
     rate = sweep.format.rate_hz
     piece = min(len(taxels) // 4, PIECE)
     hz, s, power = spectrogram(
@@ -418,7 +425,7 @@ def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -
 
 
 def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
-    """A line [n] of at most FINEST steps, of each the least and the highest count in the order of
+    """A line [n] of at most FINEST steps: the lowest and the highest count of each, in the order of
     time."""
     if len(counts) <= 2 * FINEST:
         return time_s, counts
@@ -432,7 +439,7 @@ def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
 
 
 def _edges(n: int, most: int) -> Array:
-    """Ends [k + 1] of the k parts, at most `most`, into which n things are divided."""
+    """Ends [k + 1] of the k parts, at most `most`, into which n items are divided."""
     return np.linspace(0, n, min(most, n) + 1).astype(int)
 
 

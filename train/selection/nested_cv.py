@@ -23,8 +23,8 @@ from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol
 from train.data.transforms import WHOLE, Change
 from train.evaluation import corruptions
-from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Where, folds
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import Fold, FoldTask
 from train.metrics.score import interval
 from train.models import methods

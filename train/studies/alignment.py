@@ -21,7 +21,7 @@ from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.signal.contact import centre
 from appliance.sim import skin
-from train.evaluation.corruptions import EvaluationSweeps
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.metrics.score import interval, provenance
 
 Array = NDArray[Any]

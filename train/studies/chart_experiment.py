@@ -19,8 +19,8 @@ from appliance.core.errors import BundleError, FormatError
 from train.data import sets
 from train.data.sets import Dataset
 from train.evaluation import evaluate, parallel, robustness
-from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Plan, Where
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import fingerprint
 from train.export import measure
 from train.metrics import score

@@ -16,11 +16,11 @@ from appliance.inference.novelty import ClassDistances
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.trunk import FORM, trunk
 from train.calibration import early_exit
-from train.evaluation import uncertainty
 from train.export.bundle_graph import bundle_graph
 from train.export.pack import means_file
 from train.models.recipe import calibrate
 from train.onnx_tools.graph_builder import run
+from train.studies import certainty
 
 
 def prefixes(n: int, places: int = 8, seed: int = 0, strength=None):
@@ -251,7 +251,7 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     z = done.embedding(x[:, -1])
     means = ClassDistances(new.classes, new.manifest.known, new.manifest.labels)
     want = means.logits(means.distances(z)) * done.class_mean_temperature
-    have = uncertainty.enrolled_logits(done.embedding, z, z[drawn])
+    have = certainty.enrolled_logits(done.embedding, z, z[drawn])
     assert np.allclose(
         have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02
     )

@@ -20,8 +20,8 @@ from appliance.core.types import Status, SweepFormat
 from appliance.sim import skin
 from train.data.sets import Dataset
 from train.evaluation import corruptions, robustness
-from train.evaluation.corruptions import EvaluationSweeps
 from train.evaluation.evaluate import Where
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.models import methods
 from train.models.methods import Method, model_inputs
 

@@ -19,7 +19,7 @@ from tests.factories.page_reader import PageReader
 from train.cli.main import main
 from train.data import sets
 from train.data.sets import Dataset
-from train.evaluation.corruptions import EvaluationSweeps
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_score
 from train.reports import bundle_experiment, bundle_report
 

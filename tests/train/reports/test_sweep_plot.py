@@ -88,7 +88,7 @@ def test_the_picture_says_what_is_known(small: str):
         "grey: the skin at rest",
         "raw counts over seconds after the start edge",
         "raw counts per √Hz over Hz",
-        "the noise of rounding to whole counts; without 1 that stand still",
+        "the noise of rounding to whole counts; without 1 constant taxels",
     ):
         assert text in shown, text
     assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(

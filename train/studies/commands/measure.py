@@ -19,12 +19,12 @@ from train.arguments import numbers, options
 from train.arguments.types import Add
 from train.data import sets
 from train.data.progress import Progress
-from train.evaluation import robustness, uncertainty
-from train.evaluation.corruptions import EvaluationSweeps
+from train.evaluation import robustness
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_stress
 from train.metrics import score
 from train.models import methods
-from train.studies import alignment, references, sim_calibration
+from train.studies import alignment, certainty, references, sim_calibration
 from train.studies.study import results_file, save
 
 STRESSED = "sim:T-REAL:101-104:1"
@@ -230,7 +230,7 @@ def _box_under_stress(
 def run_certainty(args: argparse.Namespace) -> None:
     """Write the results; print their path."""
     test = sets.load(args.test).select(args.only) if args.test else None
-    result = uncertainty.run(
+    result = certainty.run(
         options.load(args),
         test,
         args.protocol,
