@@ -260,7 +260,8 @@ def _about_spectrum(format: SweepFormat, still: int) -> str:
     rounding = (
         "" if format.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
     )
-    left_out = f"; without {still} constant taxels" if still else ""
+    taxels = "taxel" if still == 1 else "taxels"
+    left_out = f"; without {still} constant {taxels}" if still else ""
     return (
         "raw counts per √Hz over Hz: mean power of the taxels; light: their range"
         f"{rounding}{left_out}"

@@ -25,7 +25,8 @@ from train.models.recipe.stages import Fit
 
 @pytest.mark.slow
 def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """What was not trained on is written as a set, recordings kept; together it is everything."""
+    """fit writes the sweeps that it did not train on as a set. Recordings stay whole, and training,
+    held-out and written sweeps together are the whole set."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
     args = [
         "fit",
@@ -116,7 +117,7 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
 def test_an_error_of_the_project_is_one_line(
     args: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """The exit code of a FormatError and its message on the error stream."""
+    """A FormatError gives its exit code, and its message on the error stream."""
     assert (
         main(["fit", "--seed", "1", "--out", str(tmp_path / "fit.npz"), *args])
         == FormatError.exit_code
@@ -129,7 +130,8 @@ def test_an_error_of_the_project_is_one_line(
 
 @pytest.mark.slow
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
-    """`palpate-train evaluate --list | head -1`: exit code 1, and nothing on the error stream."""
+    """`palpate-train evaluate --list | head -1` gives exit code 1 and nothing on the error
+    stream."""
     command = [sys.executable, "-m", "train", "evaluate", "--list"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -197,7 +199,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
 def test_what_cannot_be_written_or_computed_is_refused_first(
     args: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ):
-    """Before a set is read: the sets named here do not even exist."""
+    """Wrong options are refused before a set is read: the sets named here do not exist."""
     assert main(args) != 0
     err = capsys.readouterr().err
     assert message in err
@@ -226,7 +228,7 @@ def test_an_interrupted_command_says_what_becomes_of_it(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    """Ctrl-C: exit code 130, one line; whether the next call begins anew."""
+    """Ctrl-C gives exit code 130 and one line, which says whether the next call begins anew."""
 
     def interrupt(*args: object, **more: object) -> None:
         raise KeyboardInterrupt
@@ -242,8 +244,8 @@ def test_an_interrupted_command_says_what_becomes_of_it(
 def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     default_bundle: Bundle, capsys: pytest.CaptureFixture[str], labels: int, told: bool
 ):
-    """Four lines have fifteen codes beside 0: with one label more the figures say how many lines
-    are needed."""
+    """Four GPIO lines have fifteen codes beside 0. With one more label, the figures state the
+    number of lines that are needed."""
     manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
     bundles._print(manifest, bundle.DEFAULT)
     line = (
@@ -253,20 +255,21 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
 
 
 def test_each_command_is_found_in_the_module_that_registers_it():
-    """So that one command needs the imports of one module; `palpate-train --help` has all."""
+    """One command needs the imports of one module; `palpate-train --help` shows all commands."""
     for group, names in PROGRAM.modules.items():
         assert registered_by(group) == sorted(names)
 
 
 def registered_by(group: str) -> list[str]:
-    """The commands that a module of train.cli adds."""
+    """The commands that a module of train.cli registers."""
     commands = argparse.ArgumentParser().add_subparsers()
     import_module(f"train.cli.{group}").register(lambda name, run: commands.add_parser(name))
     return sorted(commands.choices)
 
 
 def test_signing_does_without_the_imports_of_training():
-    """They take seconds, and a bundle is signed on a machine that may not even have them."""
+    """`sign` imports no training library: they take seconds, and the signing machine may lack
+    them."""
     code = "import sys; from train.cli.main import main; main(['sign', '--help'])"
     code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -277,7 +280,7 @@ def test_signing_does_without_the_imports_of_training():
 
 
 def few(tmp_path: Path) -> Path:
-    """A set in which one material has a single recording, one none, and one taxel never changes."""
+    """A set with a material of one recording, a material without any, and a constant taxel."""
     whole = easy(6)
     held = whole.take((whole.labels < 2) | (np.arange(len(whole)) == 12))
     held.samples[:, :, 0, 1] = 7
@@ -289,8 +292,8 @@ def few(tmp_path: Path) -> Path:
 def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], only: list[str]
 ):
-    """Materials without a sweep, which are left out, and taxels that never change; materials that
-    --only leaves out are meant."""
+    """Materials without sweeps, which are left out, and constant taxels cause a warning. Materials
+    that --only leaves out do not."""
     args = [
         "evaluate",
         "--set",
@@ -311,7 +314,8 @@ def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
 def test_a_material_of_one_recording_is_told_by_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """By fit, which has nothing to judge with; by export, which refuses such a fit; by evaluate."""
+    """Too few sweeps are named by fit, which has none to judge with; by export, which refuses such
+    a fit; and by evaluate."""
     args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
     why = "split by 'recording' leaves one sweep of 'high'; record more of it"
     fit = str(tmp_path / "fit.npz")
@@ -348,7 +352,7 @@ def test_a_material_of_one_recording_is_told_by_its_name(
 def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Not as "None: None"."""
+    """The message has a cause instead of "None: None"."""
 
     def fails(*args: object) -> None:
         raise OSError("the disk is on fire")

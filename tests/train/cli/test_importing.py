@@ -1,5 +1,4 @@
-"""palpate-train import, as a user calls it: the five commands of docs/how-to/import.md, its report,
-its exit codes."""
+"""palpate-train import as users call it: the commands of its page, its report, its exit codes."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ PAGE = (ROOT / "docs" / "how-to" / "import.md").read_text()
 
 
 def five() -> list[list[str]]:
-    """The commands of the page, as a shell splits them."""
+    """The commands of the page, split as a shell splits them."""
     (block,) = re.findall(r"<!-- five -->\n(.*?)<!-- /five -->", PAGE, re.S)
     return [shlex.split(line) for line in block.splitlines()]
 
@@ -33,8 +32,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ):
-    """As they stand there, on simulated sweeps written as CSV: the sweeps come back, most of the
-    rest is named, and no library says a word."""
+    """The commands of the page on simulated sweeps written as CSV: the sweeps come back, most of
+    the rest get the right label, and no library prints anything."""
     monkeypatch.chdir(tmp_path)
     folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
     assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
@@ -52,8 +51,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     assert [*caplog.messages, *re.findall(".*[Ww]arning.*|.*Gemm.*", err)] == []
     assert "they also helped to choose the model" in out
     assert (
-        "which no part of the fit has seen; after export: palpate-train score BUNDLE --set "
-        "build/rest.npz\n" in out
+        "which no part of the fit has seen; after export: "
+        "palpate-train score BUNDLE --set build/rest.npz\n" in out
     )
     assert (
         f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
@@ -67,7 +66,8 @@ def test_the_five_commands_of_the_page_make_a_bundle(
 def test_a_broken_file_is_told_and_the_others_are_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Its line, the set of the rest, a report with a line for each file, exit code 65."""
+    """A broken file gets a line; the other files make a set; the report has a line for each file;
+    the exit code is 65."""
     folder = csv_folder(tmp_path / "r", each=1, positions=1)
     (folder / "foam_p0_1.csv").write_text("time,s0\n0,1\n0,x\n")
     args = [
@@ -95,7 +95,7 @@ def test_a_broken_file_is_told_and_the_others_are_imported(
 
 
 def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Five lines of twelve, the rest in one; nothing is written but the report."""
+    """Five lines for twelve files, and one line for the others; only the report is written."""
     for k in range(12):
         write(tmp_path / "r" / f"wood_{k:02}.csv", np.zeros((9, 4)), 100.0)
     args = [
@@ -126,7 +126,7 @@ def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.Cap
 )
 @pytest.mark.slow
 def test_real_sweeps_come_back_from_csv(tmp_path: Path):
-    """FabricSlide, each window as a CSV file with its force and speed in the name: the same counts
+    """FabricSlide with each window as a CSV file, with force and speed in its name: the same counts
     and groups come back."""
     real = sets.load(str(Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"))
     real = real.take(np.arange(len(real)) % 20 == 0)
@@ -167,7 +167,7 @@ def test_real_sweeps_come_back_from_csv(tmp_path: Path):
 def test_a_folder_that_may_not_be_read_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """The cause, not that it is empty."""
+    """The message names the cause instead of an empty result."""
 
     def denied(self: Path) -> None:
         raise PermissionError(13, "Permission denied", str(self))

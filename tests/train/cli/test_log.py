@@ -1,5 +1,5 @@
-"""Progress as a person sees it: a bar on a terminal that leaves nothing behind, lines now and then
-in a log."""
+"""Progress on the error stream: a bar on a terminal, which is erased at the end, and occasional
+lines in a log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ sys.exit(3)
 
 
 def on_a_terminal(out_too: bool) -> tuple[str, str]:
-    """What the script shows on a terminal of 100 columns, and what it prints where its output goes
+    """The text that the script shows on a terminal of 100 columns, and its output if that goes
     elsewhere."""
     far, near = pty.openpty()
     done = subprocess.Popen(
@@ -54,8 +54,8 @@ def on_a_terminal(out_too: bool) -> tuple[str, str]:
 @pytest.mark.slow
 @pytest.mark.thorough  # trains on a terminal
 def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
-    """How much is done, the line as it was written, what is printed above; at the end the cursor is
-    back."""
+    """The bar shows the share that is done and the line as written; other output stands above it;
+    at the end the cursor is back."""
     shown, printed = on_a_terminal(out_too=False)
     for text in (
         "━",
@@ -73,7 +73,7 @@ def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
 def test_a_log_has_a_line_now_and_then(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    """Whole lines without escapes; none before its time, but for those that are kept."""
+    """A log gets whole lines without escapes, none too early except those that are kept."""
     log = options.Log()
     log(ProgressLine.of(1, 2, 3.0, "early"))
     log.keep("kept")

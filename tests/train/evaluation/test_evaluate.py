@@ -1,5 +1,5 @@
-"""The grid of methods, protocols, folds and seeds: what it counts, keeps, resumes, and the form
-that scripts rely on."""
+"""The grid of methods, protocols, folds and seeds: its counts, its cache, and its results for
+scripts."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ KEYS = {
 
 
 def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.Result]:
-    """All results of these methods."""
     given = {"protocols": ("leave:session",), **plan}
     return list(evaluate.evaluate(sweeps, Plan(names, **given), where))
 
@@ -60,7 +59,8 @@ def test_it_finds_what_distinguishes_materials():
 
 
 def test_it_finds_nothing_where_there_is_nothing():
-    """Labels drawn at random are guessed at about one in three: nothing leaks from the test."""
+    """Labels drawn at random are guessed at about one in three, so nothing leaks from the test
+    sweeps."""
     sweeps = tones(recordings=20, windows=1)
     labels = np.random.default_rng(2).permutation(sweeps.labels)
     shuffled = Dataset(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
@@ -70,7 +70,7 @@ def test_it_finds_nothing_where_there_is_nothing():
 
 @pytest.mark.slow
 def test_removed_means_are_gone():
-    """A material known by its offset alone is not known any more."""
+    """A material that differs only by its offset cannot be recognized without means."""
     hidden = tones(offset=40.0, noise=60.0)
     hidden = Dataset(
         (hidden.samples - hidden.samples % 40).astype(np.int16),
@@ -90,8 +90,8 @@ def test_removed_means_are_gone():
 
 @pytest.mark.slow
 def test_the_counts_are_those_of_the_logits():
-    """Windows by the largest logit, recordings by the product of their probabilities, the confusion
-    matrix of both."""
+    """Windows count by the largest logit, recordings by the product of their probabilities; the
+    confusion matrices agree with the counts."""
     sweeps = tones(noise=150.0)
     (result,) = every(sweeps, HERE, "L-knn")
     figures, labels = result.json(), sweeps.labels[result.test]
@@ -114,7 +114,7 @@ def test_the_counts_are_those_of_the_logits():
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
-    """Where it runs does not change what comes out."""
+    """The number of processes does not change the result."""
     one, two = (
         every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2)
     )
@@ -124,7 +124,7 @@ def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
 def test_an_interrupted_evaluation_continues_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Folds that are done are not trained again; the result is the same."""
+    """Finished folds are not trained again, and the result is the same."""
     where = Where(jobs=1, cache=tmp_path)
     calls: list[int] = []
     train = fold.run
@@ -154,7 +154,7 @@ def test_an_interrupted_evaluation_continues_where_it_was(
 
 
 def test_a_broken_cache_file_is_done_again(tmp_path: Path):
-    """Half a file counts as none."""
+    """A file that is cut in half is ignored."""
     where = Where(jobs=1, cache=tmp_path)
     (first,) = every(tones(), where, "L-gauss")
     path = min(tmp_path.glob("*.npz"))
@@ -166,7 +166,7 @@ def test_a_broken_cache_file_is_done_again(tmp_path: Path):
 def test_a_fold_is_kept_under_all_that_it_depends_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Data, method, effort, seed, split and code: another name for each of them."""
+    """Data, method, effort, seed, split and code each give the fold another name."""
     task = fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
     others = [
         fold.FoldTask("L-knn", methods.FULL_EFFORT, 1, task.train, task.test),
@@ -187,11 +187,11 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(
 
 
 def test_a_fold_depends_on_the_code_that_its_method_runs():
-    """What a method imports, directly or not, counts; what stands around it and other methods'
-    networks do not."""
+    """The code that a method imports counts, directly or indirectly; code around it and the
+    networks of other methods do not."""
 
     def reached(method: str) -> set[str]:
-        """Without the packages' names."""
+        """Names of modules without the packages."""
         return {
             name.split(".")[-1]
             for name in fold.reached((methods.module_of(method), "train.evaluation.fold"))
@@ -228,7 +228,8 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
 def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(
     method: str, used: set[str], unused: set[str], monkeypatch: pytest.MonkeyPatch
 ):
-    """An upgrade of each of them gives the fold another name; what it does not use may change."""
+    """An upgrade of each library that the method uses gives the fold another name; other libraries
+    may change."""
     task = fold.FoldTask(method, methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
     plain, real = fold.key(task, "data"), fold.version
     modules = (methods.module_of(method), "train.evaluation.fold")
@@ -251,7 +252,7 @@ def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(
     ],
 )
 def test_what_cannot_be_evaluated_is_named(names: list[str], protocol: str, why: str):
-    """Before anything is trained."""
+    """An unknown method or protocol is refused before any training."""
     with pytest.raises(FormatError, match=why):
         every(tones(), HERE, *names, protocols=(protocol,))
 
@@ -265,8 +266,8 @@ def command(*args: str, cache: Path) -> int:
 def test_the_command_writes_what_scripts_rely_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A list of results with the keys of the manual, one for each method and seed, in the order
-    asked for."""
+    """A list of results with the documented keys, one for each method and seed, in the requested
+    order."""
     tones(offset=9.0).save(tmp_path / "tones.npz")
     out = tmp_path / "deep" / "results.json"
     args = (
@@ -310,7 +311,7 @@ def test_the_command_writes_what_scripts_rely_on(
 
 
 def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
-    """Every sweep stands for itself."""
+    """Every sweep counts alone."""
     whole = tones(windows=1)
     Dataset(
         whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}
@@ -338,7 +339,7 @@ def test_a_method_that_cannot_work_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Windows too short for a spectrum over time: reported with the reason and an exit code, after
-    all else was done."""
+    all other results."""
     whole, out = tones(), tmp_path / "r.json"
     short = Dataset(
         whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short"
@@ -368,8 +369,8 @@ def test_a_method_that_cannot_work_does_not_stop_the_others(
 def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Too few frames for H at this rate: named once, above the final line; kept, so that --kept can
-    say it too."""
+    """Too few frames for H at this rate: named once, above the final line, and kept, so that --kept
+    names it too."""
     whole, out = tones(), tmp_path / "r.json"
     fast = Dataset(
         whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "fast"
@@ -407,8 +408,8 @@ def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
 def test_a_method_refused_in_one_fold_loses_no_other_result(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """It is named once for a protocol and seed, at once; its other protocols and the other methods
-    are complete."""
+    """A refusal is named once for a protocol and seed, at once; the other protocols and methods are
+    complete."""
     calls: list[int] = []
     (sound,) = methods.find(["L-gauss"])
 
@@ -440,36 +441,36 @@ def test_a_method_refused_in_one_fold_loses_no_other_result(
 
 @dataclass(frozen=True)
 class Spoilt:
-    """A model that fails after training, or gives what is no number."""
+    """A model that fails after training, or gives logits that are not numbers."""
 
     model: methods.Model
     how: str
 
     def logits(self, inputs: np.ndarray) -> np.ndarray:
-        """Nothing that can be used."""
+        """Fail, or give logits that cannot be used."""
         if self.how == "logits":
             raise FormatError("too few of something")
         return self.model.logits(inputs) * np.nan
 
     def graph(self) -> onnx.ModelProto:
-        """That of the sound model."""
+        """The graph of the sound model."""
         return self.model.graph()
 
 
 def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):
-    """One sweep at a time, its labels compared with those of all at once; pack names the
-    library."""
+    """One sweep is classified at a time, and its label is compared with the labels of all sweeps at
+    once; pack names the library."""
     (sound,) = methods.find(["L-gauss"])
     asked: list[int] = []
 
     class Alone:
-        """Has no graph."""
+        """A model without a graph."""
 
         def __init__(self, model: methods.Model) -> None:
             self.model = model
 
         def logits(self, inputs: np.ndarray) -> np.ndarray:
-            """Those of the sound model."""
+            """The logits of the sound model."""
             asked.append(len(inputs))
             return self.model.logits(inputs)
 
@@ -491,7 +492,7 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
 
 
 def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.MonkeyPatch):
-    """Of each material in each fold; what is tested stays."""
+    """Each fold trains on the given number of sweeps of each material; its test sweeps stay."""
     seen: list[np.ndarray] = []
     (sound,) = methods.find(["L-gauss"])
 
@@ -510,7 +511,7 @@ def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.M
 
 
 def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
-    """Two sets make one with a group `set`: T-REAL against T-HARD."""
+    """Two sets make one with a group `set`: T-REAL for training, T-HARD for the test."""
     out = tmp_path / "r.json"
     assert (
         command(
@@ -544,7 +545,7 @@ def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
 def test_bad_arguments_are_one_line(
     args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """With the value and what to try."""
+    """The message has the value and a remedy."""
     tones().save(tmp_path / "t.npz")
     good = {"--set": str(tmp_path / "t.npz"), "--protocol": "leave:session", "--method": "L-svm"}
     assert command(*sum((good | dict([args])).items(), ()), cache=tmp_path) == FormatError.exit_code
@@ -554,7 +555,7 @@ def test_bad_arguments_are_one_line(
 
 
 def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[str]):
-    """All that the manual promises, and one that needs an extra says so."""
+    """The documented methods are listed, and a method that needs an extra states it."""
     with pytest.raises(SystemExit, match="0"):
         main(["evaluate", "--list"])
     lines = capsys.readouterr().out.splitlines()

@@ -1,5 +1,5 @@
-"""Many tasks at once: on this machine, and on a real Dask cluster of two workers on loopback, one
-of which dies."""
+"""Parallel tasks on this machine, and on a real Dask cluster of two workers on loopback. Some tests
+kill a worker."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def add(task: int, data: np.ndarray) -> float:
 
 
 def threads(task: int) -> int:
-    """How many threads a linear algebra library may use."""
+    """The number of threads that a linear algebra library may use."""
     return max(entry["num_threads"] for entry in threadpoolctl.threadpool_info())
 
 
 def test_every_task_is_done_once_with_its_data():
-    """Two processes; each result comes with its task."""
+    """With two processes, each result comes with its task."""
     data = np.arange(50.0)
     done = dict(parallel.results(add, range(20), [data], jobs=2))
     assert done == {task: task + 1225.0 for task in range(20)}
@@ -49,8 +49,8 @@ def test_every_task_is_done_once_with_its_data():
 
 
 def test_a_process_that_is_replaced_is_not_spoken_of():
-    """joblib warns where it replaces one whose memory has grown; no task is lost by that, and other
-    warnings are shown."""
+    """joblib warns when it replaces a process whose memory has grown. No task is lost by that, so
+    the warning is hidden; other warnings are shown."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
         assert len(list(parallel.results(add, range(3), [np.arange(3.0)], jobs=1))) == 3
@@ -64,20 +64,20 @@ def test_a_process_that_is_replaced_is_not_spoken_of():
 
 
 def test_each_task_has_one_thread():
-    """Linear algebra does not compete for cores, in this process and in others."""
+    """Linear algebra has one thread, in this process and in others."""
     for jobs in (1, 2):
         assert {n for _, n in parallel.results(threads, [0], [], jobs=jobs)} == {1}
 
 
 def test_an_error_in_a_task_is_the_callers():
-    """It is raised here, not swallowed there."""
+    """The error of a task is raised here."""
     with pytest.raises(IndexError):
         list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """A scheduler and two workers without nannies: who dies stays dead."""
+    """A scheduler and two workers without nannies, so that a dead worker stays dead."""
     command, env = (
         (sys.executable, "-m", "dask"),
         os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
@@ -117,7 +117,8 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
 
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_cluster_gives_the_same_bits(cluster):
-    """An evaluation there and here: equal logits, of features with an SVM and of a network."""
+    """An evaluation here and on the cluster gives equal logits, for features with an SVM and for a
+    network."""
     plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
     there, here = (
         {result.method: result for result in evaluate.evaluate(tones(), plan, where)}
@@ -129,8 +130,7 @@ def test_a_cluster_gives_the_same_bits(cluster):
 
 
 def noted(task: int, folder: str, data: np.ndarray) -> float:
-    """A task that leaves a note for each time it was done; the first to do task 7 is killed in the
-    middle of it."""
+    """A task that leaves a note for each run. The first run of task 7 kills its worker."""
     if task == 7:
         with contextlib.suppress(FileExistsError):
             Path(folder, "killed").touch(exist_ok=False)
@@ -142,7 +142,8 @@ def noted(task: int, folder: str, data: np.ndarray) -> float:
 
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
-    """Twenty tasks, one worker killed: all are done, none but the killed one's was begun twice."""
+    """One of two workers is killed during twenty tasks: all tasks are done, and only the killed
+    task runs twice."""
     address, workers = cluster
     data = np.arange(20.0)
     done = dict(parallel.results(noted, range(20), [str(tmp_path), data], scheduler=address))
@@ -155,7 +156,7 @@ def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Pa
 
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_an_error_on_a_worker_is_the_callers(cluster):
-    """It is raised here too."""
+    """The error of a task on the cluster is raised here."""
     with pytest.raises(IndexError):
         list(parallel.results(add, [99], [np.arange(3.0)], scheduler=cluster[0]))
 
@@ -164,7 +165,7 @@ def test_an_error_on_a_worker_is_the_callers(cluster):
 def test_a_cluster_without_the_project_is_named(
     cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """What is to be run is not installed there."""
+    """Workers without this version of the project are reported."""
     (tmp_path / "only_here.py").write_text("def call(task):\n    return task\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(FormatError, match="lacks this version of palpate-train"):
@@ -176,7 +177,7 @@ def test_a_cluster_without_the_project_is_named(
 
 
 def always_dies(task: int) -> None:
-    """A task that takes its worker along."""
+    """A task that kills its worker."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -184,15 +185,15 @@ def always_dies(task: int) -> None:
 def test_a_task_that_kills_every_worker_ends_with_a_reason(
     cluster, monkeypatch: pytest.MonkeyPatch
 ):
-    """Nothing hangs when no worker is left."""
+    """The call ends if no worker is left."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match=r"died too often|has no worker"):
         list(parallel.results(always_dies, [1], [], scheduler=cluster[0]))
 
 
 def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
-    """No scheduler at that address: reported within its deadline, with the command that starts
-    one."""
+    """Without a scheduler at that address, the command that starts one is named within the
+    deadline."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(
         FormatError, match=r"no scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"
@@ -201,7 +202,7 @@ def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch
 
 
 def test_without_dask_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
-    """The extra is named."""
+    """The message names the extra to install."""
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(FormatError, match=r"palpate-train\[dask\]"):
         list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))

@@ -1,5 +1,5 @@
-"""Robustness: each corruption does what it says and nothing else, and right answers are counted
-correctly."""
+"""Robustness: each corruption changes only the described property, and right answers are
+counted correctly."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DIGITAL = [s.name for s in corruptions.CORRUPTIONS if s.only != "simulated"]
 def small(
     kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3), rate_hz: float = 100.0
 ) -> Dataset:
-    """Sweeps of two materials: the second is stronger and rougher."""
+    """Sweeps of two materials; the second is stronger and rougher."""
     labels = np.arange(shape[0]) % 2
     each = labels.reshape(-1, *(1,) * (len(shape) - 1))
     rough = np.random.default_rng(7).standard_normal(shape) * (3 + 3 * each)
@@ -42,13 +42,14 @@ def small(
 
 @cache
 def scene() -> EvaluationSweeps:
-    """A small simulated one: two worlds, one place each, two sweeps of each material there."""
+    """A small simulated scene: two worlds with one placement each and two sweeps of each
+    material."""
     return EvaluationSweeps.simulated("sim:T-LAB:1001-1002:2")
 
 
 @dataclass
 class NearestMean:
-    """Answers with the material whose mean of two simple figures is nearest."""
+    """Answers with the material with the nearest mean of two simple figures."""
 
     means: np.ndarray
 
@@ -57,7 +58,7 @@ class NearestMean:
         return -(((_figures(given)[:, None] - self.means) ** 2).sum(axis=2)).astype(np.float32)
 
     def graph(self) -> onnx.ModelProto:
-        """Corrupted sweeps go to the model itself; no graph is needed."""
+        """Raises an error: corrupted sweeps go to the model itself, and no graph is needed."""
         raise AssertionError("the corruption asked for a graph")
 
 
@@ -67,7 +68,7 @@ def _figures(given: np.ndarray) -> np.ndarray:
 
 
 def learn(sweeps: Dataset, given: np.ndarray, seed: int) -> NearestMean:
-    """Train the fake; refuses sweeps that are too short, as real methods do."""
+    """Train the fake, which refuses sweeps that are too short, as real methods do."""
     if given.shape[1] < 20:
         raise FormatError(f"a window of {given.shape[1]} frames is too short; use at least 20")
     seen = _figures(given) + seed
@@ -90,8 +91,8 @@ FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
 )
 @pytest.mark.parametrize("name", DIGITAL)
 def test_counts_stay_counts(name: str, sweeps: Dataset):
-    """For any grid, rate and type: severity 0 changes no bit, the severest gives another sweep of
-    the same form, repeatably."""
+    """For any grid, rate and type, severity 0 changes no bit, and the severest gives a different
+    sweep of the same format, repeatably."""
     entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
     assert entry.apply(trial, 0, 3) is sweeps.samples
@@ -105,8 +106,7 @@ def test_counts_stay_counts(name: str, sweeps: Dataset):
 
 @pytest.mark.parametrize("name", [n for n in BY_NAME if BY_NAME[n].only == "simulated"])
 def test_the_scene_is_drawn_anew(name: str):
-    """Each physical corruption changes simulated sweeps, and is refused by name where there is no
-    scene to draw."""
+    """Each physical corruption changes simulated sweeps, and is refused by name without a scene."""
     entry = BY_NAME[name]
     assert entry.apply(scene(), 0, 0) is scene().sweeps.samples
     severe = entry.apply(scene(), entry.severities[-1], 0)
@@ -138,7 +138,7 @@ def test_the_scene_is_drawn_anew(name: str):
     ],
 )
 def test_a_corruption_only_grows(name: str):
-    """The more severe, the further from the sound sweep."""
+    """A higher severity is further from the sound sweep."""
     trial = EvaluationSweeps(small("float32"))
     away = [
         np.abs(BY_NAME[name].apply(trial, s, 1) - trial.sweeps.samples).mean()
@@ -155,8 +155,8 @@ def test_no_severity_beyond_the_scale(severity: float):
 
 
 def test_corruptions_by_name():
-    """Found by name, unknown ones are refused; simulated sweeps are drawn anew, the raw counts of a
-    file are changed."""
+    """Corruptions are found by name, and unknown names are refused. Simulated sweeps are drawn
+    again; the raw counts of a file are changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
         corruptions.find(["cold"])
@@ -169,8 +169,8 @@ def test_corruptions_by_name():
 
 
 def test_the_scene_is_what_the_simulator_draws():
-    """The sound sweeps; one row of shift and 20 degrees of turn are skin.sweep's own, from the same
-    random stream."""
+    """The sound sweeps, a shift by one row and a turn by 20 degrees are those of skin.sweep with
+    the same random stream."""
     trial, form = scene(), skin.FORMAT
     assert (trial.scene.draw() == trial.sweeps.samples).all()
     assert sorted(np.bincount(trial.sweeps.labels)) == [4] * 6
@@ -204,15 +204,15 @@ def test_a_window_error_reaches_into_the_rest():
 
 
 def test_force_is_the_worlds():
-    """Half the force presses about half as much."""
+    """With half the force, the finger presses about half as much."""
     levels = [BY_NAME[name].apply(scene(), 0.5, 0).mean() for name in ("force-down", "force-up")]
     sound = scene().sweeps.samples.mean()
     assert levels[0] < 0.7 * sound < 1.2 * sound < levels[1]
 
 
 def test_speed_is_the_fingers():
-    """Half as fast, the relief passes at half its frequencies; what friction shakes keeps its
-    own."""
+    """At half the speed, the relief passes at half its frequencies; vibrations of friction keep
+    their frequencies."""
     still = replace(skin.WORLD, off=frozenset({"vibration", "drift", "noise", "spot"}))
     shaken = replace(skin.WORLD, off=frozenset({"texture", "drift", "noise", "spot"}))
 
@@ -235,8 +235,8 @@ def test_speed_is_the_fingers():
 
 
 def test_dead_stuck_and_noisy_taxels():
-    """As many taxels as the severity says, the others unchanged; those dead at 1 are dead at 3
-    too."""
+    """The severity is the number of bad taxels, and the others are unchanged. Taxels that are dead
+    at 1 are also dead at 3."""
     trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
@@ -251,7 +251,7 @@ def test_dead_stuck_and_noisy_taxels():
 
 
 def test_a_taxel_is_dead_on_all_its_axes():
-    """As many taxels as the severity says, each on every axis."""
+    """The severity is the number of dead taxels, each dead on every axis."""
     trial = EvaluationSweeps(small(shape=(12, 120, 3, 3, 3)))
     changed = (BY_NAME["dead"].apply(trial, 3, 5) != trial.sweeps.samples).any(axis=1)
     assert (changed.any(axis=3).sum(axis=(1, 2)) == 3).all()
@@ -259,8 +259,8 @@ def test_a_taxel_is_dead_on_all_its_axes():
 
 
 def test_shear_turns_with_the_skin():
-    """A quarter turn: the grid as that of one axis, and shear along the rows becomes shear across;
-    the normal axis stays."""
+    """After a quarter turn, the grid is as with one axis, shear along the rows becomes shear
+    across, and the normal axis stays."""
     flat = np.random.default_rng(0).uniform(10, 90, (2, 5, 3, 3)).astype(np.float32)
     along, normal = np.arange(90, dtype=np.float32).reshape(flat.shape), flat
     x = np.stack([along, 0 * along, normal], axis=-1)
@@ -273,7 +273,8 @@ def test_shear_turns_with_the_skin():
 
 @pytest.mark.slow
 def test_a_scene_with_shear_is_drawn_anew():
-    """Its own skin stays: format, sweeps without a corruption, and one with half the force."""
+    """A scene with shear keeps its skin: the format, the sweeps without a corruption, and those
+    with half the force."""
     trial = EvaluationSweeps.simulated("sim:T-LABx3:1001:1")
     assert str(trial.sweeps.format) == "4x4x3 int16 at 750 Hz, window 1500"
     drawn = BY_NAME["force-down"].apply(trial, 0.5, 0)
@@ -284,8 +285,8 @@ def test_a_scene_with_shear_is_drawn_anew():
 
 
 def test_lost_frames_lie_on_the_line():
-    """About a fifth is lost, never more than two in a row, and each is on the line between those
-    that came."""
+    """About a fifth of the frames is lost, never more than two in a row, and each is interpolated
+    between its neighbours."""
     trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
     got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
     lost = (got != was).all(axis=(2, 3))
@@ -301,7 +302,7 @@ def test_lost_frames_lie_on_the_line():
     ("name", "share", "hz"), [("stretch", 0.5, 5), ("shorten", 0.5, 15), ("shorten", 0.2, 12)]
 )
 def test_stretching_moves_frequencies(name: str, share: float, hz: float):
-    """A tone of 10 Hz becomes one of 5, 15 or 12 Hz, as strong as before."""
+    """A tone of 10 Hz becomes a tone of 5, 15 or 12 Hz of the same amplitude."""
     tone = np.sin(2 * np.pi * 10 * np.arange(400) / 100).astype(np.float32).reshape(1, 400, 1, 1)
     sweeps = Dataset(np.repeat(tone, 2, axis=0), np.arange(2), ("a", "b"), 100.0)
     got = BY_NAME[name].apply(EvaluationSweeps(sweeps), share, 0)[0, :, 0, 0]
@@ -310,7 +311,7 @@ def test_stretching_moves_frequencies(name: str, share: float, hz: float):
 
 
 def test_gains_drift_steps_and_clipping():
-    """Gains, drift, steps and clipping, each by its own formula."""
+    """Gains, drift, steps and clipping each follow their formula."""
     trial = EvaluationSweeps(small("float32"))
     was = trial.sweeps.samples
 
@@ -330,7 +331,7 @@ def test_gains_drift_steps_and_clipping():
 
 
 def test_hum_and_noise_have_their_strength():
-    """50 Hz on all taxels alike; white noise as a share of each taxel's own deviation."""
+    """50 Hz is alike on all taxels; white noise is a share of each taxel's own deviation."""
     sweeps = small("float32", (4, 600, 2, 2), 300.0)
     sweeps.samples[:, :, 0, 0] *= 4
     trial = EvaluationSweeps(sweeps)
@@ -343,7 +344,7 @@ def test_hum_and_noise_have_their_strength():
 
 
 def test_counts_are_digitized_again():
-    """uint8 ends at 255 and int16 stays whole: more gain saturates, it does not wrap."""
+    """uint8 ends at 255 and int16 stays whole: a higher gain saturates without overflow."""
     sweeps = small("uint8")
     sweeps.samples[:, :, 1, 1] = 200
     up = BY_NAME["gain-up"].apply(EvaluationSweeps(sweeps), 0.5, 0)
@@ -355,8 +356,8 @@ def test_counts_are_digitized_again():
 
 
 def test_the_grid_is_read_elsewhere():
-    """One row on: each row reads its neighbour, the last the one before it, but for gains that
-    training never saw."""
+    """With a shift by one row, each row has the values of its neighbour, and the last row mirrors;
+    the gains are new ones."""
     trial = EvaluationSweeps(small("float32", (3, 50, 4, 2)))
     was = trial.sweeps.samples
     ratio = BY_NAME["shift-grid"].apply(trial, 1, 0) / was[:, :, [1, 2, 3, 2]]
@@ -373,7 +374,7 @@ def test_the_grid_is_read_elsewhere():
 
 
 def test_fewer_sweeps_as_many_of_each():
-    """Of a file about `most` are taken, evenly over the materials; what is not more is taken
+    """About `most` sweeps of a file are used, evenly over the materials; a smaller file is used
     whole."""
     sweeps = small("uint8", (40, 20, 1, 1))
     assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
@@ -390,14 +391,14 @@ def test_fewer_sweeps_as_many_of_each():
 
 @pytest.mark.parametrize("spec", ["sim:T-NONE", "sim:T-LAB:3-2"])
 def test_an_unknown_scene_is_refused(spec: str):
-    """As sets.load refuses it."""
+    """An unknown scene is refused as by sets.load."""
     with pytest.raises(FormatError, match="set 'sim:T"):
         EvaluationSweeps.simulated(spec)
 
 
 def test_the_fall_is_between_two_severities():
-    """On the line between them; exactly five points are enough; None where it never falls that
-    far."""
+    """The fall is interpolated between two severities; exactly five points are enough; without a
+    fall it is None."""
 
     def at(*accuracy: float) -> float | None:
         return robustness.falls({"severities": [0.0, 1.0, 2.0, 4.0], "accuracy": list(accuracy)})
@@ -409,7 +410,7 @@ def test_the_fall_is_between_two_severities():
 
 
 def task(method: str, seed: int, right: list[int], **more) -> dict:
-    """What `evaluate_method` returns, by hand: 20 sweeps under one corruption."""
+    """A result of `evaluate_method` written by hand: 20 sweeps under one corruption."""
     ends = {"low": [n / 20 - 0.1 for n in right], "high": [n / 20 + 0.05 for n in right]}
     curve = {
         "title": "dead taxels",
@@ -432,7 +433,7 @@ def task(method: str, seed: int, right: list[int], **more) -> dict:
 
 
 def test_merged_by_hand():
-    """Sums, band, fall and loss of two seeds; the order in which they ended does not matter."""
+    """Sums, band, fall and loss of two seeds, in any order of completion."""
     tasks = [
         task("a", 0, [18, 16, 10]),
         task("a", 1, [20, 18, 2], ran="less"),
@@ -451,8 +452,8 @@ def test_merged_by_hand():
 
 
 def test_what_breaks_first_comes_first():
-    """By the part of its range that it takes; of two alike what loses more; what never falls is
-    left out."""
+    """Corruptions are ordered by the share of the range that they take, then by the loss. Those
+    without a fall are left out."""
     found = {
         name: {"lost": lost, "falls": fall, "severities": [0, most]}
         for name, lost, fall, most in (
@@ -466,7 +467,8 @@ def test_what_breaks_first_comes_first():
 
 
 def test_intervals_are_by_attachment():
-    """Sweeps of one attachment fail together: the interval is wider than of as many that do not."""
+    """Sweeps of one attachment fail together, so the interval is wider than with independent
+    sweeps."""
     by_place = replace(small(), groups={"position": np.repeat([0, 1, 2], 4)})
     right = np.repeat([True, True, False], 4)
     widths = []
@@ -478,7 +480,7 @@ def test_intervals_are_by_attachment():
 
 
 def test_one_task_travels_and_counts():
-    """A task can be sent away and comes back as JSON; its numbers are those counted by hand."""
+    """A task and its result survive a conversion to JSON; the numbers are those counted by hand."""
     sweeps, trial = small(), EvaluationSweeps(small())
     sent = pickle.loads(pickle.dumps((FAKE, sweeps, trial, corruptions.CORRUPTIONS, 0)))
     done = robustness.evaluate_method(*sent[:3], corruptions.find(["gain-up", "hum"]), 0)
@@ -490,8 +492,7 @@ def test_one_task_travels_and_counts():
 
 
 def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each method and seed is a task of its own; what is done is not done again; unknown names are
-    refused."""
+    """Each method and seed is one task; kept tasks do not run again; unknown names are refused."""
     sweeps, trial = small(), EvaluationSweeps(small())
     monkeypatch.setattr(
         methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names]
@@ -535,7 +536,8 @@ def test_all_applicable_corruptions_by_default():
 
 
 def test_what_cannot_be_done_is_said():
-    """A set of another kind is the caller's mistake; a method that refuses its set is a result."""
+    """A set of another kind is an error of the caller; a method that refuses its set is a
+    result."""
     with pytest.raises(
         FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"
     ):
@@ -549,7 +551,7 @@ def test_what_cannot_be_done_is_said():
 
 
 def test_an_answer_that_is_not_finite_is_wrong():
-    """It is counted as wrong and as broken, also where the label would have been right."""
+    """Such an answer counts as wrong and as broken, also if the label would have been right."""
 
     class NanModel(NearestMean):
         def logits(self, given: np.ndarray) -> np.ndarray:
@@ -570,8 +572,8 @@ def test_an_answer_that_is_not_finite_is_wrong():
 
 
 def test_each_answer_to_an_uninformative_sweep_has_a_name():
-    """Sound methods stay finite or refuse; a value that is not finite never reaches them; a crash
-    is reported, and the worst answer counts."""
+    """Sound methods stay finite or refuse; values that are not finite never reach them; a crash is
+    reported, and the worst answer counts."""
     model = learn(small(), small().samples, 0)
     found = robustness.uninformative_answers(FAKE, model, EvaluationSweeps(small("float32")))
     assert [found[k] for k in ("silent", "constant", "saturated")] == ["finite"] * 3
@@ -601,8 +603,8 @@ def test_each_answer_to_an_uninformative_sweep_has_a_name():
 
 
 def test_the_box_answers_with_a_status(default_bundle: bundle.Bundle):
-    """Through sweep cutter and classifier: an uninformative sweep is refused by name, and a sound
-    one is not."""
+    """The sweep cutter and the classifier refuse a sweep without information by name, and accept a
+    sound one."""
     assert robustness.box_answers(default_bundle) == {
         "silent": "no-contact",
         "constant": "stuck-taxel",
@@ -615,8 +617,8 @@ def test_the_box_answers_with_a_status(default_bundle: bundle.Bundle):
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_a_nan_from_a_float_skin_is_never_an_answer():
-    """A board that sends one NaN: its taxel is dead; a bundle whose input is float32 would take
-    it."""
+    """If a board sends one NaN, its taxel is dead, although a bundle with float32 input would
+    accept it."""
     form = SweepFormat(3, 3, 100.0, 40, "float32")
     nodes = [
         helper.make_node("ReduceMean", ["sweep"], ["mean"], axes=[1, 2, 3], keepdims=0),

@@ -28,21 +28,21 @@ NOTHING = lambda line: None  # noqa: E731
 
 @pytest.fixture(scope="module")
 def sweeps() -> Dataset:
-    """A few sweeps of each material that the packaged bundle has never seen."""
+    """A few sweeps of each material that the packaged bundle was not trained on."""
     return sets.load("sim:T-REAL:1021:1", 1).select(["position<=3"])
 
 
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
-    """Of the packaged bundle."""
+    """The figures of the packaged bundle."""
     return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {
         "command": "palpate-train report"
     }
 
 
 def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
-    """Materials add up to what the box's classifier answers, and precision counts the sweeps of
-    others."""
+    """The counts by material add up to the answers of the box's classifier, and precision includes
+    the sweeps of other materials."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     assert figures["named_rightly"]["right"] == found.right.sum()
     assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
@@ -56,7 +56,7 @@ def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_
 def test_a_material_that_others_are_taken_for_loses_precision(
     figures: dict, sweeps: Dataset, default_bundle: Bundle
 ):
-    """Three sweeps of wood as metal, one refused: each stands where it belongs."""
+    """Three sweeps of wood as metal and one refused: each is counted in the right place."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     answered = {
         "wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 1, "(dead-taxel)": 2}),
@@ -83,8 +83,8 @@ def test_a_material_that_others_are_taken_for_loses_precision(
 
 
 def test_what_breaks_it_first_stands_on_top(figures: dict):
-    """The share of its range at which five points are lost rises; clean sweeps are the first of
-    each."""
+    """The corruptions are ordered by the share of the range at which five points are lost; each
+    begins with clean sweeps."""
     rows = figures["corruptions"]
     reach = [
         np.inf if row["falls"] is None else row["falls"] / row["severities"][-1] for row in rows
@@ -100,8 +100,8 @@ def test_what_breaks_it_first_stands_on_top(figures: dict):
 
 
 def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
-    """Headline, a row for each material and corruption; whole tags, no raw braces, nothing from
-    elsewhere."""
+    """The page has a headline and a row for each material and corruption; tags are closed, no
+    template syntax is left, and nothing is loaded from elsewhere."""
     reader = PageReader(bundle_report.page(figures, sweeps))
     assert (reader.open, reader.wrong) == ([], [])
     assert all(link.startswith(("#", "data:")) for link in reader.links)
@@ -115,7 +115,8 @@ def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
 
 
 def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
-    """The foreign one has its table; with more than twelve labels the matrix is left out."""
+    """A material that the bundle lacks has its own table; with more than twelve labels there is no
+    matrix."""
     many = figures | {
         "labels": [f"m{i}" for i in range(13)],
         "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
@@ -130,7 +131,7 @@ def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Da
 
 
 def test_windows_too_short_for_a_spectrogram_say_so(figures: dict, sweeps: Dataset):
-    """A skin of 28 Hz has 56 frames; its signals are shown all the same."""
+    """A skin of 28 Hz has 56 frames; its signals are still shown."""
     short = replace(sweeps, samples=sweeps.samples[:, :40])
     text = bundle_report.page(figures, short)
     assert text.count("no spectrogram: less than 64 frames") == len(np.unique(sweeps.labels))
@@ -138,8 +139,8 @@ def test_windows_too_short_for_a_spectrogram_say_so(figures: dict, sweeps: Datas
 
 
 def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
-    """Right, wrong and not named add up to all sweeps; the worst material, the first thing to break
-    it, errors, cost."""
+    """Right, wrong and unnamed sweeps add up to all sweeps. The headline has the worst material,
+    the first corruption to break the bundle, errors and cost."""
     named = figures["named"]
     assert named["right"] + named["wrong"] + named["not_named"] == named["n"] == len(sweeps)
     missed = figures | {
@@ -165,8 +166,8 @@ def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
 def test_what_the_bundle_calls_a_foreign_material_is_counted(
     sweeps: Dataset, default_bundle: Bundle
 ):
-    """Six sweeps of felt, four of which get a label: two thirds; wrong and silent answers to its
-    own are told apart."""
+    """Six sweeps of felt, of which four get a label: two thirds. Wrong answers and missing answers
+    to the bundle's own materials are counted apart."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     answered = {"wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 2})}
     mixed = replace(
@@ -183,7 +184,7 @@ def test_what_the_bundle_calls_a_foreign_material_is_counted(
 
 
 def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
-    """It never answers unknown; the page does not claim otherwise."""
+    """Such a bundle never answers `unknown`, and the page states no figure for it."""
     text = PageReader(bundle_report.page(figures | {"tells_unknown": False}, sweeps)).text
     assert "This bundle holds no measure of novelty: it never answers unknown" in text
     assert "Of the sweeps of its own materials" not in text
@@ -194,7 +195,7 @@ def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
 def test_the_command_writes_page_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    """Both files; the target is checked before anything is measured."""
+    """Both files are written; the target is checked before any measurement."""
     monkeypatch.setattr(EvaluationSweeps.of.__func__, "__defaults__", (12, 0))
     named = ["report", str(bundle.DEFAULT), "--set", "sim:T-REAL:1021:1", "--only", "position<=2"]
     assert main([*named, "--out", "/proc/none/report.html"]) != 0

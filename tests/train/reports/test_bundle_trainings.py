@@ -1,5 +1,5 @@
-"""What a report needs trainings for: the points of the learning curve, materials left out, and how
-sets are brought together."""
+"""Trainings for a report: points of the learning curve, materials left out, and sets that are
+joined."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ NOTHING = lambda line: None  # noqa: E731
 
 
 def where(folder: Path) -> Where:
-    """One process, its results below `folder`."""
+    """One process, with its results below `folder`."""
     return Where(jobs=1, cache=folder)
 
 
 @pytest.mark.slow
 def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
-    """Points at 5 and 10 of each material, the last of all 16; each tests all sweeps; more training
-    is no worse here."""
+    """Points at 5 and 10 sweeps of each material, the last at all 16. Each tests all sweeps, and
+    more training is at least as good here."""
     made = {"method": "static-svm"}
     test = easy(30, seed=5)
     found = bundle_trainings.run(made, easy(16), test, where(tmp_path), NOTHING)
@@ -47,8 +47,8 @@ def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # fits again for each material
 def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
-    """The default recipe: a share that gets a known name, a share of known ones kept, for each
-    material."""
+    """The default recipe gives, for each material, a share that gets a known label and a share of
+    known sweeps that are kept."""
     train, test = tones(10), tones(4, noise=1.5)
     found = bundle_trainings.run({"chosen": "filters"}, train, test, where(tmp_path), NOTHING)
     assert set(found["left_out"]["materials"]) == {"a", "b", "c"}
@@ -59,7 +59,7 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
 
 
 def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
-    """A fit of a size of its own: the reason stands in place of the figures."""
+    """A fit with its own size gives the reason instead of figures."""
     found = bundle_trainings.run({}, easy(4), easy(4), where(tmp_path), NOTHING)
     assert found == {
         "why_not": "the bundle was fitted with settings of its own, which no method has"
@@ -67,8 +67,8 @@ def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
 
 
 def test_materials_are_matched_by_name():
-    """Another order of materials, one more, one less: labels mean the same, what is foreign is left
-    out; formats must fit."""
+    """With another order, one more and one less material, labels keep their meaning, and materials
+    without a match are left out. Formats must agree."""
     train, other = easy(4), easy(6)
     mixed = replace(other, materials=("high", "felt", "low"))
     found = bundle_trainings.aligned(mixed, train)
@@ -82,7 +82,7 @@ def test_materials_are_matched_by_name():
 
 
 def test_a_fit_gives_back_all_its_sweeps():
-    """Those that were trained on, then those that were held out, with their groups."""
+    """The training sweeps come first, then the held-out ones, with their groups."""
     whole = easy(20)
     made = recipe.fit(whole, 1, recipe.Settings(0), NOTHING)
     again = bundle_trainings.whole(made)
@@ -94,7 +94,7 @@ def test_a_fit_gives_back_all_its_sweeps():
 
 
 def figures(curve: list[dict]) -> dict:
-    """What a page needs, of no sweep at all, with this curve."""
+    """Figures for a page without any sweep, with this curve."""
     return {
         "bundle": {"name": "b", "version": "1", "id": "0"},
         "set": "s.npz",
@@ -153,8 +153,8 @@ def figures(curve: list[dict]) -> dict:
 
 
 def test_the_page_shows_the_curve_and_materials_left_out():
-    """Each point in words, the picture with a name for each axis, the material in its table and in
-    the headline."""
+    """The page has each point in words, the picture with titles of its axes, and the material in
+    its table and in the headline."""
     points = [
         {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
         {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
@@ -172,7 +172,8 @@ def test_the_page_shows_the_curve_and_materials_left_out():
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: int, scheme: str):
-    """At three widths, by day and by night, with a curve, materials left out, matrix and sweeps."""
+    """The page with a curve, materials left out, a matrix and sweeps can be read at three widths,
+    by day and by night."""
     points = [
         {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
         {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
@@ -186,8 +187,8 @@ def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: in
 def test_the_report_of_a_fit_is_that_of_its_bundle(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """From fit to page in two commands, the second named by the first; with a curve, since a fit
-    holds its sweeps."""
+    """Two commands lead from a fit to its page, and the first names the second; there is a curve,
+    since a fit holds its sweeps."""
     tones(12).save(tmp_path / "t.npz")
     fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
     assert (
@@ -232,7 +233,7 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
 
 
 def test_sets_for_training_must_have_the_form_of_the_bundle():
-    """A set of another skin is refused before anything is trained."""
+    """A set of another skin is refused before any training."""
     other: Dataset = tones()
     with pytest.raises(FormatError, match=r"easy is of .*, tones of .*; name sets of one form"):
         bundle_trainings.run(

@@ -1,4 +1,4 @@
-"""The frame of all pictures: light and dark by themselves, and axes that say what they show."""
+"""The style of all pictures: light and dark without a page, and titles of axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Draw = Callable[[Figure, Axes], None]
 
 
 def drawn(draw: Draw, plain: bool = False) -> str:
-    """A picture with one plot that has numbers on both axes, then `draw`."""
+    """A picture with one plot with numbers on both axes, to which `draw` is applied."""
     figure, axes = plot_style.single_axes(2.0, 0.1, 0.9, 0.3, 0.4)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     for axis in (axes.xaxis, axes.yaxis):
@@ -63,12 +63,13 @@ def titles(svg: str) -> list[str | None]:
     ids=["none", "one", "both", "shared", "no numbers", "names", "no ticks"],
 )
 def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw, there: list[str]):
-    """Its title is an attribute, empty where it is missing; axes without numbers need none."""
+    """The title of an axis is an attribute, empty if it is missing; axes without numbers need
+    none."""
     assert titles(drawn(draw)) == there
 
 
 def test_titles_stand_by_their_axes():
-    """Both are written, the vertical one level."""
+    """Both titles are written, the vertical one horizontally."""
     svg = drawn(lambda figure, axes: plot_style.set_titles(axes, "time, s", "share named"))
     texts = {
         node.text: node
@@ -79,8 +80,8 @@ def test_titles_stand_by_their_axes():
 
 
 def test_a_picture_by_itself_is_light_or_dark():
-    """The roles have values for both; within a page they are the page's; programs without style
-    sheets get colours."""
+    """The roles have values for light and dark; within a page they are the page's; programs without
+    style sheets get colours."""
     svg = drawn(lambda figure, axes: None)
     assert svg.count(plot_style.SCHEMES) == 1
     for roles in (plot_style.ROLES, plot_style.DARK_ROLES):
@@ -93,7 +94,7 @@ def test_a_picture_by_itself_is_light_or_dark():
 
 @pytest.mark.parametrize("roles", [plot_style.ROLES, plot_style.DARK_ROLES], ids=["light", "dark"])
 def test_texts_of_every_role_can_be_read(roles: dict[str, str]):
-    """Contrast of at least 4.5 (WCAG 2.1, 1.4.3) of all that is written on the background."""
+    """All text has a contrast of at least 4.5 to the background (WCAG 2.1, 1.4.3)."""
     rgb = {role: [int(colour[i : i + 2], 16) for i in (1, 3, 5)] for role, colour in roles.items()}
     for role in ("text", "grey", "accent"):
         assert contrast(rgb[role], rgb["background"]) >= 4.5, role

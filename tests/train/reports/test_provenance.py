@@ -1,5 +1,5 @@
-"""The header of pages, pictures and results: made once, found in each kind of file, and what is
-older says so first."""
+"""The header of pages, pictures and results: made once, found in each kind of file, with a warning
+for older figures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SVG = '<svg xmlns="http://www.w3.org/2000/svg"><title>a</title></svg>'
 
 
 def as_html(about: Provenance, home: str = html.HOME) -> str:
-    """A page with a title and a line."""
+    """A page with a title and one line."""
     folder = html.TEMPLATES
     return html.render("base.html.j2", folder, header=about, home=home)
 
@@ -41,7 +41,7 @@ def written(folder: Path, about: Provenance) -> list[Path]:
 
 
 def test_each_kind_of_file_gives_its_header_back(tmp_path: Path):
-    """Whatever stands in the names: tags, ends of comments, quotes."""
+    """Names may contain tags, ends of comments and quotes."""
     for path in written(tmp_path, ABOUT):
         assert provenance.read(path) == ABOUT, path.name
     (tmp_path / "a.json").write_text(json.dumps({"commit": "abc", "bundle": "12345678", "seed": 3}))
@@ -49,7 +49,7 @@ def test_each_kind_of_file_gives_its_header_back(tmp_path: Path):
 
 
 def test_a_second_header_takes_the_place_of_the_first():
-    """The text beside it stays as it is."""
+    """The text beside the header stays."""
     other = replace(ABOUT, commit=("fff",), bundle=(score.shipped(),))
     assert provenance.in_svg(provenance.in_svg(SVG, ABOUT), other) == provenance.in_svg(SVG, other)
     page = "# Title\n\nText -- and <!-- a --> more.\n\n- line\n"
@@ -68,7 +68,7 @@ def test_a_second_header_takes_the_place_of_the_first():
     ],
 )
 def test_a_file_without_header_is_named(tmp_path: Path, text: str):
-    """FormatError with its name and what to do; also where it is not there at all."""
+    """A FormatError has the file's name and a remedy, also if the file is missing."""
     path = tmp_path / "index.html"
     if text:
         path.write_text(text)
@@ -79,8 +79,8 @@ def test_a_file_without_header_is_named(tmp_path: Path, text: str):
 
 
 def test_the_header_is_collected_wherever_figures_say_it():
-    """Joined runs, results in lists, sets of parts; names of sets that stand for several are left
-    to their results."""
+    """The origin is collected from joined runs, results in lists and sets of parts; names that
+    stand for several sets are left to their results."""
     figures = {
         "runs": [
             {
@@ -116,7 +116,7 @@ def test_the_header_is_collected_wherever_figures_say_it():
 
 
 def test_a_run_records_its_origin():
-    """What is packaged now, the day, and the commit: of a run of today nothing is older."""
+    """A run records the packaged bundle, the day and the commit; figures of today are not older."""
     known = score.provenance()
     assert known["shipped"] == score.shipped()
     assert re.fullmatch(r"[0-9a-f]{8}", known["shipped"])
@@ -126,8 +126,8 @@ def test_a_run_records_its_origin():
 
 
 def test_a_page_of_an_older_default_says_so_in_its_first_line():
-    """Behind the title, before all else, in HTML and in Markdown; a page of today's default, and
-    one for others, does not."""
+    """The warning stands below the title, in HTML and in Markdown. A page of today's default, and a
+    page for others, has none."""
     now, text = (
         score.shipped(),
         f"Made with an older default, bundle 12345678; the box ships bundle {score.shipped()} now.",
@@ -143,8 +143,8 @@ def test_a_page_of_an_older_default_says_so_in_its_first_line():
 
 
 def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
-    """A link with words before the title, the origin at the end; a page for others has no such
-    link."""
+    """A link with text stands before the title, and the origin at the end; a page for others has no
+    such link."""
     page = as_html(ABOUT)
     assert '<nav><a href="../../README.md">← Palpate</a></nav>\n<h1>' in page
     assert "2026-11-22, commit abc, def+, bundle 12345678, seeds 1, 2." in PageReader(page).text
@@ -152,11 +152,11 @@ def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
 
 
 def test_every_table_has_a_frame(tmp_path: Path):
-    """Whatever a template writes: heads have a scope, wide tables take the focus; what a template
-    says itself stays."""
+    """Headings of all tables have a scope, and wide tables take the focus; attributes set by a
+    template stay."""
     (tmp_path / "a.html.j2").write_text(
-        '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead><tr><th '
-        'scope="row">b</th></tr></table></div>'
+        '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead>'
+        '<tr><th scope="row">b</th></tr></table></div>'
     )
     page = html.render("a.html.j2", tmp_path)
     assert '<th scope="col" class="text">a</th>' in page

@@ -1,5 +1,4 @@
-"""The eyes of the tests: each fault of a page is seen by the browser, and a page without one has
-none."""
+"""The browser checks of the tests find each fault of a page, and none in a page without faults."""
 
 from __future__ import annotations
 
@@ -14,14 +13,14 @@ from train.reports import html, plot_style
 LONG = "an_unbroken_name_" * 12
 GOOD = """{% extends "base.html.j2" %}{% import "parts.html.j2" as parts %}
 {% block title %}Good{% endblock %}{% block body %}
-{{ parts.targets([{"what": "accuracy where the skin was put back elsewhere", "target": "≥ 97 %",
-  "here": "98.1 % [96.1, 99.3]", "met": false}]) }}
+{{ parts.targets([{"what": "accuracy where the skin was put back elsewhere",
+                   "target": "≥ 97 %", "here": "98.1 % [96.1, 99.3]", "met": false}]) }}
 {{ parts.table(["a", "b", "c", "d", "e", "f"], [["99.1 % [99.0, 99.2]"] * 6]) }}
 <figure>{{ svg }}</figure>{% endblock %}"""
 
 
 def page(folder: Path, body: str, **figure: str) -> str:
-    """The address of a page with this body, in the frame of all pages. figure: titles of its
+    """The address of a page with this body in the frame of all pages. figure: titles of its
     picture's axes."""
     one, axes = plot_style.single_axes(2.0, 0.1, 0.9, 0.3, 0.5)
     plot_style.set_ticks(axes.xaxis, (0, 0.5, 1), "s")
@@ -37,7 +36,7 @@ def page(folder: Path, body: str, **figure: str) -> str:
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, scheme: str):
-    """With a verdict, a wide table and a picture with titles."""
+    """A page with a verdict, a wide table and a picture with titles."""
     assert rendered.faults(browser, page(tmp_path, GOOD, x="time", y="share"), width, scheme) == {}
 
 
@@ -48,8 +47,8 @@ def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, sche
         ("page wider than the window", f"<p style='white-space: nowrap'>{LONG}</p>"),
         (
             "verdict out of sight",
-            "<div class='wide' tabindex='0' role='region'><table><tr><td style='padding-left: "
-            "30rem'></td>"
+            "<div class='wide' tabindex='0' role='region'>"
+            "<table><tr><td style='padding-left: 30rem'></td>"
             "<td class='verdict'>reached</td></tr></table></div>",
         ),
         ("scrolls without keyboard", f"<div style='overflow-x: auto'><pre>{LONG}</pre></div>"),
@@ -64,14 +63,14 @@ def test_a_good_page_has_no_fault(browser: Any, tmp_path: Path, width: int, sche
         ("low contrast", "<p style='color: #999'>pale</p>"),
         (
             "low contrast",
-            "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/><text y='14' "
-            "font-size='9' fill='#111'>dark</text></svg>",
+            "<svg viewBox='0 0 90 20'><rect width='90' height='20' fill='#777'/>"
+            "<text y='14' font-size='9' fill='#111'>dark</text></svg>",
         ),
         ("raw brace", "<p>sim:T-REAL:{{ '{w}' }}</p>"),
     ],
 )
 def test_each_fault_is_seen(browser: Any, tmp_path: Path, kind: str, body: str):
-    """And no other is, on a phone by day."""
+    """Only this fault is found, on a phone by day."""
     whole = (
         '{% extends "base.html.j2" %}{% block title %}Bad{% endblock %}{% block body %}'
         + body
@@ -82,7 +81,7 @@ def test_each_fault_is_seen(browser: Any, tmp_path: Path, kind: str, body: str):
 
 @pytest.mark.slow
 def test_an_axis_without_title_is_seen(browser: Any, tmp_path: Path):
-    """One for each axis that lacks it."""
+    """Each axis without a title is found."""
     found = rendered.faults(browser, page(tmp_path, GOOD, x="time"), 390, "light")
     assert list(found) == ["axis without title"]
     assert len(found["axis without title"]) == 1
@@ -90,8 +89,8 @@ def test_an_axis_without_title_is_seen(browser: Any, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_picture_by_itself_is_dark_by_night(browser: Any, tmp_path: Path):
-    """Its own style sheet gives it the colours of the scheme: nothing is low in contrast, and the
-    background differs."""
+    """The picture's own style sheet gives it the colours of the scheme: no contrast is low, and the
+    backgrounds differ."""
     figure, axes = plot_style.single_axes(1.0, 0.1, 0.9, 0.3, 0.4)
     plot_style.write(axes, 0.5, 0.5, "a text")
     for axis in (axes.xaxis, axes.yaxis):

@@ -1,5 +1,4 @@
-"""The page to leaf through a set: which sweeps it shows, how large it is, and how it is turned in a
-browser."""
+"""The page to leaf through a set: the sweeps that it shows, its size, and its keys in a browser."""
 
 from __future__ import annotations
 
@@ -20,14 +19,14 @@ from train.reports.sweep_plot import SweepSource
 
 
 def source(count: int) -> SweepSource:
-    """A set of so many sweeps, all the same."""
+    """A set of `count` equal sweeps."""
     one = sweep_plot.of_set(easy(4), 0)
     return SweepSource("mine.npz", count, lambda number: one)
 
 
 def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.MonkeyPatch):
-    """First and last among them, in order, none twice; as many as are allowed, and as fit by their
-    size."""
+    """The first and the last sweep are shown, in order, none twice; as many as are allowed, and as
+    fit by their size."""
     assert sweep_pages.chosen(source(7), None) == list(range(7))
     shown = sweep_pages.chosen(source(1000), None)
     assert (len(shown), shown[0], shown[-1]) == (sweep_pages.MOST, 0, 999)
@@ -49,7 +48,7 @@ def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.Mo
 def test_what_a_page_cannot_show_is_refused(
     count: int, numbers: range | None, message: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """No sweeps, numbers that are not there, more than a page holds: each says what there is."""
+    """An empty set, missing numbers and too many numbers: each message states what there is."""
     monkeypatch.setattr(sweep_pages, "MOST_BYTES", 1)
     with pytest.raises(FormatError, match=message):
         sweep_pages.chosen(source(count), numbers)
@@ -58,8 +57,8 @@ def test_what_a_page_cannot_show_is_refused(
 def test_the_command_writes_a_page_of_what_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Sweeps of a set and of a folder; an .svg is of one sweep, and other kinds of file are not
-    written."""
+    """Sweeps of a set and of a folder are shown; an .svg shows one sweep, and other kinds of file
+    are refused."""
     easy(4).save(tmp_path / "s.npz")
     out = tmp_path / "v.html"
     assert (
@@ -101,7 +100,7 @@ def test_the_command_writes_a_page_of_what_is_named(
 def test_a_page_of_some_sweeps_says_how_many_there_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    """In the terminal and on the page, with what shows the others."""
+    """The terminal and the page say that a part is shown, and how to show the others."""
     monkeypatch.setattr(sweep_pages, "MOST", 3)
     easy(4).save(tmp_path / "s.npz")
     assert main(["sets", "view", str(tmp_path / "s.npz"), "--out", str(tmp_path / "v.html")]) == 0
@@ -114,15 +113,15 @@ def test_a_page_of_some_sweeps_says_how_many_there_are(
 
 @pytest.fixture
 def address(tmp_path: Path) -> str:
-    """Of a page of four sweeps."""
+    """The address of a page of four sweeps."""
     (tmp_path / "v.html").write_text(sweep_pages.page(source(4), range(4), lambda line: None))
     return rendered.address(tmp_path / "v.html")
 
 
 @pytest.mark.slow
 def test_arrow_keys_turn_the_page(browser: Any, address: str):
-    """One sweep is seen at a time; arrows, Home and End turn, not beyond the ends; the address
-    names the sweep."""
+    """One sweep is visible at a time. Arrows, Home and End turn the page within its ends, and the
+    address names the sweep."""
     seen_page = BrowsedPage(browser.new_context(), address)
     page = seen_page.page
 
@@ -156,5 +155,5 @@ def test_arrow_keys_turn_the_page(browser: Any, address: str):
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 def test_the_page_can_be_read_everywhere(browser: Any, address: str, width: int, scheme: str):
-    """At three widths, by day and by night."""
+    """The page can be read at three widths, by day and by night."""
     assert rendered.faults(browser, address, width, scheme) == {}

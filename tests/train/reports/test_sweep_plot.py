@@ -1,5 +1,5 @@
-"""The picture of a sweep: what stands in it, for every grid and length; the same everywhere,
-nothing from outside."""
+"""The picture of a sweep, for every grid and length: its content, the same in every run, with
+nothing loaded from elsewhere."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sweep(
     seq: np.ndarray | None = None,
     **more,
 ) -> str:
-    """A recording of noise, a second after its start edge; its last taxel is silent."""
+    """A recording of noise, a second after its start edge, with a silent last taxel."""
     seq = np.arange(format.window) if seq is None else seq
     taxels = (
         np.random.default_rng(0)
@@ -56,7 +56,7 @@ def sweep(
 
 
 def words(svg: str) -> str:
-    """All texts of a picture, a line each."""
+    """All texts of a picture, one a line."""
     return "\n".join(node.text or "" for node in ElementTree.fromstring(svg).iter(f"{SVG}text"))
 
 
@@ -67,14 +67,14 @@ def drawn(path: Path, *more, **also) -> str:
 
 @pytest.fixture
 def small(tmp_path: Path) -> str:
-    """A picture of the paper's skin with all that a sidecar knows."""
+    """A picture of the paper's skin with every field of a sidecar."""
     format = SweepFormat(4, 4, 750.0, 1500, "uint8")
     return drawn(tmp_path / "sweep-000017.npy", format, ABOUT, position="3", session="mon", lost=2)
 
 
 def test_the_picture_says_what_is_known(small: str):
-    """Label, places, file, format, losses, verdict, bundle, device, clock; numbers as they are;
-    units at both fields."""
+    """Label, places, file, format, losses, verdict, bundle, device and clock are shown; numbers are
+    unchanged; both fields have units."""
     shown = words(small)
     for text in (
         "cork, position 3, session mon",
@@ -88,7 +88,7 @@ def test_the_picture_says_what_is_known(small: str):
         "grey: the skin at rest",
         "raw counts over seconds after the start edge",
         "raw counts per √Hz over Hz",
-        "the noise of rounding to whole counts; without 1 constant taxels",
+        "the noise of rounding to whole counts; without 1 constant taxel",
     ):
         assert text in shown, text
     assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(
@@ -97,7 +97,7 @@ def test_the_picture_says_what_is_known(small: str):
 
 
 def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
-    """What the recorder found: the status alone, the trigger, and the unloaded skin."""
+    """A recording without a bundle shows the status alone, the trigger, and the unloaded skin."""
     about = {
         "verdict": {"status": "recorded", "label": "", "probability": 0.0, "detail": ""},
         "source": "usb",
@@ -115,8 +115,7 @@ def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
 
 
 def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
-    """A recording of an older version, with nothing more in its sidecar: nothing of rest, verdict
-    or device is shown."""
+    """A recording of an older version with a short sidecar shows no rest, verdict or device."""
     record(tmp_path / "1.npy", "a")
     shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
     assert shown.startswith("a\n1.npy, sweep 1: ok")
@@ -126,8 +125,8 @@ def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
-    """Well-formed, titled, drawn twice the same, in plain colours, its pixels in itself, no text
-    beyond its edges."""
+    """The picture is well-formed, titled, the same when drawn twice, in plain colours and complete;
+    no text lies beyond its edges."""
     format = SweepFormat(12, 12, 50.0, 40, "float32")
     for svg in (small, drawn(tmp_path / "big.npy", format)):
         root = ElementTree.fromstring(svg)
@@ -165,8 +164,7 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
 
 
 def test_every_peak_is_in_the_line():
-    """Thinned to what can be seen: first and last step, the one frame that stands out, the order of
-    time."""
+    """The thinned line keeps the first and the last step, the single peak and the order of time."""
     counts = np.zeros(5000)
     counts[[3210, 4321]] = 99, -99
     time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, counts)
@@ -178,8 +176,8 @@ def test_every_peak_is_in_the_line():
 
 
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
-    """A sine of 100 Hz has its peak there, and its height as a density: amplitude over root of
-    twice the bin's noise width."""
+    """A sine of 100 Hz has its peak there, with its height as a density: amplitude over the root of
+    twice the noise width of a bin."""
     format = SweepFormat(1, 1, 750.0, 1500, "float32")
     tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
     axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
@@ -209,8 +207,8 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: int, dtype: str):
-    """From one taxel and one frame to the largest skin there can be, in a file that a browser opens
-    at once."""
+    """Every grid from one taxel and one frame to the largest skin can be drawn, in a file that a
+    browser opens at once."""
     svg = drawn(tmp_path / "a.npy", SweepFormat(rows, cols, 0.5, window, dtype))
     ElementTree.fromstring(svg)
     assert len(svg) < 2_000_000
@@ -220,8 +218,8 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
 
 @pytest.mark.parametrize("grid", [(2, 3), (9, 2)])
 def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int]):
-    """A line for each axis, the normal one dark; a larger skin is an image of all. A tare of
-    another shape is refused."""
+    """A plot has a line for each axis, the normal one dark; a larger skin is an image of all. A
+    tare of another shape is refused."""
     format = SweepFormat(*grid, 100.0, 100, "int16", 3)
     shown = words(drawn(tmp_path / "a.npy", format, {"tare": np.ones(format.shape).tolist()}))
     small = max(grid) <= 8
@@ -242,7 +240,7 @@ def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int
 
 @pytest.mark.parametrize("count", [0, 255])
 def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
-    """Nothing moves: no frequency has power, no axis is without length."""
+    """In a constant sweep no frequency has power, and no axis has length zero."""
     format = SweepFormat(2, 2, 100.0, 300, "uint8")
     still = np.full((300, 2, 2), count, np.uint8)
     save(
@@ -260,8 +258,8 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
 def test_missing_frames_are_marked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]
 ):
-    """Where the numbers jump there is a bar, as wide as the gap lasted; the spectrum is of the
-    longest run without one."""
+    """A bar marks a jump of the numbers, as wide as the gap; the spectrum is of the longest part
+    without a gap."""
     format = SweepFormat(*grid, 100.0, 400, "uint8")
     whole = drawn(tmp_path / "a.npy", format)
     seen = sweep_plot.load(sweep(tmp_path / "b.npy", format, seq=np.r_[0:300, 350:400]))
@@ -282,8 +280,8 @@ def test_missing_frames_are_marked(
 
 @pytest.mark.slow
 def test_texts_are_shown_as_they_are(tmp_path: Path):
-    """Dollars are no formulas, signs of markup no markup, long texts end with …, what cannot be
-    shown is a �."""
+    """Dollars do not start formulas, signs of markup are escaped, long texts end with …, and
+    characters that cannot be shown become �."""
     format = SweepFormat(1, 1, 50.0, 9, "uint8")
     assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", format, material="$a_b$ <&>"))
     first = words(drawn(tmp_path / "a.npy", format, material="x" * 300)).split("\n")[0]
@@ -297,8 +295,8 @@ def test_texts_are_shown_as_they_are(tmp_path: Path):
 
 
 def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
-    """Of a file, a simulated set, a folder: the one that training counts so; its groups are
-    named."""
+    """A number selects a sweep of a file, a simulated set or a folder, counted as in training; its
+    groups are named."""
     s = easy(4)
     s.save(tmp_path / "s.npz")
     seen = sweep_plot.load(str(tmp_path / "s.npz"), 11)
@@ -325,7 +323,7 @@ def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
     ],
 )
 def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | None, message: str):
-    """What was asked for, why not, and what to try."""
+    """The message has the request, the cause and a remedy."""
     easy(4).save(tmp_path / "s.npz")
     record(tmp_path / "box" / "0.npy", status=Status.GAP, frames=0)
     record(tmp_path / "box" / "1.npy")
@@ -346,7 +344,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, what: str, number: int | 
 
 
 def test_a_picture_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A name that promises another kind of picture is refused, before anything is read."""
+    """A file name with another kind of picture is refused before any sweep is read."""
     assert (
         main(["sets", "view", "none.npy", "--out", str(tmp_path / "v.png")])
         == FormatError.exit_code
@@ -359,8 +357,8 @@ def test_a_picture_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.Cap
 
 @pytest.mark.slow
 def test_the_spectrogram_shows_when_a_tone_sounds(monkeypatch: pytest.MonkeyPatch):
-    """A tone of 25 Hz in the second half alone: its band is weak before and strong after; time lies
-    as in the signals."""
+    """A tone of 25 Hz in the second half alone: its band is weak before and strong after, on the
+    time axis of the signals."""
     rate = 100.0
     t = np.arange(400) / rate
     tone = np.where(t >= 2, 40 * np.sin(2 * np.pi * 25 * t), 0)

@@ -1,5 +1,5 @@
-"""Choosing the smallest sufficient model within the budget, its unbiased figure, and reduced sweeps
-where they suffice."""
+"""The choice of the smallest sufficient model within the budget, its unbiased figure, and
+reductions of the sweeps."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ HERE = Where(jobs=1, cache=None)
 
 @dataclass
 class Powers:
-    """Answers with the material whose log power on each taxel is nearest; taxels from the `first`
-    on are not looked at."""
+    """Answers with the material with the nearest log power on each taxel; taxels from `first` on
+    are ignored."""
 
     means: np.ndarray
     first: int
     sweeps: Dataset
 
     def graph(self) -> onnx.ModelProto:
-        """`sweep` -> `logits`."""
+        """The graph from `sweep` to `logits`."""
         g, form = GraphBuilder(), self.sweeps.format
         x = g("Cast", "sweep", to=1)
         x = g("Sub", x, g("ReduceMean", x, axes=[1], keepdims=1))
@@ -54,7 +54,7 @@ class Powers:
         return g.model(form, "logits", len(means))
 
     def logits(self, given: np.ndarray) -> np.ndarray:
-        """As the graph has them."""
+        """The logits of the graph."""
         return run(self.graph(), given)
 
 
@@ -71,7 +71,7 @@ def learn(sweeps: Dataset, given: np.ndarray, seed: int, first: int = 99) -> Pow
 
 
 def guess(sweeps: Dataset, given: np.ndarray, seed: int, number: int = 0) -> Powers:
-    """A method that knows nothing: its means are drawn."""
+    """A method without information: its means are drawn at random."""
     drawn = np.random.default_rng(number).standard_normal((len(sweeps.materials), given[0, 0].size))
     return Powers(3 + drawn.astype(np.float32), 99, sweeps)
 
@@ -79,8 +79,8 @@ def guess(sweeps: Dataset, given: np.ndarray, seed: int, number: int = 0) -> Pow
 def skin(
     places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1), noise: float = 0.15
 ) -> Dataset:
-    """Four materials at several places: each of the named taxels has half of the information, by
-    the strength of what they feel."""
+    """Four materials at several places. Each of the named taxels has half of the information, in
+    the strength of its signal."""
     labels = np.tile(np.arange(4), places * each)
     rng = np.random.default_rng(3)
     bits = np.stack([labels % 2, labels // 2], axis=1)
@@ -106,7 +106,7 @@ COSTS = {name: BundleCost(0.1 * (i + 1), 10.0 * (i + 1), 50.0) for i, name in en
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Puts fake methods, of fixed costs, in the place of the real ones."""
+    """A function that replaces the real methods by fakes with fixed costs."""
 
     def put(known: dict[str, Method] = FAKES, costs: dict[str, BundleCost] = COSTS) -> None:
         monkeypatch.setattr(methods, "every", lambda effort=FULL_EFFORT: known)
@@ -131,7 +131,7 @@ def chosen(sweeps: Dataset, where: Where = HERE, **more) -> select.Selection:
 
 
 def parts_of(sweeps: Dataset, **more) -> nested_cv.Trials:
-    """Trials of which none has been run."""
+    """Trials before the first run."""
     return nested_cv.Trials(
         sweeps, asked(**more), FULL_EFFORT, HERE, Progress(0, lambda line: None)
     )
@@ -144,8 +144,8 @@ def two() -> Dataset:
 
 
 def test_the_smallest_that_will_do_is_taken(fakes):
-    """One taxel has half of the information, two have all: two are taken, with reasons both ways;
-    four and six are not tried."""
+    """One taxel has half of the information, two have all. The model with two is chosen, with
+    reasons against less and more; four and six are not tried."""
     choice = chosen(two())
     result = choice.json(asked())
     assert result["chosen"] == "see-2"
@@ -158,7 +158,7 @@ def test_the_smallest_that_will_do_is_taken(fakes):
 
 
 def test_the_cheapest_is_taken_where_it_suffices(fakes):
-    """Two materials that the first taxel distinguishes."""
+    """Two materials can be distinguished by the first taxel."""
     sweeps = two().take(two().labels < 2).select(())
     choice = chosen(sweeps)
     assert choice.final.chosen == "see-1"
@@ -166,8 +166,7 @@ def test_the_cheapest_is_taken_where_it_suffices(fakes):
 
 
 def test_a_gain_within_the_error_is_no_reason(fakes):
-    """What is right at one place more than the cheaper one is not paid for; what is right a little
-    more everywhere is."""
+    """A gain at one place only does not justify a larger model; a small gain at all places does."""
     better = np.ones((1, len(two())))
     here, everywhere = better.copy(), better.copy()
     here[0, :3] = 0
@@ -182,8 +181,8 @@ def test_a_gain_within_the_error_is_no_reason(fakes):
 
 
 def test_the_search_in_a_family_ends_where_larger_ones_change_nothing(fakes):
-    """Two larger ones that change nothing end it, unless the second is better than the first; other
-    families go on."""
+    """Two larger models without a gain end the search, unless the second is better than the first;
+    other families continue."""
     half, more = np.zeros((2, 1, len(two())))
     half[0, ::2], more[0] = 1, 1
     more[0, ::6] = 0
@@ -205,15 +204,15 @@ def test_the_search_in_a_family_ends_where_larger_ones_change_nothing(fakes):
 
 
 def test_the_order_is_that_of_cost(fakes):
-    """The same methods with other costs: the one that is then cheapest is taken, though it looks at
-    more."""
+    """With other costs, the same methods give another choice: the cheapest, although it uses more
+    taxels."""
     fakes(costs={name: replace(COSTS[name], kb=100 - COSTS[name].kb) for name in reversed(FAKES)})
     assert chosen(two()).final.chosen == "see-6"
 
 
 def test_what_is_over_the_budget_is_not_tried(fakes):
-    """Time on the board, size or memory: named with its limit; the best of the others is taken,
-    whether it reaches what is wanted or not."""
+    """Time on the board, size and memory are each named with their limit. The best of the others is
+    chosen, whether or not it reaches the wanted accuracy."""
     for budget in ({"ms": 0.3, "slower": 2.0}, {"kb": 15}):
         choice = chosen(two(), budget=scene.Budget(**budget))
         assert choice.final.chosen == "see-1"
@@ -222,7 +221,7 @@ def test_what_is_over_the_budget_is_not_tried(fakes):
 
 
 def test_nothing_fits(fakes):
-    """The nearest is named with what it lacks."""
+    """The nearest model is named with the exceeded limit."""
     with pytest.raises(
         select.NothingFits, match=r"nearest is see-1, over the budget: 10 kb of 5: raise the budget"
     ):
@@ -235,7 +234,8 @@ def test_nothing_fits(fakes):
 
 
 def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
-    """It has no cost, or its training refuses: the reason is reported and the others are tried."""
+    """A method without a cost, or with a refused training: the reason is reported, and the others
+    are tried."""
     never = Method(
         "see-0", "refuses", "raw", lambda sweeps, given, seed: learn(sweeps, given[:, :1], seed)
     )
@@ -254,8 +254,8 @@ def test_a_method_that_is_refused_does_not_stop_the_others(fakes):
 
 @pytest.mark.slow
 def test_the_nested_figure_is_not_optimistic(fakes):
-    """Of sixteen that only guess the best one looks good; the choice, judged on what it has not
-    seen, is a guess."""
+    """The best of sixteen guessing methods looks good; the choice, judged on parts that it did not
+    use, is a guess."""
     known = {
         f"g{i}-": Method(f"g{i}-", "guesses", "raw", partial(guess, number=i)) for i in range(16)
     }
@@ -272,8 +272,8 @@ def test_the_nested_figure_is_not_optimistic(fakes):
 
 
 def test_an_inner_choice_never_sees_its_part(fakes):
-    """Neither trained on nor tested on: of every training that it looks at, and in every score that
-    it has."""
+    """The part is neither trained on nor tested on, in all trainings and in all scores of the inner
+    choice."""
     trials = parts_of(two(), varies=("place", "day"))
     for p, part in enumerate(trials.parts):
         for tested, unseen in trials.seen_from(p).items():
@@ -287,7 +287,7 @@ def test_an_inner_choice_never_sees_its_part(fakes):
 
 
 def test_the_error_is_that_of_what_fails_together(fakes):
-    """A loss at one place alone is less sure than the same loss everywhere; no loss is no loss."""
+    """The same loss at one place has a larger error than at all places; no loss has no error."""
     trials = parts_of(two())
     ones = np.ones((1, len(two())))
     here, everywhere = ones.copy(), ones.copy()
@@ -327,14 +327,15 @@ def test_corruptions_count_like_sweeps_as_recorded(fakes):
 def test_a_scene_that_cannot_be_judged_is_refused(
     fakes, sweeps: Dataset, varies: tuple[str, ...], why: str
 ):
-    """Too few values of a group, or a material that goes with one of them; before anything is
-    trained."""
+    """Too few values of a group, or a material that has only one of them, is refused before any
+    training."""
     with pytest.raises(FormatError, match=why):
         chosen(sweeps, varies=varies)
 
 
 def test_parts_are_whole_and_few():
-    """All values of a group, each in one part; five at most, or as many as are asked for."""
+    """All values of a group are in exactly one part; five parts at most, or as many as
+    requested."""
     found = nested_cv.parts(two(), ("place", "day"))
     assert [p.group for p in found] == ["place"] * 4 + ["day"] * 4
     assert np.sum([p.out for p in found[:4]], axis=0).tolist() == [1] * 96
@@ -347,16 +348,15 @@ def test_parts_are_whole_and_few():
 
 
 def reduced(sweeps: Dataset, **more) -> dict[str, dict]:
-    """The curves of a scene by what there is less of, and under "change" what would be left out of
-    the bundle."""
+    """The curves of a scene by reduction, and under "change" the reduction for the bundle."""
     wish = asked(**more)
     result, change, accuracy = reduction_curves.curves(chosen(sweeps, **more), wish)
     return {curve["kind"]: curve for curve in result} | {"change": change, "accuracy": accuracy}
 
 
 def test_two_taxels_are_all_that_is_needed(fakes):
-    """Of six the third and the fifth have all the information: these two are kept, one alone is not
-    enough."""
+    """Of six taxels, the third and the fifth have all the information: these two are kept, and one
+    alone is not enough."""
     fakes({"see-6": FAKES["see-6"]}, {"see-6": COSTS["see-6"]})
     found = reduced(skin(taxels=(2, 4)), reduce=("taxels",), apply=("taxels",))
     assert found["taxels"]["kept"] == "2 taxels"
@@ -367,8 +367,8 @@ def test_two_taxels_are_all_that_is_needed(fakes):
 
 
 def hum(slow: float, fast: float, places: int = 4) -> Dataset:
-    """Two materials that differ by the strength of a swing of 40 frames, of one of two frames, or
-    of both."""
+    """Two materials that differ in the strength of an oscillation of 40 frames, of one of two
+    frames, or of both."""
     labels = np.tile([0, 1], places * 3)
     rng = np.random.default_rng(2)
     strength = np.exp(0.3 * rng.standard_normal((2, len(labels), 1)))
@@ -384,8 +384,8 @@ def hum(slow: float, fast: float, places: int = 4) -> Dataset:
 
 
 def test_a_low_rate_is_enough_for_slow_things(fakes):
-    """Averaging takes the fast noise away: the lowest rate is kept, with what to set; nothing is
-    applied unasked."""
+    """Averaging removes the fast noise: the lowest rate is kept, with the setting for it; nothing
+    is applied without a request."""
     found = reduced(hum(slow=5, fast=1), reduce=("rate",))
     assert found["rate"]["kept"] == "25 Hz"
     assert found["rate"]["set"] == "set the readout board to average 8 frames and send one"
@@ -394,8 +394,8 @@ def test_a_low_rate_is_enough_for_slow_things(fakes):
 
 
 def test_a_rate_that_is_needed_is_kept(fakes):
-    """Materials that differ by the fast part alone: half the rate loses it, and the curve ends
-    where it has fallen."""
+    """Materials that differ only in the fast part: half the rate loses it, and the curve ends after
+    the fall."""
     found = reduced(hum(slow=1, fast=5), reduce=("rate",), apply=("rate",))
     assert (found["rate"]["kept"], found["change"].rate) == ("all", 1)
     assert [p["fine"] for p in found["rate"]["points"]] == [True, False, False]
@@ -403,8 +403,8 @@ def test_a_rate_that_is_needed_is_kept(fakes):
 
 @pytest.mark.slow
 def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
-    """Sixty frames are more than needed; the fake refuses fewer than four, and the curve says
-    so."""
+    """Sixty frames are more than needed; the fake refuses fewer than four, and the curve states
+    it."""
     found = reduced(two(), reduce=("window",))
     assert found["window"]["kept"] == "0.15 s"
     assert found["window"]["applied"] is True
@@ -414,8 +414,8 @@ def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported(fakes):
 
 
 def test_less_does_not_fall_below_what_is_wanted(fakes):
-    """A loss within the error is still refused where the whole reaches the wanted accuracy and less
-    does not."""
+    """A loss within the error is refused if the whole sweeps reach the wanted accuracy and the
+    reduced ones do not."""
     trials = parts_of(two())
     full, less = np.ones((2, 1, len(two())))
     less[0, 0] = 0
@@ -426,8 +426,8 @@ def test_less_does_not_fall_below_what_is_wanted(fakes):
 
 @pytest.mark.slow
 def test_materials_that_look_alike_are_proposed_as_one(fakes):
-    """Only the first taxel has information: a and c, b and d are the same to it. Proposed, not
-    applied."""
+    """Only the first taxel has information, and it cannot distinguish a from c and b from d. The
+    pairs are proposed and not applied."""
     sweeps = skin(taxels=(0, 0))
     strength = replace(
         sweeps,
@@ -444,7 +444,7 @@ def test_materials_that_look_alike_are_proposed_as_one(fakes):
 
 @pytest.mark.slow
 def test_an_interrupted_choice_continues(fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Trainings that are done are not done again, and the choice is the same."""
+    """Finished trainings do not run again, and the choice is the same."""
     where, calls, train = Where(jobs=1, cache=tmp_path), [], evaluate.run
 
     def counted(*args):
@@ -463,8 +463,8 @@ def test_an_interrupted_choice_continues(fakes, tmp_path: Path, monkeypatch: pyt
 
 
 def test_all_trainings_have_one_count(fakes):
-    """From the first candidate to the last reduction: it never starts anew, and what is left at
-    most only shrinks."""
+    """From the first candidate to the last reduction, the count never restarts, and the largest
+    number left only falls."""
     lines: list[ProgressLine] = []
     wish = asked(reduce=("window", "taxels", "classes"), apply=("window",))
     choice = select.choose(
@@ -487,14 +487,14 @@ def test_all_trainings_have_one_count(fakes):
 
 @pytest.mark.slow
 def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
-    """Real methods on a real bundle: L-features suffice, so they are deployed; the page needs
-    nothing from outside."""
+    """With real methods and a real bundle, L-features suffice and are packed; the page loads
+    nothing from elsewhere."""
     skin().save(tmp_path / "skin.npz")
     (tmp_path / "scene.toml").write_text(
-        'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\nfolds '
-        "= 3\naccuracy = 0.8\n"
-        'methods = ["L-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\nms = 50\nkb = '
-        "500\nmb = 500\nslower = 3\n"
+        'name = "drawer"\nsets = ["skin.npz"]\nmaterials = ["a", "d"]\nvaries = ["place"]\n'
+        "folds = 3\naccuracy = 0.8\n"
+        'methods = ["L-svm", "L-gauss"]\nreduce = ["window", "classes"]\n[budget]\n'
+        "ms = 50\nkb = 500\nmb = 500\nslower = 3\n"
     )
     args = [
         "choose",
@@ -534,7 +534,7 @@ def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
 def test_what_is_wanted_and_not_reached_is_said_first(
     fakes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ):
-    """The best is reported and packed all the same."""
+    """The best is reported and packed although it misses the wanted accuracy."""
     monkeypatch.setattr(measure, "memory", lambda folder, sweeps: {"rss_mib": 50.0, "foreign": []})
     hard = skin(noise=0.9)
     hard.save(tmp_path / "skin.npz")
@@ -555,8 +555,8 @@ def test_what_is_wanted_and_not_reached_is_said_first(
 
 
 def test_cheap_is_what_takes_little_of_the_scarcer():
-    """Of time and storage, whichever the board has less of; without a budget the smaller; of equals
-    the faster."""
+    """Cost is the larger of the shares of time and storage; without a budget the size; among equals
+    the time."""
     small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
     tight = {
         "time": scene.Budget(ms=1, kb=1000, slower=2),

@@ -1,4 +1,4 @@
-"""Scenes: what scene.toml may say, how it is refused, and which sweeps it names."""
+"""Scenes: the content of scene.toml, its errors, and the sweeps that it selects."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def three(folder: Path) -> Path:
-    """A set of three materials in a file: two forces, two sweeps of each there."""
+    """A set of three materials in a file, with two forces and two sweeps of each."""
     labels = np.repeat([0, 1, 2], 4)
     samples = (10 * labels[:, None, None, None] + np.arange(5)[:, None, None]).astype(
         np.int16
@@ -61,7 +61,7 @@ def three(folder: Path) -> Path:
 
 
 def test_every_key_is_read(tmp_path: Path):
-    """What stands in the file is what the scene holds; what does not keeps its default."""
+    """The scene holds the values of the file, and defaults for all others."""
     found = scene.read(written(tmp_path, WHOLE))
     assert (found.name, found.version, found.folds, found.seeds) == ("drawer", "2.1", 4, 2)
     assert found.merge == {"a or c": ("a", "b")}
@@ -146,13 +146,14 @@ def test_every_key_is_read(tmp_path: Path):
     ],
 )
 def test_what_is_wrong_is_named(text: str, why: str, tmp_path: Path):
-    """File, key, value, what is allowed or nearest; before any sweep is read."""
+    """The message has the file, the key, the value, and the allowed or nearest value, before any
+    sweep is read."""
     with pytest.raises(FormatError, match=why):
         scene.read(written(tmp_path, text))
 
 
 def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
-    """Bytes that are no UTF-8."""
+    """Bytes that are not UTF-8."""
     path = tmp_path / "scene.toml"
     path.write_bytes(b'name = "\xff"')
     with pytest.raises(FormatError, match="not TOML"):
@@ -160,7 +161,7 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
 
 
 def test_sets_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A file is sought from where scene.toml is, a variable is filled in, and one that is not set
+    """A relative path starts at scene.toml, variables are replaced, and a variable that is not set
     is named."""
     three(tmp_path)
     monkeypatch.chdir("/")
@@ -174,7 +175,7 @@ def test_sets_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_materials_are_narrowed_and_merged(tmp_path: Path):
-    """Those at hand, with their new names, in their old order; labels and groups follow."""
+    """The selected materials have their new names in their old order; labels and groups agree."""
     three(tmp_path)
     found = scene.read(
         written(tmp_path, 'sets = ["a.npz"]\nmaterials = ["a", "c"]\nonly = ["force=100"]')
@@ -198,14 +199,14 @@ def test_materials_are_narrowed_and_merged(tmp_path: Path):
     ],
 )
 def test_what_does_not_fit_the_sweeps_is_named(text: str, why: str, tmp_path: Path):
-    """A material, group or value that the sets have not."""
+    """A material, group or value that the sets do not have."""
     three(tmp_path)
     with pytest.raises(FormatError, match=why):
         scene.read(written(tmp_path, f'sets = ["a.npz"]\n{text}')).sweeps()
 
 
 def test_a_label_that_the_box_cannot_send_is_refused_at_once(tmp_path: Path):
-    """Before hours of training; [merge] gives it another name."""
+    """It is refused before hours of training; [merge] renames it."""
     samples = np.arange(40, dtype=np.int16).reshape(4, 10, 1, 1)
     Dataset(samples, np.array([0, 0, 1, 1]), ("wood, oiled", "b"), 50.0).save(tmp_path / "a.npz")
     with pytest.raises(
@@ -220,7 +221,7 @@ def test_a_label_that_the_box_cannot_send_is_refused_at_once(tmp_path: Path):
 
 
 def test_the_examples_are_scenes_and_name_every_key():
-    """What docs show can be read, and the long one shows all that there is."""
+    """The documented examples can be read, and the long one shows every key."""
     docs = ROOT / "docs" / "choose"
     found = {path.name: scene.read(path) for path in docs.glob("*.toml")}
     assert {"tubes.toml", "fabrics.toml"} <= found.keys()
