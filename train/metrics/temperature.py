@@ -66,7 +66,7 @@ def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> 
 
 def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float:
     """The lowest of TEMPERATURES whose log loss is within SLACK standard errors of the smallest
-    loss (a variant of the one-SE rule; Breiman et al. 1984).
+    loss, after the rule of one standard error (Breiman et al. 1984).
 
     The standard error is that of a mean over `groups` [n], because sweeps of a group are right or
     wrong together; with a single group it is that of a mean over sweeps. Platt's correction is left
