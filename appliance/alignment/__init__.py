@@ -1,1 +1,1 @@
-"""Shows where the contact lies on the skin, in a terminal and as a page."""
+"""Shows the position of the contact on the skin, in a terminal and on a page."""

@@ -1,6 +1,5 @@
-"""Heat maps of a skin as lines of a terminal, for `palpate skin show` and `palpate watch`. In:
-loads. Out: lines with the control sequences of 256 colours.
-"""
+"""Heat maps of a skin in a terminal with 256 colours, for `palpate skin show` and `palpate
+watch`."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from itertools import zip_longest
 from appliance.alignment.terminal import BLOCKS, HEAT, PLAIN
 
 WIDEST = 6
-"""Characters of a taxel at most; from five on its count fits in."""
+"""Largest width of a taxel in characters; from five on the count is shown."""
 GAP = "   "
 
 Map = Sequence[Sequence[float]]
@@ -20,9 +19,11 @@ Map = Sequence[Sequence[float]]
 def side_by_side(
     load: Sequence[Map], full: float, width: int, signs: str = BLOCKS
 ) -> Iterator[list[str]]:
-    """The maps of the axes, as many beside one another as there is room for in `width`; each time
-    the lines of one row of maps. full: load that is shown as the strongest. signs: see
-    alignment.terminal."""
+    """The maps of all axes, with as many side by side as fit in `width`. Yields the lines of one
+    row of maps after another.
+
+    full: load that is shown as the strongest. signs: see alignment.terminal.
+    """
     axes, cols = len(load), len(load[0][0]) if load else 0
     if not load:
         return
@@ -39,7 +40,7 @@ def side_by_side(
 
 
 def uncoloured(text: str) -> str:
-    """A line for a terminal without colours."""
+    """`text` for a terminal without colours."""
     for shade in HEAT:
         text = text.replace(f"\033[38;5;{shade}m", "")
     return text.replace(PLAIN, "")
@@ -50,7 +51,7 @@ def _head(axis: int, axes: int) -> str:
 
 
 def _map(values: Map, head: str, full: float, cell: int, signs: str) -> list[str]:
-    """One axis: a shaded field for each taxel, with its count where it fits in."""
+    """One axis: a shaded field for each taxel, with its count if there is room."""
     rows = ["".join(_field(value, full, cell, signs) for value in row) + PLAIN for row in values]
     return [head.ljust(cell * len(values[0])), *rows] if head else rows
 

@@ -1,5 +1,4 @@
-"""Where the skin is touched, for `palpate align`. In: frames of a finger at rest. Out: a View, five
-times a second, to displays."""
+"""Shows the position of the contact on displays, five times a second, for `palpate align`."""
 
 from __future__ import annotations
 
@@ -22,13 +21,13 @@ from appliance.signal.contact import IN_PLACE, ContactPositions, Point, advice, 
 from appliance.signal.unloaded import UnloadedTracker
 
 VIEW_NS = 200_000_000
-"""From one View to the next."""
+"""Time between two Views."""
 SPAN_S = 0.3
-"""How much of the latest signal is averaged: long compared with the vibrations of a pulse or a
-robot's controller."""
+"""Length of the latest signal that is averaged. It is long compared with the vibrations of a pulse
+or a robot's controller."""
 NO_BUNDLE = "none for this skin"
 SHOWN = 10
-"""The strongest load shown is at first so many times the contact threshold."""
+"""Initial value of the strongest load shown, in multiples of the contact threshold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,7 @@ class Expected:
 
     @classmethod
     def by(cls, model: Bundle, fingertip: str = "") -> Expected:
-        """What a bundle says."""
+        """The skin as `model` describes it. fingertip: setting `skin.fingertip`."""
         m = model.manifest
         named = f"{m.name} {m.version}, {model.id}"
         return cls(m.format, named, m.thresholds.contact, m.contact, normal(m.tare, 0), fingertip)
@@ -68,7 +67,7 @@ class Expected:
 
     @classmethod
     def read(cls, format: SweepFormat, known: Mapping[str, Any], bundle: str) -> Expected:
-        """From what `json` gave; nothing where `known` is empty. Raises KeyError, TypeError,
+        """The inverse of `json`; an empty `known` means no bundle. Raises KeyError, TypeError,
         ValueError or BundleError."""
         if not known:
             return cls(format, bundle or NO_BUNDLE)
@@ -89,10 +88,10 @@ class Expected:
 class ContactTracker:
     """Makes Views of the frames of a skin.
 
-    Of a skin with several axes it looks at the normal one alone. The unloaded value of a taxel is
-    the lowest it has been since the skin was connected: so nobody has to press a key, and a finger
-    that lay on the skin at the start is noticed when it is lifted (with a bundle, whose threshold
-    is above what an unloaded skin gives).
+    For a skin with several axes it uses the normal axis alone. The unloaded value of a taxel is its
+    lowest value since the skin was connected, so nobody has to press a key. A bundle's contact
+    threshold is above the counts of an unloaded skin. With it, a finger that touched the skin from
+    the start is noticed, and the person is asked to lift it.
     """
 
     def __init__(self, expected: Expected, source: str) -> None:
@@ -104,21 +103,20 @@ class ContactTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew: this may be another skin than before."""
+        """Start anew, as for another skin."""
         self._latest = normal(Frames.empty(self._expected.format).taxels, 1)
         self._lowest = np.full(self._shape, np.inf)
         self._full = SHOWN * abs(self._expected.threshold or 0.1)
         self._unloaded.restart()
 
     def put(self, taxels: NDArray[Any]) -> None:
-        """Take the newest frames, raw counts [n, R, C] or [n, R, C, A]."""
+        """Add the newest frames, raw counts [n, R, C] or [n, R, C, A]."""
         self._latest = np.concatenate([self._latest, normal(taxels, 1)])[-self._span :]
         if self._expected.threshold is None:
             self._unloaded.put(taxels)
 
     def view(self, skin: str, trouble: str) -> View:
-        """The View of this moment. skin: its state (PROTOCOL.md). trouble: why it does not
-        stream."""
+        """The present View. skin: its state (PROTOCOL.md). trouble: why it does not stream."""
         self._number, self._skin = self._number + 1, skin
         if skin != "streaming":
             return self._view("no-skin", f"no skin: {skin}", trouble)
@@ -146,8 +144,8 @@ class ContactTracker:
         if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
             hint = (
-                f"a taxel has not read less than {least:.0f} raw counts{above} yet: something "
-                "lies on the skin"
+                f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies "
+                "on the skin"
             )
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
@@ -158,13 +156,13 @@ class ContactTracker:
             hint = "this bundle does not say where the skin sat in training; export it again"
             if self._expected.bundle == NO_BUNDLE:
                 hint = (
-                    "no bundle fits this skin, so there is no trained position; "
-                    "palpate record needs none"
+                    "no bundle fits this skin, so there is no trained position; palpate record "
+                    "needs no bundle"
                 )
             elif self._expected.threshold is None:
                 hint = (
-                    "this bundle cannot tell contact, so it has no trained position; "
-                    "train one on sweeps of palpate record"
+                    "this bundle cannot detect contact, so it has no trained position; train a "
+                    "bundle on sweeps of palpate record"
                 )
             return self._view(
                 "no-positions", "the contact's centre alone", hint, **shown, centre=found
@@ -218,7 +216,7 @@ class Alignment:
         self._sensor.close()
 
     def view(self) -> View:
-        """The View of this moment."""
+        """The present View."""
         return self._tracker.view(self._sensor.state, str(self._sensor.trouble or ""))
 
 
@@ -229,8 +227,8 @@ def run(
     displays: Iterable[Display],
     stopped: Callable[[], bool],
 ) -> None:
-    """Show on `displays` where the skin is touched, until `stopped()`. A slow display makes frames
-    late, which does no harm."""
+    """Show Views on `displays` until `stopped()`. A slow display delays frames, which does no
+    harm."""
     shown_on = tuple(displays)
     with closing(Alignment(settings, expected, devices)) as alignment:
         next_ns = devices.clock.now_ns()

@@ -1,8 +1,7 @@
-"""Shows in a terminal where the skin is touched. In: Views. Out: a picture that is drawn again and
-again, or plain lines.
+"""Shows Views in a terminal, as a picture that is redrawn or as plain lines.
 
-Nothing depends on colour: five characters and numbers show the load, signs the positions. Where the
-output is no terminal, or a dumb one, it gets one line a second.
+Nothing depends on colour: five characters and numbers show the load, signs the positions. If the
+output is not a terminal, or is a dumb terminal, one line is printed each second.
 """
 
 from __future__ import annotations
@@ -19,30 +18,30 @@ Shown = TypeVar("Shown")
 LINE_NS = 1_000_000_000
 """Time between two plain lines."""
 ENTER, LEAVE = "\033[?1049h\033[?25l", "\033[?1049l\033[?25h"
-"""Control sequences: to the alternate screen without a cursor, and back to what was on the terminal
-before."""
+"""Control sequences that change to the alternate screen without a cursor, and back."""
 BLOCKS, ASCII = " ░▒▓█◉+┌─┐│└┘", " .:*#@+.-.|''"
-"""Signs for five loads, the contact's centre, a trained position and a frame: for UTF-8, and for
-any terminal."""
+"""Signs for five loads, the contact's centre, a trained position and a frame, in UTF-8 and in
+ASCII."""
 LEFT, TOP, SPARE = 8, 6, 12
-"""Column and line where the grid begins, and the number of lines outside it."""
+"""First column and line of the grid, and the number of lines outside it."""
 BOLD, PLAIN = "\033[1m", "\033[0m"
 MARKED = "\033[1;7m"
 HEAT = (236, 23, 30, 37, 79, 158)
-"""Colours of loads in a terminal that knows 256, from none to the strongest."""
+"""Colours of loads in a terminal with 256 colours, from none to the strongest."""
 
 
 def abilities(out: TextIO) -> tuple[bool, str]:
-    """Whether a terminal knows 256 colours, and the signs that it can show."""
+    """Whether a terminal has 256 colours, and the signs that it can show."""
     signs = BLOCKS if (out.encoding or "").lower().replace("-", "") == "utf8" else ASCII
     return "256" in os.environ.get("TERM", ""), signs
 
 
 class LiveScreen(ABC, Generic[Shown]):
-    """Shows one thing after another on `out`; `address`: of the page, where there is one. Restores
-    the terminal at the end. live: `out` is a terminal on which pictures can be drawn.
+    """Shows one object after another on `out`, and restores the terminal at the end. Subclasses
+    implement `_picture` and `_line`.
 
-    A subclass says what it looks like: `_picture` and `_line`.
+    address: of the page, "" without a page. live: `out` is a terminal on which pictures can be
+    drawn.
     """
 
     def __init__(self, out: TextIO, clock: Clock, address: str = "") -> None:
@@ -59,8 +58,8 @@ class LiveScreen(ABC, Generic[Shown]):
         self._write(LEAVE if self.live else "")
 
     def show(self, view: Shown) -> None:
-        """Draw `view` over the one before, in one write so that nothing flickers; or print a line,
-        once a second."""
+        """Draw `view` over the previous picture, or print a line once a second. One write draws the
+        picture, so it does not flicker."""
         if self.live:
             width, height = os.get_terminal_size(self._out.fileno())
             lines = self._picture(view, width or 80, height or 24)
@@ -73,7 +72,7 @@ class LiveScreen(ABC, Generic[Shown]):
 
     @abstractmethod
     def _picture(self, view: Shown, width: int, height: int) -> list[str]:
-        """`view` line by line, for a terminal of this size."""
+        """The lines of `view` for a terminal of this size."""
         ...
 
     @abstractmethod
@@ -97,7 +96,7 @@ class Screen(LiveScreen[View]):
 
 
 def line(view: View) -> str:
-    """A View in one line, the message first."""
+    """A View in one line that begins with the message."""
     at = (
         f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}"
         if view.centre
@@ -158,8 +157,8 @@ class Canvas:
         self._put(below + 2, 1, address)
 
     def _grid(self) -> None:
-        """A field of characters for the load of each taxel, with the number in its middle; a frame
-        around all."""
+        """Draw a field of characters for the load of each taxel, with the number in its middle, and
+        a frame around the grid."""
         (high, wide), view = self._cell, self._view
         left_up, flat, right_up, upright, left_down, right_down = list(self._signs[7:])
         for c in range(view.shape[1]):
@@ -179,7 +178,7 @@ class Canvas:
         )
 
     def _taxel(self, top: int, left: int, load: float) -> None:
-        """One field; the last character of its width is the gap to the next."""
+        """Draw one field; the last character of its width is the gap to the next field."""
         (high, wide), share = self._cell, max(0.0, min(1.0, load / self._view.full))
         for y in range(high):
             self._put(
@@ -203,7 +202,7 @@ class Canvas:
             self._put(y, x - 1, f"({self._signs[5]})", MARKED)
 
     def _at(self, point: Point) -> tuple[int, int]:
-        """Line and column of a point, at the grid's edge where it lies beyond it."""
+        """Line and column of a point, at the grid's edge if the point lies outside."""
         pitch = self._view.contact.pitch_mm if self._view.contact else 1.0
         (high, wide), (rows, cols) = self._cell, self._view.shape
         row, col = (point[0] / pitch + 0.5) * high, (point[1] / pitch + 0.5) * wide

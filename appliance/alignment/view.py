@@ -1,4 +1,4 @@
-"""What `palpate align` shows at one moment: the View, and the display that shows it."""
+"""The View, the picture of `palpate align` at one moment, and the interface of its displays."""
 
 from __future__ import annotations
 
@@ -10,14 +10,20 @@ from appliance.signal.contact import ContactPositions, Point
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where the skin is touched at one moment, and what the person may do.
+    """The contact on the skin at one moment, and advice for the person.
 
-    number: counts Views from 1. source: as sentences name it ("usb", "sim"). skin: its state
-    (PROTOCOL.md). state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or
-    "in-place". message: that in words. hint: what the person may do. load: raw counts above the
-    unloaded skin, [rows][columns]; empty before there are any. full: load that is shown as the
-    strongest. centre: of the contact, and nearest: the trained position nearest to it, mm from the
-    centre of taxel 1.1 (taxels where there is no `place`). fingertip: setting `skin.fingertip`.
+    number: counts Views from 1.
+    source: as in sentences ("usb", "sim").
+    skin: its state (PROTOCOL.md).
+    state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or "in-place".
+    message: the state in words.
+    hint: advice for the person.
+    load: raw counts above the unloaded skin, [rows][columns]; empty before the first frames.
+    full: load that is shown as the strongest.
+    centre: centre of the contact, mm from the centre of taxel 1.1 (in taxels without `contact`).
+    nearest: the nearest trained position, in the same unit.
+    contact: contact positions in training, None if unknown.
+    fingertip: setting `skin.fingertip`.
     """
 
     number: int
@@ -37,7 +43,7 @@ class View:
 
     @property
     def origin(self) -> str:
-        """That the skin is not a real one, "" if it is."""
+        """A note that the skin is simulated or replayed, "" for a real skin."""
         return {"usb": "", "replay": "REPLAYED"}.get(self.source, "SIMULATED")
 
     @property
@@ -54,4 +60,4 @@ class Display(Protocol):
     """Shows one View after another."""
 
     def show(self, view: View) -> None:
-        """Show `view` in place of the one before."""
+        """Show `view` instead of the previous View."""

@@ -1,1 +1,1 @@
-"""From frames and edges to sweeps, and from sweeps to files: recordings, black box, captures."""
+"""Cuts sweeps from frames, and writes them to files: recordings, black box, captures."""

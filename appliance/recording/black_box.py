@@ -1,8 +1,7 @@
-"""The black box: the last sweeps in service with their verdicts. In: sweeps, verdicts. Out: files
-for `palpate replay`.
+"""The black box: files of the last sweeps in service with their verdicts, for `palpate replay`.
 
-Sweeps without a window are not kept. Their sentence holds everything that is known, and a robot
-that continues without a skin would displace the sweeps that have a window.
+Sweeps without a window are not kept. Their sentence has all information, and a robot that continues
+without a skin would push out the sweeps that have a window.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from appliance.recording.recording import FULL, SweepFolder
 class BlackBox(Observer):
     """Keeps the last `most` sweeps in `folder`, also over restarts.
 
-    An old sweep is removed after the new one was written, on a full disk before.
+    The oldest sweep is removed after the new sweep was written, on a full disk before.
     """
 
     def __init__(self, folder: Path, format: SweepFormat, most: int) -> None:
@@ -36,7 +35,7 @@ class BlackBox(Observer):
         )  # now, at the start, since it waits for the disk several times
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Write the sweep if it has a window, and remove the oldest if there are too many."""
+        """Write the sweep if it has a window, and remove the oldest sweep beyond `most`."""
         if len(sweep.frames):
             self._with_folder(lambda folder: self._put(folder, sweep, verdict, circumstances))
 

@@ -1,8 +1,7 @@
-"""Captures: everything that the box receives, in one file. In: transfers, sensor states, edges and
-commands with their times. Out: a file; and `Playback`, which gives its content to the same modules
-again.
+"""Captures: one file with all inputs of the box (transfers, sensor states, edges and commands, with
+their times), and `Playback`, which feeds them to the same modules again.
 
-The verdicts of a capture are the same bit for bit, since they depend on nothing else.
+The verdicts of a replayed capture are the same, bit for bit, since they depend on nothing else.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from appliance.io.usb_sensor import OPENED, SensorCounters
 
 MAGIC = b"PPLPCAP1"
 MOST_KEPT = 99
-"""Most captures of the same name from earlier starts."""
+"""Largest number of captures of the same name from earlier starts."""
 _RECORD = struct.Struct("<BQI")
 _EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
@@ -39,7 +38,7 @@ _MOST_NS = 1 << 63
 
 
 class RecordKind(IntEnum):
-    """Content of a record."""
+    """Kind of a record's content."""
 
     TRANSFER = 0
     STATE = 1
@@ -48,17 +47,17 @@ class RecordKind(IntEnum):
 
 
 class CaptureWriter(Observer):
-    """Writes a capture while the box runs; a power failure loses at most what the system had not
-    written yet.
+    """Writes a capture while the box runs. A power failure loses at most the records that the
+    system had not written yet.
 
-    If the file cannot be written any more the capture ends, since one with a gap would replay
-    differently; classifying goes on. A file that is there, of an earlier start, becomes `path.1`,
-    or the next number that is free. profile: of the skin, which decides how its bytes are read.
-    Raises ConfigError if the file cannot be opened.
+    After a failed write the capture ends, since a capture with a gap would replay differently;
+    classifying goes on. A file of an earlier start is renamed to `path.1` or the next free number.
+    profile: of the skin; it decides how its bytes are read. Raises ConfigError if the file cannot
+    be opened.
     """
 
     def __init__(self, path: Path, format: SweepFormat, profile: SkinProfile = PALPATE) -> None:
-        # that of PROTOCOL.md is left out, so that captures remain those of earlier versions
+        # the profile of PROTOCOL.md is left out, as in captures of earlier versions
         head = json.dumps(
             format.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
         ).encode()
@@ -92,11 +91,11 @@ class CaptureWriter(Observer):
         )
 
     def command(self, t_ns: int, line: str) -> None:
-        """Write a command that was executed, in the form of a sentence."""
+        """Write a command that was executed, as a sentence."""
         self._write(RecordKind.COMMAND, t_ns, line.encode())
 
     def close(self) -> None:
-        """Finish the file."""
+        """Close the file."""
         self._put(self._file.close)
 
     def _write(self, kind: RecordKind, t_ns: int, data: bytes) -> None:
@@ -108,26 +107,26 @@ class CaptureWriter(Observer):
 
 
 def _set_aside(path: Path) -> None:
-    """Give the capture of an earlier start another name: a box restarts by itself. Raises OSError,
-    and ConfigError where there are too many."""
+    """Rename the capture of an earlier start, because a box restarts by itself. Raises OSError, and
+    ConfigError if there are too many captures."""
     if not path.is_file() or not path.stat().st_size:  # /dev/full, a pipe
         return
     kept = (path.with_name(f"{path.name}.{i}") for i in range(1, MOST_KEPT + 1))
     free = next((name for name in kept if not name.exists()), None)
     if not free:
         raise ConfigError(
-            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; "
-            "move them away"
+            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them "
+            "away"
         )
     path.rename(free)
-    log.info(f"capture: {path} was there, of an earlier start; it is {free.name} now")
+    log.info(f"capture: {path} of an earlier start was renamed to {free.name}")
 
 
 class Playback:
-    """Sensor, trigger, clock and source of commands of a replayed capture: each record is returned
+    """Sensor, trigger, clock and source of commands of a replayed capture. Each record is returned
     at its time.
 
-    Raises FormatError if the file cannot be read or is no capture; an incomplete last record is
+    Raises FormatError if the file cannot be read or is not a capture. An incomplete last record is
     left out.
     """
 
@@ -136,12 +135,12 @@ class Playback:
             data = path.read_bytes()
         except OSError as e:
             raise FormatError(
-                f"{path}: cannot be read: {e.strerror}; name what `palpate run --capture` wrote"
+                f"{path}: cannot be read: {e.strerror}; name a file of `palpate run --capture`"
             ) from e
         if not data.startswith(MAGIC):
             raise FormatError(
-                f"{path}: not a capture (it begins with {data[:8]!r}); "
-                "`palpate run --capture` writes one"
+                f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` "
+                "writes captures"
             )
         begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
         try:
@@ -159,21 +158,19 @@ class Playback:
         self.identity: Identity | None = None
         self.counters = SensorCounters()
         self.about = {"mode": "capture", "times": "as captured"}
-        self.edge_counters = (
-            EdgeCounters()
-        )  # a capture holds the edges that were reported, none of the others
+        self.edge_counters = EdgeCounters()  # a capture holds only the edges that were reported
         self._stream = skin_stream.stream(profile, self.format, self.counters)
         self._records = deque(_records(path, data, begin))
         self._now_ns = self._records[0][1] if self._records else 0
 
     @property
     def finished(self) -> bool:
-        """True when all records were played."""
+        """True after all records were played."""
         return not self._records
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Sensor: how well the board's time is known (DeviceClock.quality)."""
+        """Sensor: accuracy of the readout board's time (DeviceClock.quality)."""
         return self._stream.clock
 
     @property
@@ -190,7 +187,7 @@ class Playback:
 
     @property
     def blind(self) -> bool:
-        """Trigger: never; a capture holds the edges that the box was given."""
+        """Trigger: never, since a capture holds all edges that the box received."""
         return False
 
     def read(self) -> Frames:
@@ -201,17 +198,17 @@ class Playback:
             if kind in (RecordKind.TRANSFER, RecordKind.STATE):
                 self._records.popleft()
             if kind == RecordKind.TRANSFER:
-                with suppress(SensorMismatch):  # the state that followed is the next record
+                with suppress(SensorMismatch):  # the resulting state is the next record
                     frames = self._stream.feed(data, self._now_ns)
-                if self._opened:  # the sensor did not pass them on: it was not streaming yet
+                if self._opened:  # the sensor was not streaming yet and did not return them
                     frames = Frames.empty(self.format)
             elif kind == RecordKind.STATE:
                 self._enter(data.decode())
         return frames
 
     def _enter(self, state: str) -> None:
-        """Play a STATE record. In captures of version 0.1, `streaming` was written when the skin
-        was opened; since then, OPENED is."""
+        """Play a STATE record. When the skin is opened, OPENED is written; version 0.1 wrote
+        `streaming`."""
         if state == OPENED or (state == "streaming" and not self._opened):
             self._stream.restart()
         self._opened = state == OPENED
@@ -219,7 +216,7 @@ class Playback:
             self.state = state
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Trigger: the edges that the box was given at this time."""
+        """Trigger: the edges that the box received at this time."""
         edges = []
         while (
             self._records
@@ -243,15 +240,15 @@ class Playback:
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
     """The records (kind, host ns, content) from byte `at` on. Raises FormatError for an unknown
-    one."""
+    record."""
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
         whole = len(body) == size
         if kind >= len(RecordKind) or (whole and not _written(kind, t_ns, body)):
             raise FormatError(
-                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; "
-                "capture again"
+                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture "
+                "again"
             )
         if whole:
             yield RecordKind(kind), t_ns, body
@@ -259,7 +256,7 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
 
 
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
-    """Whether CaptureWriter can have written this record."""
+    """Whether this record can come from CaptureWriter."""
     if kind == RecordKind.EDGES:
         return not len(body) % _EDGE.size and all(
             k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body)

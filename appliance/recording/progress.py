@@ -1,5 +1,4 @@
-"""How far a recording has got. In: material and position of each stored sweep. Out: what is still
-missing, in words."""
+"""The progress of a recording, from material and position of each stored sweep."""
 
 from __future__ import annotations
 
@@ -7,14 +6,14 @@ from collections import Counter
 from itertools import product
 
 MOST_SHOWN = 6
-"""Most pairs of material and position that a line names."""
+"""Largest number of pairs of material and position in a line."""
 
 
 class RecordingProgress:
-    """Counts sweeps per material and position; `target`: how many of each are wanted.
+    """Counts sweeps per material and position. target: wanted number of sweeps of each pair.
 
-    A model learns a material from the positions at which it was recorded, so that each material is
-    wanted at every position that any of them has.
+    A model learns a material from the positions at which it was recorded. So each material is
+    wanted at every position in the recording.
     """
 
     def __init__(self, target: int) -> None:
@@ -22,28 +21,26 @@ class RecordingProgress:
         self._count: Counter[tuple[str, str]] = Counter()
 
     def add(self, material: str, position: str, sweeps: int = 1) -> None:
-        """Count a sweep that was stored, or with -1 one that was removed. Without a material it is
-        of no use yet."""
+        """Count stored sweeps; -1 for a removed sweep. Sweeps without a material are not counted,
+        since a model cannot be trained on them."""
         if material:
             self._count[material, position] += sweeps
 
     @property
     def counts(self) -> list[tuple[str, str, int]]:
-        """Material, position and number of stored sweeps of each pair that has any, in order."""
+        """Material, position and number of stored sweeps, in order, of each pair with sweeps."""
         return [(*pair, number) for pair, number in sorted((+self._count).items())]
 
     def line(self, material: str, position: str) -> str:
-        """What there is of this pair, and what is missing of all: "wood at 2: 3 of 10; missing:
-        wood at 2: 7"."""
+        """The count of this pair, and all missing sweeps: "wood at 2: 3 of 10; missing: wood at 2:
+        7"."""
         if not material:
             return "no material, so it cannot be trained on; name it with MATERIAL or --material"
-        return (
-            f"{_name(material, position)}: {self._count[material, position]} "
-            f"of {self.target}; {self.missing()}"
-        )
+        count = self._count[material, position]
+        return f"{_name(material, position)}: {count} of {self.target}; {self.missing()}"
 
     def missing(self) -> str:
-        """What is still missing, as far as materials and positions are known."""
+        """The missing sweeps of the known materials and positions, in words."""
         held = +self._count
         materials, positions = (
             (sorted(set(names)) for names in zip(*held, strict=True)) if held else ((), ())

@@ -1,8 +1,7 @@
-"""Records sweeps to files, with labels that a researcher gives by commands while the robot works
+"""Records sweeps to files, with labels that a researcher sets by commands while the robot works
 (`palpate record`).
 
-In: sweeps with their verdicts, commands. Out: sweep-NNNNNN.npy and .json in one folder, a REC
-sentence for each sweep.
+Each sweep becomes sweep-NNNNNN.npy and .json in one folder, and is reported in a REC sentence.
 """
 
 from __future__ import annotations
@@ -31,31 +30,31 @@ from appliance.recording.progress import RecordingProgress
 from appliance.service.systemd import words
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errnos of a full disk."""
+"""Error numbers of a full disk."""
 LEAST_FREE = 64 << 20, 20
-"""Space that is left free for the system: this many bytes, or on a small disk one part in this
-many. A card that is completely full can stop more than a recording."""
+"""Space that is left free for the system: this number of bytes, or on a small disk one part in this
+number. A completely full card can stop more than a recording."""
 TARGET = 10
-"""Sweeps that are wanted of each material at each position, where nothing else is asked for."""
+"""Default of the wanted number of sweeps of each material at each position."""
 MOST_CHANGES = 1024
-"""Number of label changes that are kept until the sweeps before them are answered; far more than a
-person makes."""
+"""Largest number of label changes that are kept until the sweeps before them are answered; far more
+than a person makes."""
 DISCARDED = ".discarded"
-"""Suffix of what is left of a discarded sweep, so that its number is not used again: its sidecar
-under another name, since a rename needs no space. It goes when a later number is in use."""
+"""Suffix of the file that reserves the number of a discarded sweep. It is the renamed sidecar,
+since a rename needs no space, and is removed once a later number is in use."""
 _KEPT = re.compile(
     rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?"
 )
 
 
 class SweepFolder:
-    """A folder of sweeps with their verdicts. Numbers continue after a restart, and none is used
-    twice.
+    """A folder of sweeps with their verdicts. Numbers continue after a restart, and no number is
+    used twice.
 
-    Unfinished files of a program that was killed are removed. One program at a time uses the
-    folder; its lock ends with the program. numbers: of the sweeps in the folder, in order. run: the
-    number of this run's sweep 0; sidecars hold it, since each run counts its sweeps and objects
-    from 1. Raises OSError if the folder cannot be made, read or locked.
+    Unfinished files of a program that was killed are removed. Only one program at a time can use
+    the folder; its lock ends with the program. numbers: of the sweeps in the folder, in order. run:
+    offset of this run's sweep numbers in the folder; sidecars have it, since each run counts its
+    sweeps and objects from 1. Raises OSError if the folder cannot be made, read or locked.
     """
 
     def __init__(self, folder: Path, format: SweepFormat) -> None:
@@ -82,9 +81,10 @@ class SweepFolder:
         return number
 
     def remove(self, number: int, *, reserve: bool = False) -> None:
-        """Remove a sweep, its .npy first, so that none is ever without its sidecar. Raises OSError.
+        """Remove a sweep, its .npy first, so that no .npy is ever without its sidecar. Raises
+        OSError.
 
-        reserve: its number is not used again after a restart, although it was the highest.
+        reserve: do not use its number again after a restart, even if it was the highest.
         """
         path = self.path(number)
         path.unlink(missing_ok=True)
@@ -127,15 +127,15 @@ def _make(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for above in (
         folder.resolve().parents
-    ):  # all: a run that was killed may have made folders without syncing them
-        with suppress(PermissionError):  # a folder that we may not open was not made by us
+    ):  # all folders: a run that was killed may have made folders without syncing them
+        with suppress(PermissionError):  # a folder that we may not open is not ours
             storage.sync(above)
 
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Material, position on it, and session; "" is not known. Raises ConfigError for a text that
-    cannot be sent."""
+    """Material, position on the object, and session; "" if unknown. Raises ConfigError for a text
+    that cannot be sent."""
 
     material: str = ""
     position: str = ""
@@ -153,11 +153,11 @@ class Labels:
 
 class RecordingSession(Observer):
     """Records each sweep that has a window, with the labels that applied at its start edge, and
-    logs what is missing.
+    logs the missing sweeps.
 
-    say: takes REC sentences. target: sweeps that are wanted of each material at each position;
-    sweeps of earlier runs in the folder count. Raises ConfigError if the folder cannot be used, or
-    holds sweeps of another form.
+    say: called with REC sentences. target: wanted number of sweeps of each material at each
+    position; sweeps of earlier runs in the folder count. Raises ConfigError if the folder cannot be
+    used, or has sweeps of another format.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class RecordingSession(Observer):
         self._progress = RecordingProgress(target)
         self._count_earlier(format)
         self._clock, self._say = clock, say
-        # (valid from, labels): a command that comes during a sweep does not apply to it
+        # (valid from, labels): a command during a sweep does not apply to that sweep
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._answered = False
         self._stored: list[tuple[int, Labels, Status]] = []
@@ -194,14 +194,16 @@ class RecordingSession(Observer):
 
     @property
     def stored(self) -> int:
-        """Number of sweeps of this run on the disk."""
+        """Number of stored sweeps of this run."""
         return len(self._stored)
 
     def about(self) -> dict[str, Any]:
-        """How far the recording has got, for JSON: labels that hold now, sweeps of this run, what
-        there is of each material and position, how many are wanted of each, and what is missing in
-        words; what became of the last sweep, as in REC, and the number of the one that DISCARD
-        would remove (None: there is none)."""
+        """The progress of the recording, for JSON.
+
+        It has the present labels, the number of sweeps of this run, the count and the wanted number
+        of each material and position, the missing sweeps in words, the outcome of the last sweep as
+        in REC, and the number of the sweep that DISCARD would remove (None: no sweep).
+        """
         return {
             **asdict(self._labels[-1][1]),
             "stored": self.stored,
@@ -243,44 +245,43 @@ class RecordingSession(Observer):
         )
 
     def close(self) -> None:
-        """Release the folder, and log how many sweeps were stored, if there was one to store."""
+        """Release the folder. Log the number of stored sweeps if there was a sweep to store."""
         self._folder.close()
         if not self._answered:
             return
         log.info(
-            "record: sweeps of this run "
-            f"in {self._folder.folder}: {self.stored}; {self._progress.missing()}"
+            f"record: sweeps of this run in {self._folder.folder}: {self.stored}; "
+            f"{self._progress.missing()}"
         )
 
     def _count_earlier(self, format: SweepFormat) -> None:
-        """Count the sweeps that the folder holds already. Raises ConfigError for one of another
-        form."""
+        """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
+        format."""
         for number in self._folder.numbers:
             path = self._folder.path(number)
             try:
                 about = sidecar(path)
-                form, status, labels = (
+                stored, status, labels = (
                     about["format"],
                     Status(about["verdict"]["status"]),
                     _labels(about),
                 )
             except (FormatError, ConfigError, KeyError, TypeError, ValueError):
-                continue  # not one of ours, or damaged: train names it
-            if form != format.json():
+                continue  # not a sweep of ours, or damaged: training reports it
+            if stored != format.json():
                 self._folder.close()
                 raise ConfigError(
-                    f"{path} holds another form of sweeps than {format}, and a model is trained "
-                    "on one form; "
-                    "name another folder with --out"
+                    f"{path} has another format than {format}, and a model is trained on one "
+                    "format; name another folder with --out"
                 )
             self._count(labels, status)
 
     def _count(self, labels: Labels, status: Status, sweeps: int = 1) -> None:
-        if not status.faulty:  # such a sweep is not trained on
+        if not status.faulty:  # a faulty sweep is not used in training
             self._progress.add(labels.material, labels.position, sweeps)
 
     def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
-        """Log what became of a sweep: for a person beside the robot, and for one at a terminal."""
+        """Log the outcome of a sweep, for a person beside the robot and a person at a terminal."""
         if outcome in ("full", "failed"):
             return  # that was logged when it began
         if verdict.status.faulty or outcome != "stored":
@@ -319,15 +320,15 @@ class RecordingSession(Observer):
         position = self._labels[-1][1].position
         if not position.isdecimal():
             raise ApplianceError(
-                f"position {position!r} has no next one; begin with PPLP POSITION 1"
+                f"position {position!r} has no next position; begin with PPLP POSITION 1"
             )
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
     def _discard(self, which: str) -> list[object]:
-        """Remove the last stored sweep of this run; returns its number, how many are left, and its
-        file name.
+        """Remove the last stored sweep of this run; returns its number, the number of sweeps left,
+        and its file name.
 
-        which: its number, from who has seen it and means no later one; "" for whichever it is.
+        which: the expected number, so that a later sweep is not removed by mistake; "" for any.
         """
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
@@ -351,12 +352,12 @@ class RecordingSession(Observer):
 
 
 def _labels(about: Mapping[str, Any]) -> Labels:
-    """The labels in a sidecar. Raises ConfigError or KeyError if they are none."""
+    """The labels in a sidecar. Raises ConfigError or KeyError if it has no valid labels."""
     return Labels(*(str(about[name]) for name in Labels.__slots__))
 
 
 def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
-    """The line of the log for a changed outcome."""
+    """The message in the log for a changed outcome."""
     if outcome == "stored":
         return f"record: sweeps are stored again, from sweep {sweep} on"
     advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"

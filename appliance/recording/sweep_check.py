@@ -1,8 +1,7 @@
-"""Answers sweeps that are recorded before there is a bundle. In: Sweeps, frames. Out: Verdicts
-without a label.
+"""Answers sweeps in recordings without a bundle, by verdicts without a label.
 
-The status is `recorded`, or what a skin's counts alone show to be wrong: no contact, saturation,
-stuck and dead taxels.
+The status is `recorded`, or a fault that the raw counts show: no contact, saturation, stuck and
+dead taxels.
 """
 
 from __future__ import annotations
@@ -25,8 +24,9 @@ UNCHECKED = Finding(
 
 
 class SweepCheck(Observer):
-    """Checks each window against the unloaded skin, which it finds by itself; a TARE says where it
-    is. model: "", since there is none.
+    """Checks each window against the unloaded skin, which it finds by itself or takes from a TARE.
+
+    model: "", since there is no bundle.
     """
 
     model = ""
@@ -37,7 +37,7 @@ class SweepCheck(Observer):
         self._epoch = -1
 
     def frames(self, frames: Frames) -> None:
-        """Look for the unloaded skin."""
+        """Search the frames for the unloaded skin."""
         epoch = int(frames.seq[-1]) >> EPOCH_BITS
         if epoch != self._epoch:
             self._epoch = epoch
@@ -45,7 +45,7 @@ class SweepCheck(Observer):
         self._unloaded.put(frames.taxels)
 
     def __call__(self, sweep: Sweep) -> Verdict:
-        """The verdict on one sweep. A sweep whose status is not ok keeps it."""
+        """The verdict on one sweep. A sweep with another status than ok keeps it."""
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
             finding = self._checked(sweep.frames.taxels)
@@ -73,15 +73,15 @@ class SweepCheck(Observer):
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 
     def about(self) -> dict[str, Any]:
-        """For sidecars: the unloaded skin as it was found, level and noise in counts; None where it
-        was not certain."""
+        """Entries for sidecars: level and noise of the unloaded skin in raw counts, None while it
+        is not certain."""
         found = self._unloaded.skin if self._unloaded.certain else None
         return {
             "unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}
         }
 
     def describe(self) -> list[object]:
-        """No bundle, and the format."""
+        """The fields of the answer to ID: no bundle, and the format."""
         return ["recording", "", self.model, self.format]
 
     def test(self) -> str:

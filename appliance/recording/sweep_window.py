@@ -1,9 +1,8 @@
-"""Cuts the window of each sweep from the stream of frames. In: Frames of the sensor, edges of the
-trigger. Out: one Sweep per trigger, with a complete window or a status that says why there is none;
-the open sweep so far, for early answers.
+"""Cuts the window of each sweep from the stream of frames.
 
-The window is the middle of the sweep (paper, sec. II.B): it is located by time and cut by sequence
-number.
+Each trigger gives one Sweep, with a complete window or with a status that explains why it has none.
+For early answers the open sweep is returned while it goes on. The window is the middle of the sweep
+(paper, sec. II.B). It is located by time and cut by sequence number.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from appliance.core.config import SweepConfig
 from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 
 MAX_GAP = 2
-"""Largest number of consecutive missing frames that are interpolated; with more the status is
+"""Largest number of consecutive missing frames that are interpolated; for more the status is
 `gap`."""
 
 
 @dataclass(slots=True)
 class _Open:
-    """A sweep between its edges. answered: it was answered already, and only its stop edge is still
-    expected.
+    """A sweep between its edges.
 
-    first: number of the first frame for early answers, None until it has come. step: steps that
+    answered: it was answered already, and only its stop edge is still expected. first: number of
+    the first frame for early answers, None until that frame has arrived. step: number of steps that
     `so_far` has returned.
     """
 
@@ -41,8 +40,8 @@ class _Open:
 
 
 class SweepCutter:
-    """Cuts windows: holds the frames of a little more than `max_duration_s`, and the sweeps that
-    were not answered yet."""
+    """Cuts windows. It holds the frames of the last `max_duration_s` and a margin, and the sweeps
+    that were not answered yet."""
 
     def __init__(self, format: SweepFormat, config: SweepConfig) -> None:
         self._format = format
@@ -53,8 +52,7 @@ class SweepCutter:
             + 2 * MAX_GAP
             + int((config.max_duration_s + config.late_ms / 1000 + 1) * format.rate_hz)
         )
-        # slot = seq % size: a frame is found without searching and stays available until it is
-        # overwritten
+        # slot = seq % size: a frame is found without searching, and stays until it is overwritten
         self._seq = np.full(self._size, -1, np.int64)
         self._t_ns = np.zeros(self._size, np.int64)
         self._taxels = np.zeros((self._size, *format.shape), format.numpy_type)
@@ -72,8 +70,7 @@ class SweepCutter:
         return bool(self._closing) or (self._open is not None and not self._open.answered)
 
     def put(self, frames: Frames, now_ns: int) -> None:
-        """Put frames into the ring. Frames of a new enumeration end the open sweep, which began
-        before it."""
+        """Put frames into the ring. Frames of a new enumeration end the open sweep."""
         if not len(frames):
             return
         if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
@@ -91,8 +88,8 @@ class SweepCutter:
         self._newest = int(frames.seq[-1])
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
-        """Process trigger edges of one turn in their order. ready: whether the box could take a
-        sweep when they came."""
+        """Process the trigger edges of one turn in order. ready: whether the box could take a sweep
+        when they came."""
         before = self._count
         for edge in edges:
             if edge.kind is EdgeKind.START:
@@ -102,7 +99,7 @@ class SweepCutter:
             elif edge.kind is EdgeKind.NEW_OBJECT:
                 self.new_object()
             elif not self.interrupt(Status.EDGES_LOST, now_ns) and self._count == before:
-                # otherwise a sweep of this turn was answered: the robot counts one answer for it
+                # else a sweep of this turn was answered, and the robot expects one answer for it
                 self._answer(self._begin(edge.t_ns), edge.t_ns, Status.EDGES_LOST, now_ns)
 
     def new_object(self) -> None:
@@ -110,8 +107,8 @@ class SweepCutter:
         self._object += 1
 
     def interrupt(self, status: Status, now_ns: int) -> bool:
-        """Answer all unanswered sweeps with `status`; False if there was none. A later stop edge
-        gives no answer."""
+        """Answer all unanswered sweeps with `status`. Returns whether there were any. A later stop
+        edge gives no answer."""
         had = self.sweeping
         if self._open and not self._open.answered:
             self._answer(self._open, now_ns, status, now_ns)
@@ -121,7 +118,7 @@ class SweepCutter:
         return had
 
     def finished(self, now_ns: int) -> list[Sweep]:
-        """The sweeps that can be answered at `now_ns`, in the order of their numbers."""
+        """The sweeps that can be answered at `now_ns`, in order of their numbers."""
         if (
             self._open
             and not self._open.answered
@@ -143,10 +140,10 @@ class SweepCutter:
         """The open sweep at each step that was reached since the last call, until `settle` marks it
         as answered.
 
-        steps: D; step d = 1..D is reached with frame ceil(d * window / (D + 1)) of the window that
-        begins `lead_ms` after the start edge, and gives a Sweep of exactly these frames, however
-        they were grouped in transfers. After a gap that cannot be filled no further steps are
-        returned.
+        steps: D. Step d = 1..D is reached with frame ceil(d * window / (D + 1)) of the window that
+        begins `lead_ms` after the start edge. Its Sweep has exactly the frames up to this frame,
+        independent of their grouping in transfers. After a gap that cannot be filled no further
+        steps are returned.
         """
         sweep = self._open
         while sweep and not sweep.answered and not self._closing and sweep.step < steps:
@@ -179,8 +176,8 @@ class SweepCutter:
             self._open.answered = True
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if some
-        of them are missing."""
+        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if frames
+        are missing."""
         window = np.arange(self._newest - n + 1, self._newest + 1)
         slots = window % self._size
         return (
@@ -222,7 +219,7 @@ class SweepCutter:
         )
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
-        """The sweep with its window, or None while frames of it may still come."""
+        """The sweep with its window, or None while its frames may still arrive."""
         window = self._format.window
         first = self._seq_at((sweep.start_ns + stop_ns) / 2) - window // 2
         late = now_ns > stop_ns + self._late_ns
@@ -233,8 +230,8 @@ class SweepCutter:
         return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
 
     def _window(self, first: int, n: int) -> tuple[Frames, int]:
-        """Frames `first` to `first + n`, missing ones interpolated, and their number; no frames if
-        a gap is too wide."""
+        """Frames `first` to `first + n` with missing frames interpolated, and the number of missing
+        frames. No frames if a gap is too wide."""
         pad = MAX_GAP
         seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
@@ -245,8 +242,7 @@ class SweepCutter:
         return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
 
     def _seq_at(self, t_ns: float) -> int:
-        """Number of the frame that was taken nearest to `t_ns`, computed from the nearest frame in
-        the ring."""
+        """Number of the frame at `t_ns`, computed from the nearest frame in the ring."""
         k = int(np.abs(self._t_ns - round(t_ns)).argmin())
         return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
 

@@ -139,8 +139,8 @@ def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
     last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
     assert last.hint == (
-        "this bundle cannot tell contact, so it has no trained position; "
-        "train one on sweeps of palpate record"
+        "this bundle cannot detect contact, so it has no trained position; "
+        "train a bundle on sweeps of palpate record"
     )
 
 

@@ -1,5 +1,5 @@
-"""A bundle with an enrolled label in the store: on trial, gone back from, older, and every way in
-which it is refused."""
+"""A bundle with an enrolled label in the store: trial, rollback, age, and each reason for a
+refusal."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ pytestmark = [deliveries.NEEDED, pytest.mark.slow]
 
 @pytest.fixture
 def box(tmp_path: Path) -> Delivery:
-    """A box that has seen no bundle yet."""
+    """A box without a delivered bundle."""
     return Delivery(tmp_path)
 
 
 def grown(box: Delivery, label: str = "cork") -> dict[str, bytes]:
-    """What the box makes of the bundle that runs now."""
+    """The files of the running bundle after the enrolment of a label."""
     return deliveries.enrolled(dict(box.store.running().files), box.enrolment_key, label)
 
 
 def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
-    """Enrolled into a delivered bundle: it runs on trial, is committed, and `rollback` leads to the
-    one without it."""
+    """A label is enrolled into a delivered bundle. The new bundle runs on trial and is committed;
+    `rollback` leads to the bundle without the label."""
     one = box.committed(1)
     with_cork = box.store.enrol(grown(box))
     chosen = box.store.choose()
@@ -45,7 +45,7 @@ def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
 
 
 def test_a_second_label_and_the_packaged_bundle(box: Delivery):
-    """The packaged bundle is believed like the program; a second label is enrolled into the same
+    """The packaged bundle is trusted like the program. A second label is enrolled into the same
     bundle."""
     first = box.store.enrol(grown(box))
     second = box.store.enrol(grown(box, "felt"))
@@ -64,8 +64,8 @@ def test_three_bad_starts_lead_back_to_the_bundle_without_the_label(box: Deliver
 
 
 def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery):
-    """A newer bundle is taken; then what was enrolled into the older one is older, too. The one
-    that runs may lose its label by being delivered again."""
+    """After a newer bundle was committed, labels that were enrolled into the older bundle are
+    refused. Delivering the running bundle again may remove its label."""
     box.committed(1)
     old = grown(box)
     with_cork = box.store.enrol(old)
@@ -82,8 +82,8 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery)
 def check_refused(
     box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
 ) -> None:
-    """The box does not take these files, neither from a folder nor from itself, and runs what it
-    ran."""
+    """The box refuses these files, from a folder and from its own enrolment, and continues with the
+    same bundle."""
     before = box.store.current
     for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.enrol(files)):
         with pytest.raises(kind, match=why):
@@ -92,9 +92,9 @@ def check_refused(
 
 
 def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
-    """Without its signature, by another box's key, by a signer of bundles; labels of another
-    bundle, other labels of this one; a base that nobody signed, of an unknown signer, or
-    altered."""
+    """Refused: an enrolment without a signature, signed by another box, or by a signer of bundles;
+    labels of another bundle, other labels of this bundle; a base that is unsigned, altered, or by
+    an unknown signer."""
     box.committed(1)
     good, unsigned = grown(box), deliveries.enrolled(dict(box.store.running().files), None)
     other_box = install_scripts.enrolment_key(tmp_path / "other")
@@ -131,8 +131,8 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
 
 
 def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
-    """Whoever has the box's private key cannot pass off another model, threshold or class mean as
-    enrolled."""
+    """A person with the box's private key cannot change the model, a threshold or a class mean by
+    an enrolment."""
     box.committed(1)
     good = grown(box)
     evil = deliveries.signed(deliveries.files(1, None, name="evil"), box.enrolment_key.folder / KEY)
@@ -145,8 +145,8 @@ def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
 
 
 def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Delivery):
-    """Without the private key the box goes on; without the signer it says what to do, and goes on
-    once it is made again."""
+    """Without the private key the box continues. Without the signer the error says what to do, and
+    the box continues after the signer was made again."""
     box.committed(1)
     box.store.enrol(grown(box))
     assert box.store.commit()
@@ -165,8 +165,8 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
 def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
     box: Delivery, monkeypatch: pytest.MonkeyPatch
 ):
-    """The base was replaced by an upgrade: it is told, with what to do, and `rollback` leads to the
-    new packaged bundle."""
+    """An upgrade replaced the base: the error says what to do, and `rollback` leads to the new
+    packaged bundle."""
     box.store.enrol(grown(box))
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
@@ -181,7 +181,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
 
 
 def test_a_damaged_enrolment_is_told_and_gone_back_from(box: Delivery):
-    """One byte of it has changed on the card."""
+    """One byte of the enrolment has changed on the card."""
     one, sha = box.committed(1), box.store.enrol(grown(box))
     assert box.store.commit()
     path = box.store.bundles.at(sha) / bundle.ENROLMENT

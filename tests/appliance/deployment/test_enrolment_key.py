@@ -1,5 +1,5 @@
-"""The box's key for enrolments: made at the install, private, for nothing else; what is said where
-it is missing or damaged."""
+"""The box's key for enrolments: made at the install, private, for nothing else; and the errors if
+the key is missing or damaged."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def key(tmp_path: Path) -> EnrolmentKey:
 
 
 def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
-    """Nobody else may read it, it signs, the signer believes it; another install changes
+    """Nobody else may read the key, it signs, and its signatures are valid. Another install changes
     nothing."""
     assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
     assert (key.folder / SIGNER).stat().st_mode & 0o777 == 0o644
@@ -41,7 +41,8 @@ def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
 
 
 def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
-    """Another box's signature, one of other data, one for another use, a cut one: none passes."""
+    """A signature of another box, of other data, or for another use, and a cut signature are
+    refused."""
     other = install_scripts.enrolment_key(tmp_path / "other")
     assert (other.folder / KEY).read_bytes() != (key.folder / KEY).read_bytes()
     good = key.sign(DATA)
@@ -61,8 +62,8 @@ def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
 
 
 def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
-    """Even an administrator who puts its line among the signers of bundles makes none of its
-    signatures one of a bundle."""
+    """Its signatures are not valid for bundles, even if an administrator adds its line to the
+    signers of bundles."""
     signers = tmp_path / "allowed_signers"
     signers.write_text((key.folder / SIGNER).read_text())
     for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):
@@ -71,17 +72,17 @@ def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
 
 
 def lost(key: EnrolmentKey) -> None:
-    """The private key is gone."""
+    """Remove the private key."""
     (key.folder / KEY).unlink()
 
 
 def open_to_all(key: EnrolmentKey) -> None:
-    """Others may read it."""
+    """Let others read the private key."""
     (key.folder / KEY).chmod(0o444)
 
 
 def cut(key: EnrolmentKey) -> None:
-    """Half of it is left."""
+    """Cut the private key to half its length."""
     path = key.folder / KEY
     half = path.read_bytes()[: path.stat().st_size // 2]
     path.chmod(0o600)
@@ -90,21 +91,21 @@ def cut(key: EnrolmentKey) -> None:
 
 
 def empty(key: EnrolmentKey) -> None:
-    """Nothing of it is left."""
+    """Make the private key an empty file."""
     (key.folder / KEY).chmod(0o600)
     (key.folder / KEY).write_bytes(b"")
     (key.folder / KEY).chmod(0o400)
 
 
 def of_another(key: EnrolmentKey) -> None:
-    """The key of another box is there."""
+    """Replace the private key by the key of another box."""
     other = install_scripts.enrolment_key(key.folder.parent / "another")
     shutil.copy2(other.folder / KEY, key.folder / "new")
     (key.folder / "new").replace(key.folder / KEY)
 
 
 def unsigned(key: EnrolmentKey) -> None:
-    """The signer is gone."""
+    """Remove the signer."""
     (key.folder / SIGNER).unlink()
 
 
@@ -125,8 +126,8 @@ def unsigned(key: EnrolmentKey) -> None:
 def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
     key: EnrolmentKey, spoil: Callable[[EnrolmentKey], None], why: str
 ):
-    """Missing, open to others, damaged, another box's, without a signer: before the robot sweeps,
-    in one line."""
+    """A key that is missing, readable by others, damaged, or of another box, or has no signer, is
+    reported in one line before the robot sweeps."""
     spoil(key)
     with pytest.raises(ConfigError, match=why) as e:
         key.check()
@@ -134,8 +135,8 @@ def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
 
 
 def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey):
-    """Where the key is lost the box goes on with what it has; the next install makes no other one,
-    which would end that."""
+    """After the loss of the private key the enrolled labels stay valid. The next install does not
+    make another key, which would make them invalid."""
     signed = key.sign(DATA)
     lost(key)
     install_scripts.enrolment_key(key.folder)
@@ -144,7 +145,7 @@ def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey
 
 
 def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
-    """As `make install` does; what was signed before is believed again."""
+    """`make install` makes the signer again, and earlier signatures are valid again."""
     signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
     unsigned(key)
     install_scripts.enrolment_key(key.folder)
@@ -158,7 +159,7 @@ def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
 
 
 def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest.MonkeyPatch):
-    """It is neither a damaged key nor a wrong signature."""
+    """The error mentions neither a damaged key nor a wrong signature."""
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(ConfigError, match="ssh-keygen is missing"):
         key.sign(DATA)

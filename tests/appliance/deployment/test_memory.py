@@ -1,4 +1,4 @@
-"""Memory: what the service may have is more than what any bundle may need that the box takes."""
+"""Memory: the limit of the service is above the memory of any bundle that the box accepts."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from tests.factories.paths import ROOT
 
 MB = 1 << 20
 OWN = 9 * MB
-"""What onnxruntime takes beside the account of a model."""
+"""Memory of onnxruntime that the count for a model does not include."""
 
 
 def limit() -> int:
-    """Bytes that the unit gives the service."""
+    """The service's limit in its unit, in bytes."""
     unit = (ROOT / "systemd" / "palpate.service").read_text()
     (most,) = re.findall(r"^MemoryMax=(\d+)M$", unit, re.MULTILINE)
     return int(most) * MB
 
 
 def test_the_service_may_have_what_the_check_allows():
-    """The largest model that passes, or two of them where a candidate runs beside, and the program
-    without: below the limit."""
+    """The program with the largest accepted model, or with the two largest in shadow mode, stays
+    below the limit."""
     measured = json.loads((ROOT / "docs" / "data" / "bench.json").read_text())["rss_mb"][
         "without_board"
     ]
@@ -41,7 +41,7 @@ def test_the_service_may_have_what_the_check_allows():
 
 
 def large(numbers: int) -> dict[str, bytes]:
-    """The files of the toy bundle, its class weights spread over so many numbers and back."""
+    """The files of the toy bundle with two large matrices in its model."""
     onnx = pytest.importorskip("onnx")
     model = onnx.load_from_string(toy_bundle.model(("logits",)))
     rng = np.random.default_rng(1)
@@ -87,8 +87,8 @@ print(made.memory, next(line.split()[1] for line in status if line.startswith("V
 
 @pytest.mark.slow
 def test_a_bundle_near_the_limit_leaves_the_service_alive(tmp_path: Path):
-    """As large as the check lets through: the program with it, opened and run, stays below what the
-    unit gives it."""
+    """The program runs a bundle of the largest accepted size and stays below the limit of the
+    unit."""
     folder = toy_bundle.put(tmp_path / "large", large(1_640_000))
     done = subprocess.run(
         [sys.executable, "-c", MEASURE, folder],

@@ -44,7 +44,7 @@ class Side:
         )
 
     def judge(self, *sweeps: Sweep) -> None:
-        """Let both judge each sweep, with the end of its turn."""
+        """Let both bundles classify each sweep, and end its turn."""
         for one in sweeps:
             self.shadow.sweep(one, self.current(one), {"tare": self.tare.tolist()})
             self.turn()
@@ -61,7 +61,7 @@ class Side:
         return found
 
     def kept(self) -> list[Path]:
-        """The sweeps that were kept."""
+        """The kept sweeps."""
         return sorted(self.folder.glob("*.npy"))
 
 
@@ -91,8 +91,8 @@ A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
 
 
 def test_two_that_agree_are_counted_and_nothing_is_kept(side):
-    """They are written after a minute and at the end, not with each sweep; the text has a Wilson
-    interval."""
+    """The counts are written after a minute and at the end, not with each sweep. The text has a
+    Wilson interval."""
     pair = side()
     pair.judge(A, B)
     assert pair.written().compared == 0
@@ -133,7 +133,7 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
 
 
 def test_another_status_is_another_answer(side):
-    """The label is the same, but the robot is asked to sweep once more: that counts as a
+    """The label is the same, but the candidate requests another sweep: this counts as a
     difference."""
     pair = side(
         lambda b: replace(
@@ -145,7 +145,7 @@ def test_another_status_is_another_answer(side):
 
 
 def test_nothing_is_written_while_a_sweep_is_open(side):
-    """Then sweeps are only counted; when the sweep is over, one thing is written in each turn."""
+    """During an open sweep sweeps are only counted. Afterwards one file is written in each turn."""
     pair = side(renamed)
     for one in (A, B):
         pair.shadow.sweep(one, pair.current(one), {"tare": pair.tare.tolist()})
@@ -157,7 +157,7 @@ def test_nothing_is_written_while_a_sweep_is_open(side):
 
 
 def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
-    """A candidate that is always wrong does not fill the disk; counting goes on."""
+    """A candidate that is always wrong does not fill the disk, and counting goes on."""
     monkeypatch.setattr(shadow, "KEPT", 2)
     pair = side(renamed)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 6)))
@@ -165,7 +165,8 @@ def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_it_fuses_by_the_same_rule(side):
-    """The candidate, too, fuses sweeps of one object: neither asks for a third one."""
+    """The candidate also fuses the sweeps of one object, so neither bundle requests a third
+    sweep."""
     pair = side(min_probability=0.9)
     pair.judge(
         toy_bundle.sweep(2.5, 0, 1, object=1),
@@ -177,7 +178,7 @@ def test_it_fuses_by_the_same_rule(side):
 
 
 def test_it_judges_with_the_box_s_tare(side):
-    """A load that the robot has tared is no contact for the candidate either."""
+    """A load that the robot has tared does not count as contact for the candidate."""
     pair = side()
     pair.tare = np.full((2, 2), 1e4)
     pair.current.tare = pair.tare
@@ -186,8 +187,7 @@ def test_it_judges_with_the_box_s_tare(side):
 
 
 def test_without_a_tare_each_bundle_has_its_own(side):
-    """The candidate knows another unloaded skin: it is judged from that, until the robot sends a
-    TARE."""
+    """The candidate has another unloaded skin, which it uses until the robot sends a TARE."""
     pair = side(
         lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, unloaded=(1e4,) * 4))
     )
@@ -199,14 +199,14 @@ def test_without_a_tare_each_bundle_has_its_own(side):
 
 
 def test_what_has_no_window_is_not_compared(side):
-    """A sweep without a window tells nothing about a bundle, so it is not counted."""
+    """A sweep without a window says nothing about a bundle, so it is not counted."""
     pair = side()
     pair.judge(replace(A, status=Status.SHORT, frames=types.Frames.empty(toy_bundle.FORMAT)))
     assert pair.shadow.agreement.compared == 0
 
 
 def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
-    """If the candidate has no heads for it, or would wait for more, the sweep is counted but not
+    """If the candidate has no early heads, or needs more of the sweep, the sweep is counted but not
     compared."""
     files = {"outputs": ("logits", "early"), "known": None}
     eager, slow = (
@@ -255,13 +255,13 @@ class FailingClassifier:
 
 
 def strange() -> None:
-    """What onnxruntime raises shares no base but Exception."""
+    """An error like those of onnxruntime, whose only common base is Exception."""
     raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
 
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
-    """Three failures in a row are logged once, and the candidate is not asked any more; a success
-    starts the count anew."""
+    """After three failures in a row, one line is logged and the candidate is stopped. A success
+    resets the count."""
     pair = side()
     pair.shadow._classifier = FailingClassifier(
         pair.shadow._classifier, lambda s: s.id != 3, strange
@@ -308,8 +308,8 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
 
 @pytest.mark.slow
 def test_a_candidate_that_kills_the_program_stays_away(side):
-    """After three starts without an orderly end within a minute there is no fourth; an orderly end,
-    or a minute, resets the count."""
+    """After three starts in a row that died within a minute, the candidate is not loaded. An
+    orderly end, or a minute, resets the count."""
 
     def start(judged_s: float) -> Shadow:
         pair = side()
@@ -319,7 +319,7 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
 
     for _ in range(2):
         for lived_s in (1, 1, 61):
-            start(lived_s)._sweeps.close()  # what the death of the program does to its lock
+            start(lived_s)._sweeps.close()  # the lock ends with the program
         for _ in range(2):
             start(1)._sweeps.close()
         start(1).stopping()
@@ -349,8 +349,8 @@ def test_a_full_disk_costs_the_record_alone(
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, more memory than there is for two, golden sweeps with other results, a folder
-    that is a file: each is an error that says what to try."""
+    """Another format, too much memory for two models, failing golden sweeps, and a folder that is a
+    file are errors that say what to try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
     with pytest.raises(
@@ -360,7 +360,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
         side(lambda b: replace(b, id="bbbbbbbb", memory=shadow.MOST_MEMORY - b.memory + 1))
     with pytest.raises(BundleError, match="golden sweeps"):
         side(lambda b: replace(b, golden_logits=b.golden_logits[:, ::-1].copy()))
-    assert shadow.read(tmp_path / "shadow").starts == 0  # refused is not died
+    assert shadow.read(tmp_path / "shadow").starts == 0  # a refusal does not count as a crash
     shutil.rmtree(tmp_path / "shadow")
     (tmp_path / "shadow").write_text("")
     with pytest.raises(ApplianceError, match="see that it has room"):
@@ -371,7 +371,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
     "text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}']
 )
 def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged: list[str]):
-    """The log names it, and the counts begin with this start."""
+    """The log names the file, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
     (tmp_path / "shadow" / shadow.FILE).write_text(text)
     pair = side()
@@ -380,7 +380,7 @@ def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged:
 
 
 def test_the_interval_is_wilson_s():
-    """It is the one of scipy."""
+    """The interval is the same as that of scipy."""
     stats = pytest.importorskip(
         "scipy.stats", reason="scipy comes with the desktop's tools (make test)"
     )

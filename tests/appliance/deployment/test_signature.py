@@ -60,8 +60,8 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
 
 @pytest.mark.slow
 def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
-    """Another key, namespace or message, a cut, empty or huge signature: each is refused with its
-    reason."""
+    """Another key, namespace or message, and a cut, empty or huge signature are refused with their
+    reasons."""
     good = signature.sign(MESSAGE, signers.ours)
     other = subprocess.run(
         ["ssh-keygen", "-q", "-Y", "sign", "-n", "git", "-f", signers.ours],
@@ -125,7 +125,7 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
 def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(
     signers: Signers, text: str, why: str
 ):
-    """A line that ssh-keygen would skip without a message, or would need the time for, is named."""
+    """The error names a line that ssh-keygen would skip silently, or that depends on the time."""
     key = line(signers.ours).removeprefix(f"{SIGNER} ")
     text = (
         text.replace("{key}", key)
@@ -138,7 +138,7 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(
 
 
 def test_a_missing_file_of_signers_is_named(signers: Signers):
-    """The error says what belongs there."""
+    """The error shows the expected content of the file."""
     signers.file.unlink()
     with pytest.raises(ConfigError, match=r"No such file.*put a line `NAME KEY` there"):
         signers.verify()
@@ -147,7 +147,7 @@ def test_a_missing_file_of_signers_is_named(signers: Signers):
 def test_a_box_without_ssh_keygen_says_what_to_install(
     signers: Signers, monkeypatch: pytest.MonkeyPatch
 ):
-    """If ssh-keygen hangs, the box does not."""
+    """The box does not hang if ssh-keygen hangs."""
     good = signature.sign(MESSAGE, signers.ours)
     monkeypatch.setenv("PATH", str(signers.file.parent))
     with pytest.raises(ConfigError, match="apt install openssh-client"):
@@ -161,15 +161,15 @@ def test_a_box_without_ssh_keygen_says_what_to_install(
 
 
 def test_a_key_that_cannot_sign_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    """A file that is no key."""
+    """The file is not a key."""
     with pytest.raises(ConfigError, match="none does not sign"):
         signature.sign(MESSAGE, tmp_path / "none")
     assert "No such file" in capfd.readouterr().err
 
 
 def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, signers: Signers):
-    """`palpate-train sign` makes an ordinary bundle of one with an enrolment: the same labels and
-    answers, another signer."""
+    """`palpate-train sign` turns a bundle with an enrolment into an ordinary bundle with the same
+    labels and answers and another signer."""
     folder = deliveries.put(
         tmp_path / "bundle", deliveries.enrolled(deliveries.files(1, None), None)
     )
@@ -190,8 +190,8 @@ def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, sig
 
 
 def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):
-    """`palpate-train sign` puts the counter into the manifest and the signature beside it; without
-    a counter it refuses."""
+    """`palpate-train sign` writes the counter into the manifest and the signature beside it. It
+    refuses to sign without a counter."""
     folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))
     with pytest.raises(BundleError, match="counter 0, which no box takes"):
         sign.sign(folder, signers.ours)

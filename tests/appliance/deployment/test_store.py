@@ -1,4 +1,4 @@
-"""The store: which bundles a box installs, which one it runs, and which one it goes back to."""
+"""The store: which bundles a box installs, runs and goes back to."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Ways = Callable[[Delivery], object]
 
 @pytest.fixture
 def box(tmp_path: Path) -> Delivery:
-    """A box that has seen no bundle yet."""
+    """A box without a delivered bundle."""
     return Delivery(tmp_path)
 
 
@@ -48,7 +48,8 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
 
 @pytest.mark.slow
 def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery, logged: list[str]):
-    """Install, start on trial, commit, the next one, commit, and back and forth between the two."""
+    """Two bundles are installed, tried and committed one after the other; rollbacks alternate
+    between them."""
     one = box.installed(1)
     chosen = box.store.choose()
     assert chosen.trial
@@ -67,7 +68,7 @@ def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery,
 @pytest.mark.slow
 def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
     """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed
-    one again."""
+    bundle again."""
     one = box.installed(1)
     assert box.store.rollback() == PACKAGED == box.start()
     assert box.installed(1) == one
@@ -97,7 +98,8 @@ def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
 
 @pytest.mark.slow
 def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
-    """It does not go back to the first trial, which was never committed."""
+    """After the second trial the box does not go back to the first bundle, which was never
+    committed."""
     one, two, three = box.committed(1), box.installed(2), box.installed(3)
     assert box.start() == three
     assert box.store.rollback() == one
@@ -108,7 +110,7 @@ def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
 
 @pytest.mark.slow
 def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
-    """The bundle before the committed one is still there, however many were tried in between."""
+    """The bundle before the committed bundle is kept, however many bundles were tried since."""
     one, two = box.committed(1), box.committed(2)
     box.installed(3)
     box.installed(4)
@@ -118,8 +120,8 @@ def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
 
 @pytest.mark.slow
 def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
-    """A bundle was committed, rolled back by hand, deployed again and failed: a rollback does not
-    lead to it."""
+    """A bundle is committed, rolled back by hand, deployed again, and fails its trial: a rollback
+    does not lead to it."""
     one, two = box.committed(1), box.committed(2)
     assert box.store.rollback() == one
     assert box.installed(2) == two
@@ -130,7 +132,7 @@ def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
 
 @pytest.mark.slow
 def test_deploying_again_what_runs_changes_nothing(box: Delivery):
-    """A committed bundle stays committed; one on trial gets three new starts."""
+    """A committed bundle stays committed; a bundle on trial gets three new starts."""
     one = box.committed(1)
     assert box.installed(1) == one
     assert box.store.state.of(one).committed
@@ -141,7 +143,7 @@ def test_deploying_again_what_runs_changes_nothing(box: Delivery):
 
 
 def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
-    """It is current and committed as before; the bundle on trial is given up."""
+    """The committed bundle is current again, and the bundle on trial is dropped."""
     one, two = box.committed(1), box.installed(2)
     assert box.installed(1) == one
     assert box.store.current == one
@@ -151,8 +153,8 @@ def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
 
 @pytest.mark.slow
 def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
-    """The counter must be above all committed ones, also after a rollback; the newest bundle itself
-    may be installed again."""
+    """The counter must be above all committed counters, also after a rollback. The newest bundle
+    itself may be installed again."""
     one, two = box.committed(1), box.committed(2)
     box.store.rollback()
     for counter in (1, 2):
@@ -167,7 +169,7 @@ def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
 
 @pytest.mark.slow
 def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
-    """A bundle that was never committed may be replaced by one with a lower counter."""
+    """A bundle that was never committed may be replaced by a bundle with a lower counter."""
     box.committed(1)
     box.installed(9)
     assert box.start() != box.installed(2) == box.start()
@@ -239,8 +241,8 @@ BAD: dict[str, tuple[Ways, str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
-    """Refused with its reason; the current bundle, the state and the folder of bundles are as
-    before."""
+    """A bad bundle is refused with its reason. The current bundle, the state and the folder of
+    bundles do not change."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
     before = box.store.state
     make, why = BAD[name]
@@ -260,8 +262,7 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
 
 
 def test_what_was_checked_is_what_is_written(box: Delivery):
-    """A folder whose owner changes it after the check: the installed bundle is the one that was
-    checked."""
+    """The owner of the folder changes it after the check: the checked files are installed."""
     folder = box.made(1)
 
     def change(held: Bundle) -> None:
@@ -288,7 +289,8 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
 def test_a_model_that_kills_its_runtime_is_refused(
     tmp_path: Path, does: Callable[[Bundle], object], why: str
 ):
-    """It is tried in a child process: this process goes on, and reports what the child died of."""
+    """The model runs in a child process. This process continues, and reports why the child
+    died."""
     box = Delivery(tmp_path, does)
     with pytest.raises(BundleError, match=why):
         box.installed(1)
@@ -296,7 +298,7 @@ def test_a_model_that_kills_its_runtime_is_refused(
 
 
 def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The deadline ends it."""
+    """The child ends at the deadline."""
     monkeypatch.setattr("appliance.deployment.sandbox.DEADLINE_S", 0.2)
 
     def hang(held: Bundle) -> None:
@@ -332,7 +334,8 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(
 
 
 def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
-    """No other bundle is chosen by itself: the error names the way back, and that way works."""
+    """The box does not choose another bundle by itself. The error names the way back, and that way
+    works."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     with pytest.raises(BundleError, match="committed; `palpate bundles rollback` goes back"):
@@ -341,7 +344,7 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
 
 
 def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
-    """It is complete and signed, but not the one that the link names."""
+    """The folder holds a complete and signed bundle that does not belong to the folder's name."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     shutil.copytree(box.store.bundles.at(one), box.store.bundles.at(two))
@@ -350,7 +353,7 @@ def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
 
 
 def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
-    """This holds for the current one, too: its folder is replaced by a complete one."""
+    """Its folder is replaced by a complete folder, even if the bundle is current."""
     one = box.committed(1)
     (box.store.bundles.at(one) / bundle.MODEL).write_bytes(b"rotten")
     assert [e.role for e in bundle_commands.entries(box.store)] == ["previous", "damaged"]
@@ -360,7 +363,7 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
 
 @pytest.mark.slow
 def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
-    """Incomplete folders are removed, and bundles that nothing goes back to."""
+    """Incomplete folders are removed, and bundles to which no other bundle goes back."""
     shas = [box.committed(n) for n in range(1, 5)]
     left = box.store.bundles.folder / f".{shas[0]}-abc"
     left.mkdir()
@@ -377,7 +380,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
 
 @pytest.mark.slow
 def test_a_candidate_waits_and_is_promoted(box: Delivery):
-    """It does not change which bundle runs; once promoted it is on trial."""
+    """The candidate does not change which bundle runs. After its promotion it is on trial."""
     one = box.committed(1)
     two = box.store.install(box.made(2), shadow=True)
     assert box.start() == one
@@ -397,7 +400,8 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
 
 
 def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
-    """A second command waits for a limited time; and only the owner of the folder may change it."""
+    """A second command waits for a limited time. Only the owner of the folder may change the
+    store."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
     box.installed(1)
     with box.store._locked(), pytest.raises(ApplianceError, match="in use by another command"):
@@ -448,8 +452,9 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
 
 @pytest.mark.slow
 def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Delivery):
-    """Fields that it does not know, of the store and of each bundle, are nothing to it: bundle,
-    trial and counter are as they were, and the newer program reads what this one writes."""
+    """After a downgrade the program ignores unknown fields of the store and its bundles. Bundle,
+    trial and counter are unchanged, and the newer program can read the file of the older
+    program."""
     one, two = box.committed(1), box.installed(2)
     ledger = Path(box.how.folder, "bundles.json")
     newer = json.loads(ledger.read_text()) | {"format": 9, "kept": {"a": [1]}}
@@ -494,7 +499,7 @@ def test_a_box_that_is_upgraded_keeps_its_trial_and_its_counter(box: Delivery):
 def test_a_power_cut_during_the_upgrade_loses_no_state(
     box: Delivery, cut: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """The start that was being counted is counted or not; bundle, counter and way back are kept."""
+    """The start may be counted or not. Bundle, counter and the way back are kept."""
     one, two = box.committed(1), box.installed(2)
     new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
     new.rename(old)
@@ -553,8 +558,8 @@ def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
 @pytest.mark.slow
 @pytest.mark.thorough  # hundreds of altered bundles
 def test_no_altered_bundle_is_accepted(tmp_path: Path):
-    """A sample of `python -m tests.campaigns flips`: bits of each file, files swapped with another signed bundle's, cut,
-    unsigned, older; the same of a bundle with an enrolled label."""
+    """A sample of `python -m tests.campaigns flips`, with and without an enrolled label: flipped
+    bits in each file, files of another signed bundle, cut files, unsigned and older bundles."""
     found = flips.campaign(tmp_path, 50, seed=2)
     assert found[flips.FLIPPED]["tried"] == 50
     assert sum(kind.startswith(flips.ENROLLED) for kind in found) >= 14

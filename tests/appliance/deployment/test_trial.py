@@ -1,5 +1,5 @@
-"""A bundle on trial: which starts count, what ends the trial, and that classifying goes on whatever
-the disk does."""
+"""A bundle on trial: which starts count, how the trial ends, and that classifying goes on during
+trouble with the disk."""
 
 from __future__ import annotations
 
@@ -84,15 +84,15 @@ def box(tmp_path: Path) -> Trying:
 
 
 def booted(box: Trying, name: str) -> None:
-    """The power was cut, and is back: another boot of the kernel."""
+    """Change the id of the boot, as after a power cut."""
     file = box.folder / "boot_id"
     file.write_text(f"{name}\n")
     box.store = Store(box.how, lambda bundle: None, boot=file)
 
 
 def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
-    """Nine in its trial: it is still the one that runs; a crash within one boot counts as before,
-    whatever came between."""
+    """After nine power cuts in its trial the bundle still runs. A crash within one boot counts,
+    also after power cuts."""
     for cut in range(9):
         booted(box, f"boot {cut}")
         assert box.start() == box.two
@@ -104,7 +104,7 @@ def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
 
 
 def test_an_orderly_end_before_the_power_goes_is_not_taken_back_twice(box: Trying):
-    """A crash stays counted through shutdowns: those were taken back when they ended."""
+    """A crash stays counted after orderly shutdowns, whose starts are not counted."""
     booted(box, "first")
     box.tried()
     for boot in ("second", "third"):
@@ -116,7 +116,8 @@ def test_an_orderly_end_before_the_power_goes_is_not_taken_back_twice(box: Tryin
 def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(
     box: Trying, logged: list[str]
 ):
-    """After ten times: else one that resets it would stay for ever."""
+    """The bundle is replaced after ten power cuts. Else a bundle that resets the computer would
+    stay for ever."""
     for cut in range(10):
         booted(box, f"boot {cut}")
         assert box.start() == box.two
@@ -126,13 +127,13 @@ def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(
 
 
 def test_without_the_id_of_the_boot_each_start_counts(box: Trying):
-    """It cannot be read: as if the program had crashed, never the other way round."""
+    """If the id of the boot cannot be read, each start counts as if the program had crashed."""
     box.store = Store(box.how, lambda bundle: None, boot=box.folder / "none")
     assert [box.start() for _ in range(MOST_STARTS + 1)] == [box.two] * MOST_STARTS + [box.one]
 
 
 def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
-    """A start that crashes stays counted; an orderly end takes the count back, once."""
+    """A start that crashes stays counted. After an orderly end the start is no longer counted."""
     trial = box.tried()
     assert box.standing.starts == 1
     trial.stopping()
@@ -146,7 +147,7 @@ def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
 
 @pytest.mark.slow
 def test_a_skin_that_is_unplugged_never_counts(box: Trying):
-    """They do not count, however many there are; once the skin streams, the start counts."""
+    """Starts without a skin do not count. Once the skin streams, the start counts."""
     for _ in range(3 * MOST_STARTS):
         trial = box.tried()
         assert box.standing.starts == 1
@@ -171,7 +172,7 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
 
 
 def test_enough_sweeps_commit(box: Trying, logged: list[str]):
-    """Sweeps with a label count, and no commit comes while a sweep is open; afterwards older
+    """Sweeps with a label count, and the commit waits until no sweep is open. Afterwards older
     bundles are refused."""
     trial = box.tried()
     for _ in range(box.how.trial_sweeps - 1):
@@ -194,7 +195,7 @@ def test_enough_sweeps_commit(box: Trying, logged: list[str]):
 
 
 def test_enough_time_commits(box: Trying):
-    """Only the time counts during which the skin streams."""
+    """Only time with a streaming skin counts."""
     trial = box.tried()
     for t in range(0, 400):
         trial.turn(health(t))
@@ -209,7 +210,7 @@ def test_enough_time_commits(box: Trying):
 
 
 def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
-    """A robot that is switched off each evening commits its bundle as well; progress of a crashed
+    """A robot that is switched off each evening also commits its bundle. The progress of a crashed
     start is lost."""
     for n in range(2):
         trial = box.tried()
@@ -277,7 +278,7 @@ def test_a_full_disk_is_told_once_and_tried_again(
 
 
 def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
-    """The loop goes on, and the write is repeated later."""
+    """The loop goes on, and the write is tried again later."""
     trial = box.tried()
     with box.store._locked():
         trial.turn(health(0, streams=False))
@@ -289,7 +290,7 @@ def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
 
 @pytest.mark.slow
 def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
-    """Another bundle was deployed, or a person rolled back, while this one still runs."""
+    """Another bundle was deployed, or a person rolled back, while the old bundle still runs."""
     for way in (lambda: box.installed(3), box.store.rollback):
         trial = box.tried()
         way()
@@ -303,7 +304,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
 
 
 def test_a_person_may_commit_while_it_runs(box: Trying):
-    """The program notices it and logs nothing; its end changes nothing."""
+    """The program notices the commit and logs nothing. Its end changes nothing."""
     trial = box.tried()
     assert box.store.commit()
     trial.turn(health(0, streams=False))

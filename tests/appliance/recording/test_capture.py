@@ -202,7 +202,7 @@ def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
         capture.close()
     sizes = [(tmp_path / name).stat().st_size for name in ("capture.1", "capture.2", "capture")]
     assert sizes == sorted({*sizes})
-    assert logged[-1] == f"capture: {path} was there, of an earlier start; it is capture.2 now"
+    assert logged[-1] == f"capture: {path} of an earlier start was renamed to capture.2"
     for i in range(3, MOST_KEPT + 1):
         (tmp_path / f"capture.{i}").touch()
     with pytest.raises(

@@ -359,7 +359,7 @@ def test_a_folder_of_another_form_is_refused(tmp_path: Path):
     first.recording.close()
     other = replace(toy_bundle.FORMAT, rows=3)
     with pytest.raises(
-        ConfigError, match=r"sweep-000001\.npy holds another form of sweeps than 3x2 .* with --out"
+        ConfigError, match=r"sweep-000001\.npy has another format than 3x2 .* with --out"
     ):
         RecordingSession(tmp_path, other, NONE, first, first.hear)
     (tmp_path / "sweep-000002.json").write_text("{}")  # damaged: not counted, not refused

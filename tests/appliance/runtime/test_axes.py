@@ -33,7 +33,7 @@ def act(z1: float, z2: float, label: str) -> rig.Act:
 
 
 def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path: Path, capsys):
-    """Labels are right; kept sweeps hold all axes and replay bit for bit; the capture gives the
+    """Labels are right. Kept sweeps have all axes and replay bit for bit. The capture gives the
     same sentences."""
     model = toy_bundle.load(tmp_path / "bundle", format=FMT)
     stuck = act(0, 0, "stuck")

@@ -79,8 +79,7 @@ def test_sweeps_become_sentences(rigged: Callable[..., Rigged]):
 
 
 def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
-    """The window that reaches the network is, count for count, the middle of the act that the robot
-    played."""
+    """The window of the network equals the middle of the act that the robot played."""
     simulated = simulated_devices(script.tubes(1001, 3))
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
@@ -94,8 +93,8 @@ def test_windows_are_the_middle_of_what_was_slid(rigged: Callable[..., Rigged]):
 
 
 def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
-    """READY falls and BUSY rises with the sweep; class bits, then RESULT VALID; both fall when the
-    next one starts."""
+    """READY falls and BUSY rises with the sweep. Class bits are set before RESULT VALID, and both
+    fall when the next sweep starts."""
     simulated = simulated_devices(script.tubes(1002, 2))
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
@@ -122,7 +121,7 @@ def test_lines_follow_the_sweep(rigged: Callable[..., Rigged]):
 
 
 def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
-    """A killed process closes nothing: the kernel takes its lines back, and READY reads low."""
+    """After the process was killed the kernel releases its lines, and READY reads low."""
     simulated = quiet()
     box = assembly.box(config.load(None), default_bundle, simulated, StdoutPort("sim"), ExitStack())
     for _ in range(5):
@@ -134,8 +133,8 @@ def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
 
 
 def test_unplugged_during_a_sweep(rigged: Callable[..., Rigged]):
-    """The sweep is answered `sensor-lost` at once; FAULT; a trigger meanwhile is `not-ready`; after
-    replugging all is well."""
+    """The sweep is answered `sensor-lost` at once, and FAULT rises. A trigger meanwhile is
+    `not-ready`. After replugging the box works again."""
     simulated = simulated_devices(script.tubes(1003, 3))
     box = rigged(simulated)
     box.until(lambda: box.box.answered == 1)
@@ -180,7 +179,7 @@ def test_a_board_that_sends_no_frame_is_never_ready(
 
 
 def test_trigger_while_not_ready_is_answered(rigged: Callable[..., Rigged]):
-    """No skin: the start edge gets its answer, its stop edge none."""
+    """Without a skin the start edge is answered, and its stop edge is not."""
     simulated = quiet()
     simulated.backend.unplug()
     box = rigged(simulated)
@@ -255,7 +254,7 @@ def test_missing_frames(rigged: Callable[..., Rigged], packet_frames: int, statu
 
 
 def spoiled(fault: str) -> np.ndarray:
-    """A slide with a skin that is not as it should be."""
+    """A slide with a faulty skin."""
     frames = slide("plastic rough")
     if fault == "saturated":
         frames[:, 1:3, 1:3] = 255 - (np.arange(len(frames)) % 7 == 0)[:, None, None]
@@ -289,7 +288,8 @@ def test_a_spoiled_skin_is_seen_before_the_network_is_asked(
 
 
 def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
-    """Before NEW OBJECT sweeps stand alone; after it they count together, until the next one."""
+    """Before NEW OBJECT sweeps are answered alone. After it they are fused, until the next NEW
+    OBJECT."""
     acts = [replace(a, new_object=i in (1, 4)) for i, a in enumerate(script.tubes(1005, 6))]
     box = rigged(simulated_devices(acts))
     verdicts = box.until(lambda: box.box.answered == 6)
@@ -304,8 +304,8 @@ def test_fusing_can_be_turned_off(rigged: Callable[..., Rigged]):
 
 
 def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
-    """Identity, state, self-test, tare, new object, abort: each is answered; a bad one says what
-    would be right."""
+    """Identity, state, self-test, tare, new object and abort are answered. The answer to a wrong
+    command shows the right command."""
     box = rigged(quiet())
     box.seconds(1)
     assert default_bundle.id in box.ask("$PPLP,ID")
@@ -326,7 +326,7 @@ def test_commands(rigged: Callable[..., Rigged], default_bundle: bundle.Bundle):
 
 
 def test_tare_moves_the_contact_threshold(rigged: Callable[..., Rigged]):
-    """An offset that looks like a touch is none after a tare; a tare during a sweep is refused."""
+    """After a tare an offset is not taken for contact. A tare during a sweep is refused."""
     offset = np.random.default_rng(0).integers(40, 42, (9 * RATE, 4, 4)).astype(np.uint8)
     box = rigged(simulated_devices([rig.Act(offset, 10**7, 10**7 + 1, "")]))
     box.seconds(1)
@@ -339,7 +339,7 @@ def test_tare_moves_the_contact_threshold(rigged: Callable[..., Rigged]):
 
 
 def test_abort_answers_the_open_sweep(rigged: Callable[..., Rigged]):
-    """ABORT: the sweep is answered, its stop edge gets nothing more."""
+    """ABORT answers the sweep; its stop edge gets no further answer."""
     box = rigged(quiet())
     box.pulse(devices.START, 0.2)
     box.pulse(devices.STOP, 3)
@@ -371,8 +371,8 @@ def test_state_is_sent_once_a_second(rigged: Callable[..., Rigged]):
 
 @pytest.mark.slow
 def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]):
-    """The line is full: sentences are dropped and counted, every frame and every sweep is still
-    taken."""
+    """The serial line is full: sentences are dropped and counted, and no frame or sweep is
+    lost."""
     simulated = simulated_devices(script.tubes(1006, 20))
     box = rigged(simulated, sets=("serial.queue=4", "serial.state_s=0.05"))
     while not simulated.finished(box.box.answered):
@@ -383,7 +383,7 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged: Callable[..., Rigged]
 
 
 def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]):
-    """What goes wrong is logged when it begins and when it ends, not at every turn."""
+    """Trouble is logged when it begins and when it ends, not at every turn."""
     simulated = quiet()
     box = rigged(simulated)
     box.seconds(1)
@@ -398,8 +398,7 @@ def test_trouble_is_logged_once(rigged: Callable[..., Rigged], logged: list[str]
 
 
 def test_the_log_names_the_port(rigged: Callable[..., Rigged], logged: list[str]):
-    """That it is open is told once, with its name; of a box without a port nothing is told of
-    one."""
+    """The log names the open port once. Without a port the log has no such line."""
     box = rigged(quiet())
     box.seconds(2)
     assert [line for line in logged if "serial" in line] == [f"serial: {box.port.name} open"]
@@ -415,7 +414,7 @@ def test_the_log_names_the_port(rigged: Callable[..., Rigged], logged: list[str]
 
 
 class EffectLog(Observer):
-    """Notes what it is called with, under its name."""
+    """Logs its calls under its name."""
 
     def __init__(self, name: str, effects: list[str]) -> None:
         self._name, self._effects = name, effects
@@ -429,14 +428,14 @@ class EffectLog(Observer):
         self._effects.append(f"{self._name} sweep {sweep.id} {circumstances['source']}")
 
     def turn(self, health: Health) -> None:
-        """Note it, where a sweep was answered in this turn."""
+        """Log the call if a sweep was answered in this turn."""
         if self._effects and "turn" not in self._effects[-1]:
             self._effects.append(f"{self._name} turn {health.answered}")
 
 
 def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged: Callable[..., Rigged]):
-    """Two answers in one turn: both are out, at the port and at each observer, before any sweep is
-    passed on; then health."""
+    """Two answers in one turn reach the port and each observer before any sweep is passed on;
+    health comes last."""
     effects: list[str] = []
     box = rigged(quiet(), observers=[EffectLog("a", effects), EffectLog("b", effects), Observer()])
     box.seconds(0.5)

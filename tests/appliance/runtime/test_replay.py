@@ -1,5 +1,5 @@
-"""Kept sweeps judged again: the same verdict bit for bit, and every way in which it can be another
-one."""
+"""Kept sweeps classified again: the same verdict bit for bit, and each way in which it can
+differ."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ OTHERWISE = config.load(
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the first use of `in_service` finds, for all tests."""
+    """Cache of the recorded folder and sentences for all tests."""
     return {"folder": tmp_path_factory.mktemp("kept")}
 
 
@@ -45,8 +45,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def in_service(
     run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Path
 ) -> tuple[Path, list[str]]:
-    """A copy of a folder of 30 sweeps, three an object, some answered early; and the sentences that
-    went out."""
+    """A copy of a folder of 30 sweeps, three for each object, some answered early; and the
+    sentences that were sent."""
     if "heard" not in run:
         acts = [
             replace(act, new_object=i % PER_OBJECT == 0)
@@ -68,7 +68,7 @@ def in_service(
 def played(
     path: Path, model: bundle.Bundle, settings: config.Config = HERE
 ) -> tuple[int, list[str], list[str]]:
-    """Exit code, sentences, and what came of each sweep."""
+    """Exit code, sentences, and the outcome of each sweep."""
     printed: list[str] = []
     code = replay(path, settings, model, printed.append)
     lines = "".join(printed).splitlines()
@@ -87,8 +87,8 @@ def change(path: Path, **values: object) -> None:
 
 @pytest.mark.slow
 def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundle.Bundle):
-    """Fused and early ones, whatever the settings are now: the very sentences that went out, times
-    included."""
+    """With any present settings, fused and early answers give the sentences that were sent,
+    including times."""
     folder, heard = in_service
     abouts = [sidecar(path) for path in sorted(folder.glob("*.npy"))]
     assert max(about["verdict"]["fused"] for about in abouts) == PER_OBJECT
@@ -103,7 +103,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundl
 
 @pytest.mark.slow
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle: bundle.Bundle):
-    """A single file is fused with the earlier ones beside it, and with no others."""
+    """A single file is fused with the earlier sweeps of its object alone."""
     folder, heard = in_service
     change(
         folder / "sweep-000002.npy", bundle="0badcafe"
@@ -117,8 +117,8 @@ def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundl
 def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
     in_service, default_bundle: bundle.Bundle
 ):
-    """The ring has dropped an object's first sweep: the others' own scores are compared, and the
-    output says so."""
+    """The black box has removed an object's first sweep: the scores of the others are compared by
+    themselves, and the output says so."""
     folder, _ = in_service
     counts = {
         n: sidecar(folder / f"sweep-{n:06d}.npy")["verdict"]["fused"] for n in range(1, SWEEPS + 1)
@@ -148,8 +148,8 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
 
 
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
-    """By itself it would not have been given: its own scores are compared all the same, and no
-    sentence is made up."""
+    """Without the earlier sweeps there is no early answer: the scores are compared, and no sentence
+    is written."""
     model = toy_bundle.load(
         tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early")
     )
@@ -172,8 +172,8 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
 
 
 def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
-    """A score one bit off, another label, another tare: different, what differs is named, and the
-    exit code is 1."""
+    """For a score one bit off, another label or another tare the output names the difference, and
+    the exit code is 1."""
     folder, _ = in_service
     verdict = sidecar(folder / "sweep-000001.npy")["verdict"]
     change(
@@ -195,8 +195,8 @@ def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle: bundle.Bundle):
-    """Wherever in the file it is: the low bit of a digit may leave every score as it was, but not
-    the check sum."""
+    """At any position in the file. The lowest bit of a raw count may change no score, but it
+    changes the checksum."""
     folder, _ = in_service
     path = folder / "sweep-000003.npy"
     data = path.read_bytes()
@@ -213,8 +213,8 @@ def test_a_changed_byte_is_told(in_service, default_bundle: bundle.Bundle):
 
 
 def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bundle.Bundle):
-    """One sweep: both ids and what to try. A folder: those of the bundle are judged, the others are
-    named."""
+    """For one sweep the error has both ids and says what to try. In a folder the sweeps of the
+    bundle are classified, and the others are listed."""
     folder, _ = in_service
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(
@@ -236,7 +236,7 @@ def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bun
 
 def test_the_next_run_begins_anew(tmp_path: Path):
     """Objects are counted anew in each run: object 1 of a later run in the same folder is not fused
-    with the earlier."""
+    with object 1 of an earlier run."""
     model = toy_bundle.load(tmp_path / "bundle")
     for n, run in ((1, 0), (2, 1)):
         save(
@@ -251,7 +251,7 @@ def test_the_next_run_begins_anew(tmp_path: Path):
 
 
 def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
-    """By a bundle that decides there; another one is named, and no answer is made up."""
+    """Without an early answer of this bundle the output says so, and no sentence is written."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     early = Sweep(1, 0, 0, Status.OK, frames, share=0.5)
     save(tmp_path / "s.npy", early, toy_bundle.FORMAT)
@@ -271,7 +271,7 @@ def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
 
 
 def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
-    """As the box would; one that was tared is judged with its own."""
+    """As the box would do it. A recording with a tare is classified with its own tare."""
     model = toy_bundle.load(tmp_path / "bundle")
     high = replace(model, manifest=replace(model.manifest, unloaded=(1e4,) * 4))
     save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT)
@@ -282,7 +282,7 @@ def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
 
 
 def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
-    """The rule is read under its old names: the settings of today would give other verdicts."""
+    """The rule is read under its old keys; the present settings would give other verdicts."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     made = toy_bundle.load(
         tmp_path / "bundle",
@@ -333,7 +333,7 @@ def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
     ],
 )
 def test_sidecars_that_make_no_sense(tmp_path: Path, about: dict[str, object], hint: str):
-    """They are named; none ends in a traceback."""
+    """The error names the file; there is no traceback."""
     model = toy_bundle.load(tmp_path / "bundle")
     save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT, about)
     with pytest.raises(FormatError, match=f"s.npy: .*{hint}"):
@@ -365,7 +365,7 @@ def test_a_sweep_without_a_window(tmp_path: Path):
 
 
 def test_another_skin_and_an_empty_folder(tmp_path: Path, default_bundle: bundle.Bundle):
-    """Both formats are named; so is a folder that holds nothing to judge."""
+    """The error has both formats. A folder without sweeps is an error, too."""
     with pytest.raises(FormatError, match="no kept sweep is there"):
         played(tmp_path, default_bundle)
     save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT)

@@ -1,4 +1,4 @@
-"""`palpate check`: a board that is too slow for its skin is named before a robot finds out."""
+"""`palpate check` reports a board that is too slow for its skin."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from appliance.sim import devices, rig, script
 
 
 def skin_of(share: float) -> selftest.CheckResult:
-    """The check of the simulated skin on a board whose processor it takes by `share` once it
-    streams, and wholly before."""
+    """The check of the simulated skin on a board where reading takes the share `share` of a core
+    while the skin streams, and the whole core before."""
     acts, source, format = script.named("skin", None, 1, spread=False)
     built = devices.build(format, acts, rig.VirtualClock(), source)
     results = selftest.check(
@@ -36,8 +36,7 @@ def spending(clock: Clock, share: float) -> Callable[[], int]:
     ("share", "ok"), [(0.043, True), (0.49, True), (0.51, False), (0.97, False)]
 )
 def test_what_reading_takes_of_a_core(share: float, ok: bool):
-    """It is told; from half a core on nothing would be left for answers, and the check says what to
-    do."""
+    """The check shows the share of a core. Above half a core it fails and says what to do."""
     found = skin_of(share)
     assert found.ok == ok
     assert f"750 Hz, 750 frames in 1.0 s, 0 lost, {100 * share:.1f} % of a core" in found.detail

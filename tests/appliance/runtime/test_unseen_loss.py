@@ -60,7 +60,7 @@ def swept(box: Rigged) -> str:
 
 
 class Beside(Observer):
-    """Keeps what is written beside each sweep."""
+    """Keeps the circumstances of each sweep, which sidecars hold."""
 
     def __init__(self) -> None:
         self.kept: list[dict] = []
@@ -71,8 +71,8 @@ class Beside(Observer):
 
 
 def test_it_is_said_everywhere(rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch):
-    """RES has a 14th field, STA an 18th, the status and the sidecar a word; the frames are taken
-    all the same."""
+    """RES has a 14th field, STA an 18th, and the status and the sidecar have a word. Frames are
+    used as usual."""
     beside = Beside()
     box, _ = on_a_matrix(rigged, monkeypatch, observers=[beside])
     fields = swept(box).rpartition("*")[0].split(",")[2:]
@@ -97,14 +97,14 @@ def test_it_is_said_everywhere(rigged: Callable[..., Rigged], monkeypatch: pytes
 
 
 def test_a_board_that_counts_says_nothing_of_it(rigged: Callable[..., Rigged]):
-    """PROTOCOL.md's boards: sentences as they were."""
+    """Sentences for readout boards of PROTOCOL.md do not have the fields."""
     box = rigged(idle_devices())
     assert len(swept(box).split(",")) == 15
     assert box.box.health.loss_known
 
 
 def test_the_detail_gives_way(default_bundle: Bundle):
-    """In a sentence that would be too long the detail is cut, never the field."""
+    """In a sentence that is too long the detail is cut, not the field."""
     verdict = Verdict(
         99999,
         10**15,
