@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 WATCHED = (
-    "open|creat|p?write|lseek|sendfile|copy_file|splice|f?truncate|fallocate|fsync|fdatasync|sync|rename|unlink|rmdir|"
-    "mkdir|symlink|link|f?chmod|f?chown|mknod"
+    "open|creat|p?write|lseek|sendfile|copy_file|splice|f?truncate|fallocate|"
+    "fsync|fdatasync|sync|rename|unlink|rmdir|mkdir|symlink|link|f?chmod|f?chown|mknod"
 )
 """System calls that matter, by the beginnings of their names."""
 MOST_BYTES = 1 << 24

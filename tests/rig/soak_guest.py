@@ -107,7 +107,8 @@ class VirtualBox:
         self._guest.skin.mangle = self._note
         self._hand = SoakRobot(self._guest.lines, seed)
         self._board = rig.ReadoutBoard(skin.FORMAT, self._hand, self._guest.clock, fifo_frames=2250)
-        self._answer, self._board.request = self._board.request, self._request  # type: ignore[method-assign]
+        self._answer = self._board.request
+        self._board.request = self._request  # type: ignore[method-assign]
         self._guest.skin.plug(self._board)
         if not self._guest.lines.wait("READY", True, READY_S):
             raise Gone(f"the guest was not READY within {READY_S} s")

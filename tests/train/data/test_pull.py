@@ -322,11 +322,12 @@ def test_a_member_beyond_all_size_is_refused(ground: Ground):
 def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
     """A path in the list that leads elsewhere: it is not requested, and the others are fetched."""
     record(ground.box.parent / "evil.npy")
+    sha256 = "f" * 64
     (ground.box / "run 0" / "line\nbreak.npy").write_bytes(b"")
     ground.program(
         "find",
         f"""#!/bin/sh
-        printf '{"f" * 64}  ./../evil.npy\\0{"f" * 64}  ./../evil.json\\0{"f" * 64}  .//etc/evil.npy\\0'
+        printf '{sha256}  ./../evil.npy\\0{sha256}  ./../evil.json\\0{sha256}  .//etc/evil.npy\\0'
         exec {shutil.which("find")} "$@"
     """,
     )

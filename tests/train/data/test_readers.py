@@ -450,7 +450,8 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
         sets.load(str(path))
     with pytest.raises(
         FormatError,
-        match=f"it holds 1 {suffix.lower()} files: palpate-train import .* makes a set of such files",
+        match=f"it holds 1 {suffix.lower()} files: "
+        "palpate-train import .* makes a set of such files",
     ):
         sets.load(str(tmp_path))
 
