@@ -1,4 +1,4 @@
-"""Answers to sweeps of a displaced skin, and their page."""
+"""The study `alignment`: answers to sweeps of a displaced skin, and its page."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from train.studies import alignment, contact_plot, contact_table
 
 @pytest.fixture
 def model(default_bundle: Bundle) -> Bundle:
-    """The default bundle, with trained positions."""
+    """The default bundle, which has trained positions."""
     return replace(default_bundle, manifest=replace(default_bundle.manifest, contact=MIDDLE))
 
 
 @pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """A skin in place is not flagged, a skin that is a row forward always is; figures, picture and
-    lines agree."""
+    """A skin in place is not flagged; a skin displaced by a row always is. Figures and picture
+    agree.
+    """
     monkeypatch.setattr(alignment, "OFF_MM", (8.0,))
     wide = replace(
         model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
@@ -44,7 +45,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     assert (back["mm"], home["mm"], ahead["mm"]) == (-8, 0, 8)
     assert home["accuracy"] == figures["other positions"]["accuracy"]
     assert (home["n"], home["attachments"], home["moved"][0], ahead["moved"][0]) == (12, 1, 0, 1)
-    assert back["told_mm"] > ahead["told_mm"] + 0.5  # the trained place is a little ahead
+    assert back["told_mm"] > ahead["told_mm"] + 0.5  # the trained position is a little ahead
     assert ahead["accuracy"][0] < home["accuracy"][0] > 0.8
     assert figures["rows, forwards"]["lost_at_mm"] == 8
     assert ahead["told_mm"] > 1.2 > home["told_mm"]
@@ -86,8 +87,9 @@ def committed() -> dict:
 
 
 def test_the_headline_says_what_was_missed():
-    """It names false marks in place, marks where accuracy is lost, wrong answers a row off, and the
-    worst distance, from the figures."""
+    """It gives false flags in place, flags where accuracy drops, wrong answers a row off, and the
+    worst distance.
+    """
     figures = committed()
     figures["moved"]["rows"][3]["wrong_unflagged"] = 77
     figures["other positions"]["moved"] = [5 / 432, 0.0, 0.1]

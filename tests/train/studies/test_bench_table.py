@@ -1,5 +1,4 @@
-"""The one table of the box's figures, which the specifications show: no page names its
-figures elsewhere."""
+"""The table of the bench's figures in the specifications. No other text repeats its figures."""
 
 from __future__ import annotations
 
@@ -25,17 +24,17 @@ MEASURED = {
     "start": r"\b(start|process)\b[^.\n]*\bREADY\b[^\n]{0,80}?\d s\b",
     "accuracy": r"\b\d+ of 60\b|\b60 simulated sweeps\b",
 }
-"""How running text would name a figure of the bench, whatever its value."""
+"""Patterns for figures of the bench in running text, with any value."""
 
 
 @pytest.fixture
 def figures() -> dict[str, Any]:
-    """Those of docs/data/bench.json."""
+    """The figures in docs/data/bench.json."""
     return json.loads(FIGURES.read_bytes())
 
 
 def running_text(path: Path) -> str:
-    """The document without its table, and without what is indented or fenced as code."""
+    """The document without its table and without code, indented or fenced."""
     text = path.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     after = rest.partition(END)[2]
@@ -44,19 +43,22 @@ def running_text(path: Path) -> str:
 
 
 def named(text: str, figures: dict[str, Any]) -> list[str]:
-    """The figures of the bench that a text names: by what they measure, and by their values as the
-    table prints them."""
+    """The figures of the bench that a text repeats, found by their names and by their printed
+    values.
+    """
     found = [match[0] for pattern in MEASURED.values() for match in re.finditer(pattern, text)]
     values = set(re.findall(r"[\d.]+ (?:ms|MiB|kB|s)\b|\d+\.\d %", bench_table.table(figures)))
     shown = {
         value for value in values if len(re.sub(r"\D", "", value)) > 2
-    }  # of 1.0 ms there may be others
+    }  # 1.0 ms may be another figure
     return found + [value for value in shown if re.search(rf"(?<![\d.]){re.escape(value)}", text)]
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_no_figure_of_the_bench_elsewhere(path: Path, figures: dict[str, Any]):
-    """Running text and other tables have neither its values nor others for the same things."""
+    """Running text and other tables contain neither its values nor other values of the same
+    figures.
+    """
     assert named(running_text(path), figures) == []
 
 
@@ -74,18 +76,18 @@ def test_documents_name_no_figure_of_the_bench_elsewhere(path: Path, figures: di
     ],
 )
 def test_a_figure_in_running_text_would_be_found(text: str, figures: dict[str, Any]):
-    """Each is a sentence in which two pages once contradicted each other."""
+    """Two pages contradicted each other in each of these sentences once."""
     assert named(text, figures)
 
 
 def test_a_value_of_the_table_would_be_found(figures: dict[str, Any]):
-    """By its value alone, in words that no pattern knows."""
+    """It is found by its value alone, among words that no pattern knows."""
     value = f"{figures['edge_to_sentence_ms']['p99']:.2f} ms"
     assert named(f"the robot has it after {value}, mostly", figures) == [value]
 
 
 def test_figures_of_an_older_bundle_say_so_first(figures: dict[str, Any]):
-    """Before the caption; those of the packaged one begin with it."""
+    """The note stands before the caption. Figures of the packaged bundle begin with the caption."""
     figures["bundle"] = score.shipped()
     assert bench_table.table(figures).startswith("Measured by `make bench` with the simulated skin")
     figures["bundle"] = "0badbead"
@@ -98,8 +100,9 @@ def test_figures_of_an_older_bundle_say_so_first(figures: dict[str, Any]):
 
 
 def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
-    """In percent and with units; the accuracy says that it is simulated, of how many sweeps, and
-    its interval."""
+    """Figures are in percent or have units. The accuracy says that it is simulated, of how many
+    sweeps, and with which interval.
+    """
     text = bench_table.table(figures)
     right, n = figures["accuracy"]["right"], figures["accuracy"]["total"]
     assert re.search(
@@ -122,7 +125,7 @@ def test_the_table_has_a_row_for_each_figure(figures: dict[str, Any]):
 
 
 def test_memory_without_the_simulated_board_has_its_row(figures: dict[str, Any]):
-    """Behind the memory with it, in figures of a bench that has measured it."""
+    """Its row follows the row of the memory with the board, if the bench has measured it."""
     figures["rss_mb"] |= {"after_1000": 56.64, "without_board": 56.21}
     rows = bench_table.table(figures).splitlines()
     (at,) = (

@@ -1,5 +1,6 @@
-"""Uncertainty: figures on Gaussians whose true values are known, and the command from set to
-page."""
+"""The study `certainty`: figures on Gaussians with known true values, and the command from set to
+page.
+"""
 
 import json
 import re
@@ -26,8 +27,10 @@ NAMES = ("a", "b", "c", "d")
 
 
 def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
-    """Features [N, 10, 4] of n sweeps of four materials at each place, distinguishable from the
-    middle of the sweep on."""
+    """Features [N, 10, 4] of n sweeps of four materials at each position.
+
+    The materials differ from the middle of the sweep on.
+    """
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(4), n), places)
     at = np.repeat(np.arange(places), 4 * n) + first
@@ -42,7 +45,7 @@ def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
 
 
 def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
-    """A training on eight places and a test on others."""
+    """A training on eight positions and a test on others."""
     x, y, at = world(8, 20, 1, apart)
     keep = y != left_out
     y = y - (y > left_out) * (left_out != NONE_LEFT_OUT)
@@ -71,14 +74,17 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
 
 @pytest.fixture(scope="module")
 def figures():
-    """All figures of one fold, each material left out once."""
+    """All figures of one fold, with each material left out once."""
     held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
     return json.loads(json.dumps(certainty.figures(held, NAMES, 1)))
 
 
 def test_error_is_the_gap_between_probability_and_accuracy():
-    """A probability of 0.9 with 0.7 right is an error of 0.2, whatever the number; a calibrated one
-    is 0; bins count by their sweeps."""
+    """A probability of 0.9 with an accuracy of 0.7 is an error of 0.2; a calibrated probability has
+    0.
+
+    Bins are weighted by their number of sweeps.
+    """
     right = np.arange(100) < 70
     assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
     assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
@@ -94,8 +100,10 @@ def test_error_is_the_gap_between_probability_and_accuracy():
 
 
 def test_temperature_scaling_corrects_an_overconfident_head():
-    """Positions that shift the materials: LDA is overconfident, the temperature found across
-    positions corrects that."""
+    """If positions shift the materials, LDA is overconfident.
+
+    The temperature fitted across positions corrects that.
+    """
     one = case(apart=2.5, places=12)
     # sweeps of one position close together: their scatter says little of other positions
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
@@ -119,7 +127,9 @@ def test_temperature_scaling_corrects_an_overconfident_head():
 
 
 def test_more_sweeps_for_more_certainty(figures):
-    """Mean sweeps and accuracy rise with the probability wanted; one sweep where none is."""
+    """The mean number of sweeps and the accuracy rise with the requested probability. Without a
+    requested probability an object takes one sweep.
+    """
     for held in figures["sequence"].values():
         sweeps = [p["sweeps"] for p in held["points"]]
         assert sweeps[0] == 1
@@ -130,7 +140,9 @@ def test_more_sweeps_for_more_certainty(figures):
 
 
 def test_the_sequential_test_stops_at_the_wanted_probability():
-    """By hand: two objects, one decided at the second sweep, one never; the limit ends it."""
+    """By hand: of two objects one is decided at the second sweep, the other is ended by the
+    limit.
+    """
     fused = np.array(
         [[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]]
     )
@@ -148,8 +160,9 @@ def test_the_sequential_test_stops_at_the_wanted_probability():
 
 
 def test_unknown_materials_six_deviations_away_are_detected(figures):
-    """A material left out is six deviations from the others, known ones are chi-squared: AUROC
-    above 0.95."""
+    """A left-out material is six deviations away, known materials are chi-squared: AUROC above
+    0.95.
+    """
     for row in figures["unknown"]["materials"].values():
         assert row["low"] <= row["auroc"] <= row["high"]
         assert (row["known"], row["unknown"]) == (216, 72)
@@ -168,8 +181,9 @@ def test_unknown_materials_six_deviations_away_are_detected(figures):
 
 
 def test_two_sweeps_at_a_place_must_both_pass():
-    """By hand: three known sweeps at one place, of which the middle one does not pass, and two
-    unknown ones, which pass."""
+    """By hand: three known sweeps at one position, the middle one over the limit, and two unknown
+    sweeps within it.
+    """
     scores, known = np.array([0.5, 0.9, 2.0, 0.5, 0.8]), np.array([True, False, True, True, False])
     places, labels = np.zeros(5, int), np.array([0, 1, 0, 0, 1])
     assert uncertainty._passed(scores, known, places, labels, 1.0, 1) == (pytest.approx(2 / 3), 1.0)
@@ -179,7 +193,7 @@ def test_two_sweeps_at_a_place_must_both_pass():
 
 
 def test_an_unknown_material_that_does_not_differ_is_not_seen():
-    """Materials that do not differ: AUROC of a half."""
+    """Equal materials have an AUROC of 0.5."""
     held = [case(k, apart=0.0) for k in (0, 1)]
     done = [
         (c, fit_calibration(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged)))
@@ -189,8 +203,10 @@ def test_an_unknown_material_that_does_not_differ_is_not_seen():
 
 
 def test_enrolment_from_more_sweeps_comes_nearer(figures):
-    """The share of the fully trained accuracy grows with sweeps; old classes lose little; both
-    places are reported."""
+    """More sweeps bring the accuracy nearer to that of a full training. Old classes lose little.
+
+    Both positions are reported.
+    """
     points = {(p["where"], p["sweeps"]): p for p in figures["enrolment"]["points"]}
     assert {w for w, _ in points} == {"same place", "other places"}
     for where in ("same place", "other places"):
@@ -201,8 +217,9 @@ def test_enrolment_from_more_sweeps_comes_nearer(figures):
 
 
 def test_early_needs_half_the_sweep_where_that_suffices(figures):
-    """All is known at the fifth tenth: the share is below 0.6 and accuracy is that of the whole
-    sweep."""
+    """All is known at the fifth tenth. The share is below 0.6, the accuracy that of the whole
+    sweep.
+    """
     early = figures["early"]
     assert early["share"] < 0.6
     assert abs(early["lost"]) <= 0.02
@@ -211,8 +228,7 @@ def test_early_needs_half_the_sweep_where_that_suffices(figures):
 
 
 def test_of_two_materials_none_is_left_out():
-    """Of two materials none can be left out: calibration, sweeps and early answers are reported,
-    and the page has no more."""
+    """The page has calibration, sweeps and early answers, and nothing of left-out materials."""
     one = case()
     two, test = one.seen_labels < 2, one.labels < 2
     also = one.copied_labels < 2
@@ -260,8 +276,9 @@ ABOUT = (
 
 
 def test_the_page_stands_alone(figures):
-    """One file without script or address; its pictures are sound XML; each target says whether it
-    was reached."""
+    """The page is one file without script or address. Its pictures are valid XML, and each target
+    has its verdict.
+    """
     html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
     assert not re.search(r"<script(?! type=\"application/json\")|src=|href=\"http", html)
     assert len(pictures) == 5
@@ -273,7 +290,7 @@ def test_the_page_stands_alone(figures):
 
 
 def sweeps(materials: int = 3) -> Dataset:
-    """Hums of different pitch, four positions, 128 x 16 x 1 float32 at 36 Hz."""
+    """Hums of different pitch at four positions, [128, 16, 1] float32 at 36 Hz."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(materials), 6), 4)
     t = np.arange(128)[:, None] / 36
@@ -290,8 +307,9 @@ def sweeps(materials: int = 3) -> Dataset:
 
 @pytest.mark.thorough  # a whole study
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):
-    """A study with a few iterations gives results, pictures and a page; a second run trains
-    nothing."""
+    """A study with a few iterations writes results, pictures and a page. A second run trains
+    nothing.
+    """
     hums, lines = sweeps(), []
     where = Where(jobs=1, cache=tmp_path / "cache")
     first = certainty.run(
@@ -326,7 +344,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
 
 
 def test_methods_without_tenths_are_refused(tmp_path):
-    """L-gauss has no trunk: refused by name."""
+    """L-gauss has no trunk. The error names it."""
     with pytest.raises(FormatError, match="L-gauss"):
         certainty.run(
             sweeps(),
@@ -340,7 +358,7 @@ def test_methods_without_tenths_are_refused(tmp_path):
 
 
 def test_a_case_lost_on_the_way_is_trained_again(tmp_path):
-    """A broken cache file is no Case."""
+    """A broken cache file is not taken for a Case."""
     path = tmp_path / "x.case.npz"
     uncertainty_cases._save(case(2), path)
     kept = uncertainty_cases._load(path)

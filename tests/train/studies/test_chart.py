@@ -1,5 +1,4 @@
-"""The chart: what is on the front, what a graph costs, how dots are packed and measured, what the
-files hold."""
+"""The chart: its front, the costs of a graph, seeds and stress, and the content of the files."""
 
 from __future__ import annotations
 
@@ -50,15 +49,17 @@ KEYS = (
     "touch_s",
     "runs_on_box",
 )
-"""What the issue asks of each dot, beside `accuracy`."""
+"""Required keys of each dot, beside `accuracy`."""
 
 
 # the front
 
 
 def test_the_front_is_what_no_other_dot_beats():
-    """Cheaper or more accurate than every other; a tie in one axis is decided by the other; equals
-    stand together."""
+    """A dot on the front is cheaper or more accurate than every other dot.
+
+    A tie in one axis is decided by the other. Equal dots are on the front together.
+    """
     assert pareto.front([(1, 0.9), (2, 0.8), (2, 0.95), (3, 0.95), (0.5, 0.1)]) == [
         True,
         False,
@@ -72,7 +73,7 @@ def test_the_front_is_what_no_other_dot_beats():
 
 
 def test_dots_without_a_figure_are_not_placed():
-    """A dot that lacks the accuracy asked for is not there, and cannot be on the front."""
+    """A dot without the chosen accuracy is neither on the chart nor on the front."""
     spots = pareto.placed(DOTS, "ms_p50", "lopo")
     assert len(spots) == 4
     assert [DOTS.index(spot.dot) for spot in spots if spot.best] == FRONT["lopo"]
@@ -80,13 +81,14 @@ def test_dots_without_a_figure_are_not_placed():
 
 
 def test_a_network_is_shown_once_where_it_costs_least():
-    """In int8 where that is quicker, with its other precision beside it; in the quicker of two
-    libraries; with other costs elsewhere."""
+    """It is shown in int8 if that is quicker, with its other precision beside it, and in the
+    quicker of two libraries. With other costs it may be shown in another form.
+    """
     spots = {DOTS.index(spot.dot): spot for spot in pareto.placed(DOTS, "ms_p50", "speed")}
     assert sorted(spots) == sorted(SHOWN)
     assert spots[0].other == (0.05, 0.91)
     assert spots[6].methods == {"minirocket"}
-    assert spots[6].on_box  # its other form is
+    assert spots[6].on_box  # its other precision is
     assert spots[6].other is None
     assert 5 in [DOTS.index(spot.dot) for spot in pareto.placed(DOTS, "rss_mb", "speed")]
     slow = [dot("lite", "float", 1.0, 0.8, family="x"), dot("lite", "int8", 2.0, 0.79, family="x")]
@@ -95,8 +97,11 @@ def test_a_network_is_shown_once_where_it_costs_least():
 
 
 def test_two_names_of_one_network_are_one():
-    """Of ours, with the same weights, operations and accuracies wherever both were tested; peers
-    are never taken for each other."""
+    """Two of the project's networks are one if weights, operations and all common accuracies are
+    equal.
+
+    Peers are never merged.
+    """
     twin = dot("compact-20k", "int8", 0.04, 0.95)
     dots = [
         dot("compact", "int8", 0.04, 0.95, 0.93),
@@ -117,8 +122,9 @@ def test_two_names_of_one_network_are_one():
 
 
 def test_chance_is_that_of_the_sets():
-    """One of as many materials as each set of the chart has; of real ones as the development page's
-    results say."""
+    """Chance is one over the number of materials of each set. For real sets the number is in the
+    results of `development`.
+    """
     (fabrics,) = {
         one["materials"]
         for one in committed("development")["cases"]
@@ -133,8 +139,7 @@ def test_chance_is_that_of_the_sets():
 
 
 def test_weights_and_multiply_accumulates_are_counted():
-    """A graph whose sums can be done by hand; int8 counts the same, scales and zero points are no
-    weights."""
+    """A graph with sums by hand. int8 counts the same; scales and zero points are not weights."""
     plain, whole = loudness(), quantize(loudness(), sweeps().samples)
     assert cost.precision(plain) == "float"
     assert cost.precision(whole) == "int8"
@@ -143,9 +148,11 @@ def test_weights_and_multiply_accumulates_are_counted():
 
 
 def test_the_family_counts_its_costs_as_the_chart_does():
-    """What architectures.py computes for a shape is what cost.py counts in its graphs, but for the
-    means of the responses, and for the spectrum: its part of the head, and the few numbers that it
-    is made of."""
+    """architectures.py computes for a shape the costs that cost.py counts in the graph.
+
+    The means of the responses are an exception, and so is the spectrum: its part of the head, and
+    the few numbers that it consists of.
+    """
     (method,) = methods.find(["compact-10k"], methods.Effort(share=0.0))
     known = sweeps()
     model = method.train(known, known.samples, 1)
@@ -156,14 +163,14 @@ def test_the_family_counts_its_costs_as_the_chart_does():
         assert cost.weights(one.graph()) == shown.weights + more[0]
         assert cost.macs(one.graph()) == pytest.approx(
             shown.macs + more[1], rel=0.15
-        )  # a window so short has long means
+        )  # in so short a window the means count
     assert (
         cost.weights(alone) <= 7 * 4 + bands
-    )  # window, what is not heard (twice), shares of the bands
+    )  # window, unused frequencies (twice), shares of the bands
 
 
 def test_a_gru_a_kernel_and_neighbours_are_counted():
-    """One node each, by hand."""
+    """One node each, with costs computed by hand."""
     nodes = {
         "GRU": (
             [7, 1, 5],
@@ -207,7 +214,7 @@ def test_a_gru_a_kernel_and_neighbours_are_counted():
 
 
 def test_a_graph_of_unknown_shapes_is_refused():
-    """A product of something whose shape nobody knows: it is named, not counted as nothing."""
+    """A product with an unknown shape is reported by name instead of counted as nothing."""
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])
     w = onnx.numpy_helper.from_array(np.zeros((3, 2), np.float32), "w")
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
@@ -221,7 +228,9 @@ def test_a_graph_of_unknown_shapes_is_refused():
 
 
 def test_the_transforms_of_features_are_counted():
-    """L: one of 1500 frames for each of 16 taxels; H: 40 short ones of 75; raw counts: none."""
+    """L has one transform of 1500 frames for each of 16 taxels, H 40 of 75 frames; raw counts have
+    none.
+    """
     assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
     assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
     assert cost.feature_macs("raw", skin.FORMAT) == 0
@@ -231,7 +240,9 @@ def test_the_transforms_of_features_are_counted():
 
 
 def test_seeds_are_joined():
-    """Mean accuracy, mean ends of the intervals, sweeps of one seed."""
+    """The mean of the accuracies and of the ends of the intervals; the number of sweeps of one
+    seed.
+    """
     results = [
         {
             "window": {"right": right, "total": 100},
@@ -250,7 +261,7 @@ def test_seeds_are_joined():
 
 
 def curve(severities: list[float], accuracy: list[float]) -> dict:
-    """One as stress.merge gives it."""
+    """A curve as stress.merge returns it."""
     ends = {"low": [a - 0.1 for a in accuracy], "high": [min(a + 0.1, 1) for a in accuracy]}
     return {
         "severities": severities,
@@ -262,8 +273,10 @@ def curve(severities: list[float], accuracy: list[float]) -> dict:
 
 
 def test_stress_is_given_by_the_worst_and_at_the_targets():
-    """The worst is the lowest mean over severities above none; gain is the worse of both ways;
-    noise is read at .3."""
+    """The worst is the lowest mean over all severities above zero.
+
+    Gain is the worse of both directions. Noise is read at .3.
+    """
     curves = {
         "noise": curve([0, 0.1, 0.3, 0.5], [0.9, 0.8, 0.7, 0.6]),
         "hum": curve([0, 1, 2], [0.9, 0.5, 0.3]),
@@ -286,7 +299,7 @@ def test_stress_is_given_by_the_worst_and_at_the_targets():
 
 
 def test_touch_time_is_read_or_refused(tmp_path: Path):
-    """A file of another kind is named."""
+    """The error names a file of another kind."""
     path = tmp_path / "results.json"
     path.write_text(json.dumps({"method": "compact", "early": {"share": 0.5}}))
     assert chart_experiment.touch_shares([path]) == {"compact": 0.5}
@@ -300,8 +313,10 @@ def test_touch_time_is_read_or_refused(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
-    """A small chart end to end; real sweeps that nobody named are left out; kept, the accuracies
-    are the same."""
+    """A small chart end to end. Real sweeps that were not asked for are left out.
+
+    A second run takes the cached results and gives the same accuracies.
+    """
     cases = {
         "lopo": StudyCase(("sim:T-REAL:1001:1",), "leave:position", ("position<=2",)),
         "force": chart_experiment.STUDY.cases["force"],
@@ -321,11 +336,11 @@ def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
     assert set(KEYS) | {"commit", "machine", "seeds"} <= first.keys()
 
 
-# what is written
+# written files
 
 
 def test_the_files(tmp_path: Path):
-    """chart.json is a list of dots; picture and page name them; a quick run is marked."""
+    """chart.json is a list of dots. Picture and page name them. A quick run is marked."""
     quick = [one | {"quick": True} for one in DOTS]
     page = published("chart", quick, tmp_path)
     assert json.loads((page.parent / "chart.json").read_text()) == quick
@@ -341,8 +356,9 @@ def test_the_files(tmp_path: Path):
 
 
 def test_what_the_box_answers_stands_beside_what_networks_name(tmp_path: Path):
-    """The page takes it from the results of `alignment`; without them, or if they are older, it
-    says nothing."""
+    """The page reads it from the results of `alignment`. Missing or older results are not
+    mentioned.
+    """
     share = [0.88, 0.85, 0.91]
     point = {
         "n": 432,
@@ -371,8 +387,10 @@ def test_no_name_can_break_out_of_the_data():
 
 
 def test_the_picture_is_whole_and_names_do_not_collide():
-    """Well-formed, twice the same, in roles of colour; no two names overlap; ours are named by
-    their weights."""
+    """The picture is well-formed, equal in two runs, and in roles of colour.
+
+    No two names overlap. The project's networks are named by their weights.
+    """
     svg = scatter.chart(DOTS, ("speed", "lopo"))
     assert svg == scatter.chart(DOTS, ("speed", "lopo"))
     texts = list(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"))
@@ -397,7 +415,7 @@ def test_the_picture_is_whole_and_names_do_not_collide():
         "{http://www.w3.org/2000/svg}text"
     )
     boxes = [box(node) for node in texts if (node.text or "").startswith("method-")]
-    assert 2 <= len(boxes) < 12  # the rest finds no place
+    assert 2 <= len(boxes) < 12  # there is no room for the others
     for i, a in enumerate(boxes):
         assert not any(
             a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for b in boxes[:i]
@@ -405,7 +423,7 @@ def test_the_picture_is_whole_and_names_do_not_collide():
 
 
 def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
-    """About where a text is."""
+    """Approximate box of a text."""
     x, y, width = float(node.get("x", 0)), float(node.get("y", 0)), 5.0 * len(node.text or "")
     side = re.search(r"text-anchor: (\w+)", node.get("style", ""))
     left = x - {"start": 0, "middle": width / 2, "end": width}[side[1] if side else "start"]
@@ -413,7 +431,9 @@ def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
 
 
 def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
-    """Ours is in the accent colour; others are dark on the front and grey behind it."""
+    """The project's networks have the accent colour. Others are dark on the front and grey behind
+    it.
+    """
     spots = pareto.placed(DOTS, "ms_p50", "speed")
     shown = {pareto.name(spot.dot): scatter.colour(spot) for spot in spots}
     assert shown == {
@@ -426,8 +446,11 @@ def test_the_front_of_the_picture_is_dark_and_the_rest_grey():
 
 
 def test_methods_have_names_for_people():
-    """Of ours the weights that were trained, which the command's name only bounds; what nobody
-    named keeps its name."""
+    """The project's networks are named by their trained weights, which the command's name only
+    limits.
+
+    A method without a name for people keeps its own.
+    """
     assert method_names.plain_name("compact-100k", 28638) == "Palpate, 29 k weights"
     assert method_names.plain_name("compact-1k", 2248) == "Palpate, 2.2 k weights"
     assert method_names.plain_name("compact-50k") == "Palpate, trained layers alone"
@@ -442,8 +465,7 @@ def test_methods_have_names_for_people():
 
 
 def test_an_older_chart_says_so_first():
-    """Without the recipe that is shipped now: before all else, with a link to the chart of today's;
-    that one says nothing."""
+    """A chart from before the packaged recipe says so first, with a link to today's chart."""
     old = [one | {"method": "compact"} if one["method"] == "default" else one for one in DOTS]
     text = chart_page.html(old, "")
     said, note = re.search(
@@ -457,8 +479,9 @@ def test_an_older_chart_says_so_first():
 
 
 def test_what_fell_short_stands_beside_what_did_not():
-    """Each protocol a line: ours, the best peer in its own form, the difference with its interval,
-    and what that means."""
+    """Each protocol has a line: the project's accuracy, the best peer, the difference with its
+    interval and a verdict in words.
+    """
     text = PageReader(chart_page.html(DOTS, "")).text.replace("\N{NO-BREAK SPACE}", " ")
     assert (
         "a speed it never felt within a point −1.0 [−3.8, +1.8] 95.0 % 93.0 – 97.0 % 96.0 % 94.0 "
@@ -482,5 +505,5 @@ def test_what_fell_short_stands_beside_what_did_not():
     ],
 )
 def test_a_difference_in_words(gap: tuple[float, float, float], words: str):
-    """Not certain where its interval holds 0; a point below is still near."""
+    """A difference is not certain if its interval contains 0. A point below is still near."""
     assert comparison.verdict(gap) == words

@@ -1,5 +1,4 @@
-"""The interactive chart in a headless browser: every control works, and no request leaves the
-page."""
+"""The interactive chart in a headless browser: every control works, no request leaves the page."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ NAMES = [pareto.name(one) for one in DOTS]
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The page's address, in a folder."""
+    """The address of the page in a folder."""
     return published("chart", DOTS, tmp_path_factory.mktemp("chart")).as_uri()
 
 
@@ -37,13 +36,13 @@ class BrowsedChart:
         self.asked: list[str] = []
 
     def open(self, choice: str = "") -> BrowsedChart:
-        """Load it, with what was chosen in the address."""
+        """Load it with these choices in the address."""
         self.page.goto("about:blank")
         self.page.goto(self.address + choice)
         return self
 
     def places(self) -> dict[int, tuple[float, float]]:
-        """Where each dot that is shown stands, by its number."""
+        """The position of each visible dot, by its number."""
         return {
             int(i): (x, y)
             for i, x, y in self.page.evaluate("""() => [...document.querySelectorAll('.dot')]
@@ -64,18 +63,19 @@ class BrowsedChart:
         return str(self.page.get_attribute("#stairs", "d"))
 
     def tip(self) -> str:
-        """The text of the tip; "" where there is none."""
+        """The text of the tip, "" without a tip."""
         return str(self.page.inner_text("#tip")) if self.page.is_visible("#tip") else ""
 
     def rows(self) -> list[str]:
-        """The table's lines, by what commands call them."""
+        """The rows of the table, by the names that commands use."""
         return list(self.page.locator("#table tbody th small").all_inner_texts())
 
 
 @pytest.fixture
 def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
-    """The page on a desktop; nothing may appear on the console, and nothing but the file may be
-    requested."""
+    """The page on a desktop. The console must stay empty, and nothing but the file may be
+    requested.
+    """
     context = browser.new_context(viewport={"width": 1000, "height": 800}, reduced_motion="reduce")
     one = BrowsedChart(context.new_page(), file)
     yield one.open()
@@ -85,8 +85,10 @@ def seen(browser: Any, file: str) -> Iterator[BrowsedChart]:
 
 
 def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
-    """Each network once, as Python found it: further right is dearer, further up more accurate; the
-    still picture gives way."""
+    """Each network is shown once, as Python found it: right is dearer, up is more accurate.
+
+    The still picture disappears.
+    """
     there = seen.places()
     assert sorted(there, key=lambda i: there[i]) == SHOWN
     assert seen.best() == FRONT["speed"]
@@ -98,7 +100,7 @@ def test_it_shows_all_dots_and_the_front(seen: BrowsedChart):
 
 @pytest.mark.parametrize("cost", pareto.COSTS)
 def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, cost: str):
-    """For every pair of axes the page's front is Python's."""
+    """For every pair of axes the page draws the front that Python computes."""
     before = seen.places(), seen.stairs()
     for accuracy in ("lopo", "speed"):
         seen.page.select_option("#x", cost)
@@ -111,8 +113,9 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, 
 
 
 def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
-    """Near a dot its name is shown, with its interval and what beats it; away from all dots nothing
-    is."""
+    """Near a dot the tip shows its name, its interval and the dots that beat it. Elsewhere there is
+    no tip.
+    """
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()
     seen.page.mouse.move(frame["x"] + x + 6, frame["y"] + y + 6)
@@ -131,7 +134,7 @@ def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
 
 
 def test_a_tap_names_a_dot_on_a_phone(browser: Any, file: str):
-    """The tip is there after a tap and inside the picture."""
+    """A tap shows the tip inside the picture."""
     context = browser.new_context(
         viewport={"width": 360, "height": 700}, has_touch=True, reduced_motion="reduce"
     )
@@ -148,7 +151,9 @@ def test_a_tap_names_a_dot_on_a_phone(browser: Any, file: str):
 
 
 def test_filters_hide_dots_and_the_front_closes_up(seen: BrowsedChart):
-    """Without int8 and MiniRocket others are on the front; shown again, all is as before."""
+    """Without int8 and MiniRocket other dots are on the front. When they return, all is as
+    before.
+    """
     seen.page.uncheck("#precision input[value=int8]")
     seen.page.uncheck("#family input[value=MiniRocket]")
     assert set(seen.places()) == {1, 3, 4}
@@ -160,15 +165,16 @@ def test_filters_hide_dots_and_the_front_closes_up(seen: BrowsedChart):
 
 
 def test_nothing_left_is_no_trouble(seen: BrowsedChart):
-    """With all hidden there is an empty plot and an empty table."""
+    """If all dots are hidden, plot and table are empty."""
     for box in seen.page.locator("#precision input").all():
         box.uncheck()
     assert (seen.places(), seen.stairs(), seen.rows()) == ({}, "", [])
 
 
 def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
-    """A tenfold cost is equally far everywhere on a logarithmic scale, and not on a linear one;
-    errors by their root, or not."""
+    """Only on a logarithmic scale a factor of ten is equally long everywhere. Errors may be scaled
+    by their root.
+    """
     ratio = lambda there: (there[3][0] - there[2][0]) / (there[6][0] - there[3][0])  # noqa: E731
     assert ratio(seen.places()) == pytest.approx(
         np.log(12.5) / np.log(18), rel=0.01
@@ -183,8 +189,7 @@ def test_scales_are_linear_or_logarithmic(seen: BrowsedChart):
 
 
 def test_the_choice_is_in_the_address(seen: BrowsedChart):
-    """A choice is in the address, and opening that address restores it; values that do not exist
-    are ignored."""
+    """Opening the address restores the choice. Unknown values are ignored."""
     seen.page.select_option("#x", "macs")
     seen.page.select_option("#y", "lopo")
     seen.page.uncheck("#xlog")
@@ -202,14 +207,16 @@ def test_the_choice_is_in_the_address(seen: BrowsedChart):
 
 
 def test_the_address_may_change_while_the_page_is_open(seen: BrowsedChart):
-    """A link to another choice of the same page is followed."""
+    """The page follows a link to another choice of itself."""
     seen.page.evaluate("location.hash = '#y=lopo'")
     seen.page.wait_for_function("document.getElementById('y').value === 'lopo'")
     assert seen.best() == FRONT["lopo"]
 
 
 def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
-    """One stop of Tab; arrows by cost, Home and End; Escape closes the tip."""
+    """All dots are one stop of Tab. Arrows go by cost, Home and End to the ends; Escape closes the
+    tip.
+    """
     order = [pareto.label(spot.dot) for spot in pareto.placed(DOTS, "ms_p50", "speed")]
     seen.page.locator("#family input").last.focus()
     seen.page.keyboard.press("Tab")
@@ -229,7 +236,7 @@ def test_the_keyboard_goes_from_dot_to_dot(seen: BrowsedChart):
 
 
 def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: BrowsedChart):
-    """The one stop of Tab is a dot that is shown."""
+    """The stop of Tab is a visible dot."""
     seen.page.uncheck("#family input[value=Palpate]")
     seen.page.locator("#family input").last.focus()
     seen.page.keyboard.press("Tab")
@@ -237,7 +244,9 @@ def test_the_first_dot_may_be_hidden_and_tab_still_finds_one(seen: BrowsedChart)
 
 
 def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
-    """Each has its name and the two figures chosen; the controls have labels."""
+    """Each dot has its name and the two chosen figures for screen readers. The controls have
+    labels.
+    """
     assert seen.page.get_by_role("img", name="H, SVM: 93.0 %, 0.5 ms").count() == 1
     assert seen.page.get_by_label("accuracy", exact=True).count() == 1
     assert seen.page.get_by_label("stretched towards 100 %").count() == 1
@@ -245,7 +254,7 @@ def test_dots_are_named_for_those_who_do_not_see_them(seen: BrowsedChart):
 
 @pytest.mark.slow
 def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
-    """By accuracy first, by cost when asked; the head shows which."""
+    """It is sorted by accuracy at first, then by the chosen cost. Its head shows the order."""
     by_accuracy = sorted(DOTS, key=lambda one: (-one["accuracy"]["speed"]["mean"], one["ms_p50"]))
     assert seen.rows() == [pareto.name(one) for one in by_accuracy]
     seen.page.locator("button[data-sort=cost]").focus()
@@ -258,8 +267,9 @@ def test_the_table_is_sorted_by_what_was_chosen(seen: BrowsedChart):
 @pytest.mark.parametrize("width", [360, 800])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: str):
-    """No sideways scrolling, by day and by night; the plot is as wide as the page; names stay
-    inside it."""
+    """No sideways scrolling, light and dark. The plot is as wide as the page and contains all
+    names.
+    """
     context = browser.new_context(
         viewport={"width": width, "height": 700}, color_scheme=scheme, reduced_motion="reduce"
     )
@@ -281,8 +291,7 @@ def test_it_fits_and_can_be_read(browser: Any, file: str, width: int, scheme: st
 
 
 def test_what_the_box_ships_stands_out(seen: BrowsedChart):
-    """It alone has a ring; its whole name stands at it, the others of ours have theirs without
-    saying that they are ours."""
+    """Only its dot has a ring and its whole name. The project's other dots have shorter names."""
     ringed = seen.page.eval_on_selector_all(
         ".dot",
         "all => all.filter((d) => getComputedStyle(d.querySelector('.ship')).stroke !== "
@@ -295,7 +304,7 @@ def test_what_the_box_ships_stands_out(seen: BrowsedChart):
 
 
 def test_a_network_in_both_precisions_has_an_arrow(seen: BrowsedChart):
-    """From float to int8; none where a precision is filtered out."""
+    """The arrow goes from float to int8. It is missing if one of them is filtered out."""
     (arrow,) = seen.page.locator("#arrows line").all()
     there = seen.places()
     ends = [float(arrow.get_attribute(key)) for key in ("x1", "x2", "y1", "y2")]
@@ -307,8 +316,9 @@ def test_a_network_in_both_precisions_has_an_arrow(seen: BrowsedChart):
 
 
 def test_the_axis_goes_to_all_and_shows_where_guessing_is(seen: BrowsedChart):
-    """100 % is its last tick, the line of chance stands at 1/7, and the most accurate have ticks
-    around them."""
+    """The last tick is 100 %, the line of chance is at 1/7, and ticks surround the most accurate
+    dots.
+    """
     ticks = [
         text.removesuffix(" %")
         for text in seen.page.locator("#grid text[text-anchor=end]").all_text_contents()
@@ -323,7 +333,7 @@ def test_the_axis_goes_to_all_and_shows_where_guessing_is(seen: BrowsedChart):
 
 
 def test_large_files_are_told_in_megabytes(seen: BrowsedChart):
-    """50,000 KB are 50 MB, on the axis and in the table; nothing is "k KB"."""
+    """50,000 KB are shown as 50 MB on the axis and in the table. No text contains "k KB"."""
     seen.page.select_option("#x", "file_kb")
     texts = " ".join(
         [*seen.page.locator("#grid text").all_text_contents(), seen.page.inner_text("#table")]
@@ -334,15 +344,17 @@ def test_large_files_are_told_in_megabytes(seen: BrowsedChart):
 
 
 def test_what_was_not_measured_so_stands_last(seen: BrowsedChart):
-    """With a dash, and not on the chart."""
+    """Networks without this figure have a dash and no dot."""
     seen.page.select_option("#y", "lopo")
     assert [name.split()[0] for name in seen.rows()[-2:]] == ["minirocket", "minirocket"]
     assert "–" in seen.page.locator("#table tbody tr").last.inner_text()
 
 
 def test_all_figures_can_be_had(seen: BrowsedChart):
-    """As the file beside the page, and as a sheet that the page holds itself: a line for each form,
-    shares from 0 to 1."""
+    """A reader can download the file beside the page, and a sheet from the page itself.
+
+    The sheet has a line for each precision, with shares from 0 to 1.
+    """
     assert seen.page.get_attribute("a[download]:not([href^=data])", "href") == "chart.json"
     assert (Path(urlparse(seen.address).path).parent / "chart.json").exists()
     with seen.page.expect_download() as sheet:
@@ -358,7 +370,7 @@ def test_all_figures_can_be_had(seen: BrowsedChart):
 
 @pytest.mark.slow
 def test_without_scripts_there_is_a_picture_and_a_table(browser: Any, file: str):
-    """No control that does nothing."""
+    """Controls that would do nothing are hidden."""
     context = browser.new_context(java_script_enabled=False)
     page = context.new_page()
     page.goto(file)

@@ -1,5 +1,6 @@
-"""Tests of `train.studies.cnn_curve`: what is tested on, where a curve has points, and how it
-goes on when interrupted."""
+"""`train.studies.cnn_curve`: its test sets, the points of a curve, and a restart after an
+interruption.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +22,12 @@ FEW = {"train": 1, "new": 1, "hard": 1}
 
 
 class CurveInterrupted(Exception):
-    """Stands for a loss of power."""
+    """Represents a loss of power."""
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A size that is trained in a moment, measured after steps 2 and 4 and the last, kept after
-    each."""
+    """A training of a moment that is measured and saved after steps 2, 4 and the last."""
     layers = paper_cnn.ImageLayers((2, 2), ((5, 2), (5, 2)), 2, False, 4)
     recipe = replace(paper_cnn.PAPER_RECIPE, steps=7, batch=8)
     monkeypatch.setattr(cnn_curve, "SIZES", {"small": cnn_curve.Size(layers, 60, recipe)})
@@ -38,7 +38,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def follow(out: Path, seed: int = 1, stop_at: int = 0, **options: Any) -> dict[str, Any]:
-    """The curve of a training that is interrupted after a step, or not at all."""
+    """The curve of a training, which is interrupted after step `stop_at`."""
 
     def log(line: str) -> None:
         if line.startswith(f"step {stop_at}/"):
@@ -48,8 +48,10 @@ def follow(out: Path, seed: int = 1, stop_at: int = 0, **options: Any) -> dict[s
 
 
 def test_it_is_tested_on_positions_and_attachments_that_it_never_saw() -> None:
-    """Other attachments for each of the sets, of another world too; T-HARD is numbered as in the
-    paper's experiment."""
+    """Each set has its own attachments, also in another world.
+
+    T-HARD has the numbers of the paper's experiment.
+    """
     drawn = cnn_curve.draw(2, skin.WORLD, 60, FEW)
     assert {name: len(sweeps) for name, sweeps in drawn.items()} == {
         "train": 54,
@@ -64,7 +66,7 @@ def test_it_is_tested_on_positions_and_attachments_that_it_never_saw() -> None:
 
 
 def test_points_are_doubled_and_the_last_iteration_is_one() -> None:
-    """However many iterations there are."""
+    """This holds for every number of iterations."""
     assert cnn_curve.marks(600)[-3:] == [256, 512, 600]
     assert cnn_curve.marks(2) == [2]
     assert cnn_curve.marks(1) == [1]
@@ -72,8 +74,10 @@ def test_points_are_doubled_and_the_last_iteration_is_one() -> None:
 
 @pytest.mark.slow
 def test_a_curve_has_all_its_points(tmp_path: Path) -> None:
-    """Shares with intervals, and confusions that add up; nothing else stays on the disk, and it is
-    not trained again."""
+    """The points are shares with intervals, and confusions that add up.
+
+    Nothing else stays on the disk, and the curve is not trained again.
+    """
     out = tmp_path / "deeper" / "curve.json"
     result = follow(out)
     assert json.loads(out.read_text()) == json.loads(json.dumps(result))
@@ -99,7 +103,7 @@ def test_a_curve_has_all_its_points(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("centred", [False, True])
 def test_an_interrupted_curve_goes_on(centred: bool, tmp_path: Path) -> None:
-    """It becomes what it would have been."""
+    """It becomes the curve of an uninterrupted training."""
     with pytest.raises(CurveInterrupted):
         follow(tmp_path / "a.json", stop_at=5, centred=centred)
     assert [p["step"] for p in json.loads((tmp_path / "a.json").read_text())["points"]] == [2, 4]
@@ -112,7 +116,9 @@ def test_an_interrupted_curve_goes_on(centred: bool, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kept", ["", "half of {", None])
 def test_another_training_in_the_file_is_replaced(kept: str | None, tmp_path: Path) -> None:
-    """With its checkpoint, which would be of other weights; a file that cannot be read likewise."""
+    """Its checkpoint, which has other weights, is replaced, too. So is a file that cannot be
+    read.
+    """
     out = tmp_path / "a.json"
     with pytest.raises(CurveInterrupted):
         follow(out, seed=2, stop_at=5)
@@ -123,7 +129,7 @@ def test_another_training_in_the_file_is_replaced(kept: str | None, tmp_path: Pa
 
 @pytest.mark.slow
 def test_the_command_prints_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the printed numbers above it; no iterations are refused."""
+    """The paper's printed numbers stand above it. Zero iterations are refused."""
     out = tmp_path / "a.json"
     assert main(["cnn-curve", "--seed", "3", "--steps", "2", "--out", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()

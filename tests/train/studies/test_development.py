@@ -1,5 +1,4 @@
-"""The development page: what is run and kept, what is left out, and the figures that it shows of
-any part of the results."""
+"""The study `development`: its runs, its cache, its omissions, and the figures of its page."""
 
 from __future__ import annotations
 
@@ -34,8 +33,9 @@ from train.studies.study import StudyCase, StudyRun, save
 
 
 def test_the_page_shows_every_figure():
-    """Accuracies and differences with intervals beside the best peer of each line, means, what was
-    wanted, what was left out."""
+    """Accuracies and differences with intervals beside the best peer of each line, means, targets
+    and omissions.
+    """
     pages, pictures = development_report.render(figures())
     read = PageReader(pages["index"])
     text = read.text.replace("\N{NO-BREAK SPACE}", " ")
@@ -86,8 +86,10 @@ def test_the_page_shows_every_figure():
 
 
 def test_the_chart_has_an_axis_for_each_line_and_their_mean():
-    """The mean first; dots with the times that were measured, each line's chance; what was measured
-    elsewhere has no dot."""
+    """The mean is the first axis. Dots have measured times, and each line has its chance.
+
+    A method that was measured elsewhere has no dot.
+    """
     pages, pictures = development_report.render(figures())
     data = json.loads(
         re.search(
@@ -119,8 +121,9 @@ def test_the_chart_has_an_axis_for_each_line_and_their_mean():
 
 
 def test_the_mean_of_lines_counts_one_set_once():
-    """Lines of one file err together, others independently: .05 of one file, .05 / sqrt 2 of
-    two."""
+    """Lines of one file err together, others independently: .05 for one file, .05 / sqrt 2 for
+    two.
+    """
     table = development_report.by_case([entry(c, "default", 0.8) for c in ("one", "two")])
     for files, away in ((("a", "a"), 0.05), (("a", "b"), 0.05 / 2**0.5)):
         cases = [
@@ -133,7 +136,7 @@ def test_the_mean_of_lines_counts_one_set_once():
 
 
 def test_every_case_has_words_for_people():
-    """No protocol or published set is shown as the command takes it."""
+    """No protocol or published set is shown by its name in commands."""
     for name, case in development_experiment.CASES.items():
         about = {
             "case": name,
@@ -148,15 +151,17 @@ def test_every_case_has_words_for_people():
 
 
 def test_the_best_peer_of_each_line_is_bold():
-    """Never ours, and another one in another line."""
+    """The project's accuracy is never bold. The best peer may differ from line to line."""
     pages, _ = development_report.render(figures())
     bold = re.findall(r'<td class="best">([\d.]+)', pages["index"])
     assert bold == ["85.0", "75.5", "85.0", "80.2"]  # two lines, two means
 
 
 def test_a_part_of_the_results_makes_a_page():
-    """No peers: no difference; no curve: no picture of it, no times: no chart; a case without a
-    result of ours has no line."""
+    """Without peers it has no difference, without a curve no picture of it, without times no chart.
+
+    A case without a result of the project has no line.
+    """
     alone = [entry("one", "compact-50k", 0.9), entry("two", "quant", 0.7)]
     pages, pictures = development_report.render(
         figures(results=alone, methods=["compact-50k", "quant"], times=None)
@@ -168,7 +173,7 @@ def test_a_part_of_the_results_makes_a_page():
 
 
 def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
-    """An error says what to do, and nothing is written."""
+    """The error says what to do, and no file is written."""
     with pytest.raises(
         FormatError,
         match="no result of default or default-reattached or filter-bank or compact-50k; "
@@ -179,8 +184,9 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
 
 
 def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: Any) -> Development:
-    """Two cases on tones, which lie in `folder` as a file of real sweeps; the first with a learning
-    curve."""
+    """Two cases on tones from a file of real sweeps in `folder`. The first case has a learning
+    curve.
+    """
     tones().save(folder / "tones.npz")
     replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
     curve = development_experiment.EACH
@@ -204,8 +210,10 @@ def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: 
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
-    """Each case with all sweeps, one also with fewer; again from the cache alone; a method that
-    cannot take a case is named."""
+    """Each case runs with all sweeps, the first also with fewer. A second run needs only the cache.
+
+    A method that cannot run a case is reported.
+    """
     lines: list[str] = []
     run = experiment(tmp_path, "L-gauss", "spectrogram-svm", seeds=(1, 2), log=lines.append)
     found = run.results()
@@ -229,21 +237,22 @@ def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
 
 
 def test_without_real_sweeps_their_cases_are_left_out(tmp_path: Path):
-    """With what to name."""
+    """The report names the missing sweeps."""
     run = experiment(tmp_path, "L-gauss", data=None)
     assert run.results()["results"] == []
     assert run.run.left_out["tones"] == "real sweeps; name their folder with --data or PALPATE_DATA"
 
 
 def test_an_unknown_method_ends_it_before_anything_is_trained(tmp_path: Path):
-    """With those that exist."""
+    """The error lists the existing methods."""
     with pytest.raises(FormatError, match="method 'nobody' is unknown"):
         experiment(tmp_path, "L-gauss", "nobody").results()
 
 
 def test_what_is_not_wanted_is_not_run_and_named(tmp_path: Path):
-    """A case with its curve, or one point of the curve; a name that does not exist is an error,
-    with those that do."""
+    """A case with its curve, or a point of the curve, can be left out. An unknown name is an error
+    that lists the existing names.
+    """
     run = experiment(tmp_path, "L-gauss", skipped=["short", "tones, 5 each", "tones, 10 each"])
     assert {(r["case"], r["each"]) for r in run.results()["results"]} == {
         ("tones", 0),
@@ -258,7 +267,7 @@ def test_what_is_not_wanted_is_not_run_and_named(tmp_path: Path):
 
 
 def test_other_precisions_of_a_method_are_counted_with_it():
-    """Over all seeds, as the method itself."""
+    """They are counted over all seeds, as the method itself is."""
     one = {"window": Score(8, 10).json(), "interval": (0.5, 0.9), "fit_s": 1.0, "ms_p50": 2.0}
     results = [
         one | {"seed": s, "forms": {"int8": one | {"window": Score(5 + s, 10).json()}}}
@@ -270,8 +279,10 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 
 
 def test_the_usual_methods_and_cases_exist():
-    """Every peer by its name; every set and protocol can be read, each set with a learning curve;
-    the page ends with simulated sweeps."""
+    """Every peer has its name. Every set has a learning curve, and its protocols can be read.
+
+    Simulated sweeps are the last of the page.
+    """
     usual = set(development_experiment.usual_methods(development_experiment.STUDY))
     assert set(development_experiment.PEERS) < usual <= set(methods.every())
     cases = development_experiment.CASES
@@ -294,8 +305,11 @@ def test_the_usual_methods_and_cases_exist():
 
 
 def test_a_run_is_joined_by_what_it_lacks_of_another():
-    """Methods in the usual order, entries once (its own), reasons only for what is still missing,
-    and who ran when."""
+    """Methods come in the default order. Each entry comes once, from the run itself if it has it.
+
+    Reasons stay only for results that are still missing. The joined run says which part was run
+    when.
+    """
     run = figures(methods=["default"], results=[entry("one", "default", 0.9)], left_out={})
     del run["times"]
     others = [
@@ -323,11 +337,11 @@ def test_a_run_is_joined_by_what_it_lacks_of_another():
     assert made["left_out"] == {"quant, two": "too short", "one, 5 each": "no"}
     assert made["runs"] == [*run["runs"], *earlier["runs"]]
     assert made["times"] == earlier["times"]
-    assert run["methods"] == ["default"]  # as it was
+    assert run["methods"] == ["default"]  # unchanged
 
 
 def test_a_run_of_other_sweeps_is_not_joined():
-    """The case is named."""
+    """The error names the case."""
     earlier = figures()
     earlier["cases"][1]["digest"] = "other"
     with pytest.raises(FormatError, match="'two' was of other sweeps in a run that is joined"):
@@ -335,13 +349,15 @@ def test_a_run_of_other_sweeps_is_not_joined():
 
 
 def cases_named(*names: str) -> list[dict[str, Any]]:
-    """Cases as the results have them, each of a set of its own."""
+    """Cases as in the results, each with a set of its own."""
     return [figures()["cases"][0] | {"case": name, "set": name} for name in names]
 
 
 def test_the_shipped_method_is_named_even_behind_the_front():
-    """In the accent colour; so are all peers; a method that lacks a line of the mean is not in its
-    picture."""
+    """It has the accent colour. All peers are named, too.
+
+    A method without a line of the mean is not in the mean's picture.
+    """
     table = development_report.by_case(
         [
             entry(c, m, a)
@@ -370,7 +386,7 @@ def test_the_shipped_method_is_named_even_behind_the_front():
 
 
 def test_the_int8_form_of_a_peer_has_a_dot_of_its_own():
-    """With its own time and its own accuracy; without an accuracy there is none."""
+    """The dot has its own time and accuracy. Without an accuracy it has none."""
     table = development_report.by_case([entry("one", "default", 0.8)])
     table["one"]["ds-cnn"] = entry("one", "ds-cnn", 0.7) | {
         "forms": {"int8": entry("one", "ds-cnn", 0.6)}
@@ -389,7 +405,9 @@ def test_the_int8_form_of_a_peer_has_a_dot_of_its_own():
 
 
 def test_int8_is_held_against_its_own_float():
-    """Where both were timed: at most half; else nothing is said."""
+    """If both were timed, the target of int8 is half of float's time. Otherwise there is no
+    target.
+    """
     times = [
         {"method": "default", "precision": name, "ms_p50": ms}
         for name, ms in (("int8", 0.6), ("float", 1.0))
@@ -402,7 +420,9 @@ def test_int8_is_held_against_its_own_float():
 
 
 def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
-    """Three lines of two peers are a larger table than one line of three; both means are shown."""
+    """Three lines of two peers are a larger table than one line of three peers. Both means are
+    shown.
+    """
     lines = ("one", "two", "three")
     results = [
         entry(c, m, a)
@@ -437,7 +457,7 @@ def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
 
 @pytest.mark.parametrize(("mean", "word"), [(0.9, "reached"), (0.8999, "not reached")])
 def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
-    """With the interval beside it."""
+    """The verdict stands with the interval."""
     (case,) = list(development_report.WANTED)[:1]
     table = development_report.by_case([entry(case, "default", mean)])
     cases = cases_named(case)
@@ -451,7 +471,7 @@ def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
 
 
 def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
-    """The mean is over the lines of the peers that lack the fewest."""
+    """The mean is over the lines of the peers with the fewest missing lines."""
     table = development_report.by_case(
         [entry(c, m, a) for c in ("one", "two") for m, a in (("default", 0.8), ("quant", 0.9))]
     )
@@ -471,7 +491,9 @@ def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
 
 
 def test_times_are_told_in_those_of_minirocket():
-    """Where it is quickest; nothing where it was not timed."""
+    """The unit is MiniRocket's quickest time. Without a time of MiniRocket there is no
+    comparison.
+    """
     times = [
         {"method": "minirocket", "ms_p50": 12.0},
         {"method": "minirocket", "ms_p50": 10.0},
@@ -484,7 +506,7 @@ def test_times_are_told_in_those_of_minirocket():
 
 
 def test_networks_of_peers_are_trained_briefly_for_their_time():
-    """Ours are not: what they choose decides how fast they are."""
+    """The project's networks are trained in full, because their choices decide their speed."""
     brief, whole = (
         development_times._briefly(name, methods.FULL_EFFORT).effort
         for name in ("ds-cnn", "compact-50k")
@@ -495,8 +517,10 @@ def test_networks_of_peers_are_trained_briefly_for_their_time():
 @pytest.mark.slow
 @pytest.mark.thorough  # trains and times every method
 def test_all_methods_are_timed_in_one_run(tmp_path: Path):
-    """A bundle by the box's classifier, in int8 too, a method of aeon in aeon; one that cannot take
-    the sweeps is left out, with why."""
+    """The box's classifier times bundles, also in int8; aeon times its methods.
+
+    A method that cannot take the sweeps is left out with a reason.
+    """
     found = development_times.measured(
         ["L-gauss", "ds-cnn", "quant", "spectrogram-svm"],
         tones(),
@@ -532,7 +556,7 @@ def test_all_methods_are_timed_in_one_run(tmp_path: Path):
 def test_other_results_are_not_joined_or_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, why: str
 ):
-    """A missing file, half a file and another file: the error names it, nothing is written."""
+    """The error names a missing file, half a file or a file of another kind. Nothing is written."""
     if text is not None:
         (tmp_path / "development.json").write_text(text)
     file, out = str(tmp_path / "development.json"), str(tmp_path / "pages")
@@ -551,7 +575,7 @@ def test_other_results_are_not_joined_or_drawn(
 def test_times_alone_are_measured_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Of all methods of the results; accuracies stay."""
+    """All methods of the results are timed. Their accuracies stay."""
     file = save(tmp_path / "development.json", figures())
     asked: list[Any] = []
 
@@ -571,8 +595,10 @@ def test_times_alone_are_measured_again(
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Results that say what they are; --kept with fewer methods reports these alone; their page has
-    all pictures and its warning."""
+    """Its results say that they are of a quick run. --kept with fewer methods reports only these.
+
+    The page has all pictures and a warning.
+    """
     args = ["development", "--quick", "--jobs", "1", "--cache", str(tmp_path / "cache")]
     file, quick = tmp_path / "a.json", set(development_experiment.QUICK.methods)
     assert main([*args, "--out", str(file)]) == 0
@@ -605,7 +631,9 @@ def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.Capture
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 def test_both_pages_can_be_read(browser: Any, tmp_path: Path, width: int, scheme: str):
-    """Nothing cut off, no axis without title, no raw brace, enough contrast."""
+    """Nothing is cut off, every axis has a title, no raw brace is left, and the contrast is high
+    enough.
+    """
     page = published("development", figures(), tmp_path)
     for name in ("index", "chart"):
         address = rendered.address(page.with_name(f"{name}.html"))

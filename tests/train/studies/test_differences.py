@@ -1,4 +1,4 @@
-"""Means and differences of estimates, against intervals that are known."""
+"""Means and differences of estimates, compared with known intervals."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from train.studies import differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():
-    """The first example of his table II: 56 of 70 less 48 of 80 is .2, by method 10 from .0524 to
-    .3339."""
+    """The first example of his table II: 56 of 70 minus 48 of 80 is .2; method 10 gives .0524 to
+    .3339.
+    """
     one, other = ((right / n, *wilson(right, n)) for right, n in ((56, 70), (48, 80)))
     assert differences.difference(one, other) == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
 
 
 def test_the_interval_of_a_difference_holds_what_it_says():
-    """For two shares drawn 2,000 times, at least 93 % of the intervals hold the true difference,
-    and not all."""
+    """Of 2,000 random pairs of shares at least 93 % of the intervals contain the true difference,
+    and not all.
+    """
     rng, inside = np.random.default_rng(0), []
     for one, other in zip(
         rng.binomial(80, 0.9, 2000) / 80, rng.binomial(80, 0.7, 2000) / 80, strict=True
@@ -30,8 +32,9 @@ def test_the_interval_of_a_difference_holds_what_it_says():
 
 
 def test_groups_of_a_mean_err_independently():
-    """Four equal intervals: alone half as wide, as one group as wide as each; the ends keep their
-    sides."""
+    """The mean of four equal intervals is half as wide if they are independent, and as wide as each
+    if they are one group. The two ends of an interval are not exchanged.
+    """
     one = (0.8, 0.7, 0.84)
     alone = differences.mean({str(i): [one] for i in range(4)})
     together = differences.mean({"a": [one] * 4})
@@ -42,12 +45,12 @@ def test_groups_of_a_mean_err_independently():
 
 
 def test_an_entry_of_results_is_an_estimate():
-    """There and back."""
+    """An estimate survives the round trip through an entry."""
     entry = {"mean": 0.8, "low": 0.7, "high": 0.9}
     assert differences.entry(differences.of(entry | {"n": 3})) == entry
 
 
 def test_of_nothing_there_is_no_mean():
-    """An error instead of a number."""
+    """The mean of nothing is an error instead of a number."""
     with pytest.raises(ZeroDivisionError):
         differences.mean({})

@@ -1,5 +1,7 @@
-"""Results below docs/data, the pages that are drawn of them, and the pictures of written pages:
-each is in a list that commands know, has its header, and can be read."""
+"""Results in docs/data, the pages of them, and the pictures of written pages.
+
+Each is in a list of the commands, has its header and can be read.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,14 @@ HTML = (
 SVG = sorted(DOCS.rglob("*.svg"))
 MARKDOWN = [*ROOT.glob("*.md"), *sorted(DOCS.rglob("*.md"))]
 CURVE = RESULTS / "cnn-curve.json"
-"""Its newest point is in the results of `paper`."""
+"""The results of `paper` contain its last point."""
 METHODS = {"method", "methods", "shipped"}
-"""Keys of results about methods, and so about the default."""
+"""Keys of results about methods, which depend on the default method."""
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with all pages of the results in docs/data."""
+    """A folder with the pages of all results in docs/data."""
     out = tmp_path_factory.mktemp("site") / "results"
     pages.write((), out, RESULTS)
     results = json.loads((RESULTS / "soak.json").read_bytes())
@@ -43,12 +45,12 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def name(path: Path) -> str:
-    """For a test's id."""
+    """The id of a test."""
     return str(path.relative_to(ROOT))
 
 
 def about_a_default(figures: Any) -> bool:
-    """Whether figures are of methods or of a bundle, wherever they say so."""
+    """Whether figures are about methods or a bundle, at any depth."""
     if isinstance(figures, dict):
         return (
             bool(METHODS & figures.keys())
@@ -59,8 +61,9 @@ def about_a_default(figures: Any) -> bool:
 
 
 def test_every_result_about_a_default_is_listed():
-    """A file of results that `reports` does not know would grow stale unseen; git holds no page
-    that is built."""
+    """Nobody would notice that a result outside of the list of `reports` is stale. Git holds no
+    built page.
+    """
     assert list(DOCS.rglob("*.html")) == []
     results = [
         path for path in DOCS.rglob("*.json") if about_a_default(json.loads(path.read_bytes()))
@@ -71,7 +74,7 @@ def test_every_result_about_a_default_is_listed():
 
 
 def test_every_picture_is_shown_once_at_least():
-    """No picture without a page that shows it."""
+    """Every picture in docs is on a page."""
     text = "".join(path.read_text() for path in MARKDOWN)
     pictures = [*SVG, *DOCS.rglob("*.png")]
     assert [name(path) for path in pictures if f"{path.name})" not in text] == []
@@ -79,13 +82,15 @@ def test_every_picture_is_shown_once_at_least():
 
 @pytest.mark.parametrize("report", reports.REPORTS, ids=lambda report: report.name)
 def test_results_say_where_they_are_from(report: reports.ResultFile):
-    """Commit, and what else their provenance finds."""
+    """The commit, and the other fields of their provenance."""
     assert provenance.read(DOCS / report.file).commit
 
 
 def test_a_page_shows_its_results_and_says_first_if_they_are_older(drawn: Path):
-    """Its header, and that of its pictures, is that of its results; if the default was another one,
-    the first line behind the title says so."""
+    """Its header and that of its pictures are the header of its results.
+
+    If they are of another default, the first line below the title says so.
+    """
     for page in drawn.glob("*/*.html"):
         shown = provenance.read(RESULTS / f"{page.parent.name}.json")
         assert provenance.read(page) == shown, page
@@ -97,7 +102,9 @@ def test_a_page_shows_its_results_and_says_first_if_they_are_older(drawn: Path):
 
 
 def test_the_soak_is_drawn_of_its_results(tmp_path: Path):
-    """Without a new record results stay byte by byte, as the site's build needs it."""
+    """Without a new record its results stay the same byte for byte, as the build of the site
+    needs.
+    """
     file = tmp_path / "soak.json"
     file.write_bytes((RESULTS / "soak.json").read_bytes())
     assert soak.draw([tmp_path], file, tmp_path / "page")
@@ -109,9 +116,12 @@ def test_the_soak_is_drawn_of_its_results(tmp_path: Path):
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 @pytest.mark.parametrize("page", HTML)
 def test_a_page_can_be_read(browser: Any, drawn: Path, page: str, width: int, scheme: str):
-    """On a phone, a tablet and a desk, by day and by night: no column or text is cut off, every
-    axis has a title, contrast is 4.5 at least, tables have heads and take the focus where they
-    scroll, and no brace was left."""
+    """On a phone, a tablet and a desk, light and dark, nothing is cut off and every axis has a
+    title.
+
+    The contrast is at least 4.5. Tables have heads, and take the focus if they scroll. No brace is
+    left.
+    """
     assert rendered.faults(browser, rendered.address(drawn / page), width, scheme) == {}
 
 
@@ -119,14 +129,14 @@ def test_a_page_can_be_read(browser: Any, drawn: Path, page: str, width: int, sc
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 @pytest.mark.parametrize("path", SVG, ids=name)
 def test_a_picture_can_be_read(browser: Any, path: Path, scheme: str):
-    """By itself, as Markdown shows it: light or dark as its reader has chosen."""
+    """The picture alone, as Markdown shows it, light or dark as its reader has chosen."""
     assert rendered.faults(browser, rendered.address(path), 1024, scheme) == {}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HTML)
 def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, drawn: Path, name: str):
-    """The first Tab is on the way back to README; the focus can be seen there."""
+    """The first Tab reaches the link to README, and the focus is visible there."""
     context = browser.new_context()
     page = context.new_page()
     page.goto(rendered.address(drawn / name))
@@ -141,7 +151,7 @@ def test_the_keyboard_goes_home_first_and_into_every_table(browser: Any, drawn: 
 
 @pytest.mark.parametrize("path", MARKDOWN, ids=name)
 def test_no_brace_was_left_in_a_text(path: Path):
-    """Outside of code no {name} stands where a value belongs."""
+    """Outside of code no {name} is left where a value belongs."""
     text = re.sub(
         r"^```.*?^```|^ {4}.*?$|`[^`]*`|<!--.*?-->",
         "",

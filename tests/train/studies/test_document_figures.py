@@ -1,5 +1,4 @@
-"""What README and pages say in figures: it is what the files of results hold, and what is
-older says so."""
+"""The figures in README and pages are those of the results. Older figures say so."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ Break = Callable[[Path], Any]
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the documents and results of this project, as the working folder."""
+    """A folder with the project's documents and results, as the working folder."""
     results = {figure.results for figure in (*FIGURES, *document_figures.PICTURES)}
     pictures = [picture.file for picture in document_figures.PICTURES]
     for name in {*DOCUMENTS, *pictures, *(str(results_file(name)) for name in results)}:
@@ -40,21 +39,20 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_documents_show_the_figures_of_their_results(name: str):
-    """To the letter, and nothing else: what differs is written again by `python -m train.studies
-    figures`."""
+    """They are equal letter for letter; `python -m train.studies figures` writes them again."""
     assert (ROOT / name).read_text(encoding="utf-8") == document_figures.written(name, ROOT)
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_all_markers_of_a_document_are_written(name: str):
-    """No text between markers that no command writes."""
+    """Every text between markers belongs to a command."""
     known = {figure.marker for figure in FIGURES if figure.document == name}
     assert set(MARKED.findall((ROOT / name).read_text(encoding="utf-8"))) == known
 
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda picture: picture.file)
 def test_pictures_show_their_results(picture: DocumentPicture):
-    """To the byte: `python -m train.studies figures` writes a picture that differs."""
+    """They are equal byte for byte; `python -m train.studies figures` writes them again."""
     assert (ROOT / picture.file).read_text(encoding="utf-8") == document_figures.drawn(
         picture, ROOT
     )
@@ -63,8 +61,9 @@ def test_pictures_show_their_results(picture: DocumentPicture):
 def test_the_command_writes_what_has_changed_and_nothing_else(
     project: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A changed figure changes its documents, and text beside the markers stays; a second run
-    changes nothing."""
+    """A changed figure changes its documents. Text beside the markers stays. A second run changes
+    nothing.
+    """
     results, before = project / results_file("bench"), (project / SPECIFICATIONS).read_text()
     figures = json.loads(results.read_bytes())
     figures["rss_mb"]["after_1000"] = 1234.5
@@ -115,7 +114,7 @@ def test_the_command_writes_what_has_changed_and_nothing_else(
 def test_what_is_missing_is_named_and_nothing_is_written(
     project: Path, capsys: pytest.CaptureFixture[str], damage: Break, said: str
 ):
-    """One line with the file and what to do; no document is changed."""
+    """One line names the file and the remedy. No document changes."""
     damage(project)
     page = (project / ALIGN).read_bytes()
     assert main(["figures"]) == FormatError.exit_code
@@ -124,8 +123,9 @@ def test_what_is_missing_is_named_and_nothing_is_written(
 
 
 def test_a_picture_of_an_older_default_is_called_so():
-    """Every document that shows one holds its sentence; a picture without a header tells of no
-    default."""
+    """Every document with such a picture has the sentence. A picture without a header has no
+    default.
+    """
     for document in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         text = document.read_text(encoding="utf-8")
         for name in PICTURE.findall(text):

@@ -1,5 +1,4 @@
-"""`python -m train.studies fabrics`: which tests it runs, what of an earlier run stays, and what it
-says where something is missing."""
+"""`python -m train.studies fabrics`: its tests, the results that it keeps, and its errors."""
 
 from __future__ import annotations
 
@@ -22,8 +21,10 @@ MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Line
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A folder with a set of FabricSlide's names: noise that is louder for each material, two
-    values of each condition."""
+    """A folder with a set of FabricSlide's names.
+
+    Each material is louder noise than the previous one; each condition has two values.
+    """
     labels, force, speed, rep, direction = (
         x.ravel() for x in np.meshgrid(range(len(MATERIALS)), (100, 180), (1, 2), (1, 2), (0, 1))
     )
@@ -44,7 +45,7 @@ def data(tmp_path: Path) -> Path:
 
 
 def run(data: Path, *more: str, method: str = "static-svm") -> int:
-    """The command on the made set, its folds kept beside it."""
+    """Run the command on this set, with the folds cached beside it."""
     out, cache = data / "fabrics.json", data / "cache"
     return main(
         [
@@ -65,7 +66,7 @@ def run(data: Path, *more: str, method: str = "static-svm") -> int:
 
 
 def results(data: Path) -> list[dict[str, Any]]:
-    """What the command wrote."""
+    """The written results."""
     found: list[dict[str, Any]] = json.loads((data / "fabrics.json").read_bytes())
     return found
 
@@ -73,8 +74,9 @@ def results(data: Path) -> list[dict[str, Any]]:
 @pytest.mark.slow
 @pytest.mark.thorough  # fits 24 models
 def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.CaptureFixture[str]):
-    """Twelve tests, means removed first; a second method joins them, and what lay there of the
-    first is as it was."""
+    """Twelve tests run, those without means first. A second method is added, and the first is
+    unchanged.
+    """
     assert run(data) == 0
     first = results(data)
     assert [(r["means_removed"], r["protocol"]) for r in first] == [
@@ -95,8 +97,9 @@ def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.Captur
 def test_what_is_missing_is_named(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Real sweeps, results that cannot be read, a method that cannot use these sweeps: each by
-    name."""
+    """The errors name missing sweeps, unreadable results, and a method that cannot use these
+    sweeps.
+    """
     monkeypatch.delenv("PALPATE_DATA", raising=False)
     assert (
         main(["fabrics", "--method", "static-svm", "--out", str(data / "fabrics.json")])

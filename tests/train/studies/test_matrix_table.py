@@ -1,5 +1,4 @@
-"""The table of methods beside ours: tests in order, the best of the others, the difference, a
-verdict; where it goes."""
+"""The table of methods: order of tests, best peer, difference, verdict, and its place in a page."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ def result(
     seed: int = 1,
     classes: int = 2,
 ) -> dict:
-    """One of the list that evaluate writes, of a hundred windows."""
+    """A result as evaluate writes it, of a hundred windows."""
     return {
         "method": method,
         "protocol": protocol,
@@ -36,8 +35,10 @@ def result(
 
 
 def test_each_test_says_whether_ours_is_ahead():
-    """Without means first, more classes first; the best other by name, the difference with an
-    interval, a verdict in words."""
+    """Tests without means come first, then those with more classes.
+
+    Each has the best peer by name, the difference with an interval, and a verdict in words.
+    """
     results = [
         result("default", "leave:force", 95, means_removed=False),
         result("static-svm", "leave:force", 98, means_removed=False),
@@ -90,7 +91,7 @@ def test_each_test_says_whether_ours_is_ahead():
 
 
 def test_ours_alone_has_no_verdict():
-    """Nothing to compare with: the line says so."""
+    """The line says that there is nothing to compare with."""
     assert (
         matrix_table.headline([result("default", "leave:force", 90)])
         .splitlines()[-1]
@@ -101,7 +102,9 @@ def test_ours_alone_has_no_verdict():
 def test_the_command_writes_the_table_between_its_markers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Picture and table; a page without markers is named, and stays as it is."""
+    """Picture and table are written. The error names a page without markers, which stays
+    unchanged.
+    """
     (tmp_path / "r.json").write_text(
         json.dumps([result("default", "leave:force", 90), result("H-svm", "leave:force", 60)])
     )

@@ -1,4 +1,4 @@
-"""The README's picture: what it shows is what the packaged bundle answers."""
+"""The README's picture shows an answer of the packaged bundle."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from train.studies import overview_plot
 
 @pytest.mark.slow
 def test_it_shows_the_verdict_and_every_label():
-    """Each label once with its probability, the winner in the title too; it says that the sweep is
-    simulated."""
+    """Each label occurs once with its probability, and the verdict also in the title.
+
+    The picture says that the sweep is simulated.
+    """
     svg = overview_plot.draw("paper")
     assert "the box answers paper (simulated)" in svg
     shares = [float(share) for share in re.findall(r">([0-9.]+) %<", svg)]
@@ -27,6 +29,6 @@ def test_it_shows_the_verdict_and_every_label():
 
 @pytest.mark.slow
 def test_an_unknown_material_is_named():
-    """With what may be used instead."""
+    """The error lists the permitted materials."""
     with pytest.raises(FormatError, match=r"'cheese' is not simulated; use one of .*wood"):
         overview_plot.draw("cheese")

@@ -1,5 +1,7 @@
-"""Pages from templates: each shows every figure of its committed results, escapes what it is given,
-and needs nothing else."""
+"""Pages from templates: each shows every figure of its committed results and escapes its texts.
+
+It needs no other file.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ Facts = Iterator[str]
 
 
 def number(value: float, places: int = 1) -> str:
-    """A share as per cent without the sign."""
+    """A share in percent, without the sign."""
     return f"{100 * value:.{places}f}"
 
 
@@ -45,7 +47,7 @@ def paper_facts(summary: Any) -> Facts:
         yield f"{number(mean)} % {number(low)} – {number(high)} %"
         ms = (
             "–" if row["ms_p50"] is None else f"{row['ms_p50']:.2f}"
-        )  # of a CNN that was followed, not evaluated
+        )  # of a CNN in the curve's file instead of the evaluation
         yield f"{row['right']} / {row['total']} {len(row['worlds'])} {ms}"
     yield from (f"Commit {commit}" for commit in {one["commit"] for one in summary["results"]})
     yield f"On {summary['results'][0]['machine']}"
@@ -106,8 +108,9 @@ def chart_facts(dots: Any) -> Facts:
 
 
 def stress_facts(result: Any) -> Facts:
-    """Each method, its accuracy at every severity that has a limit, what the box answers there;
-    origin."""
+    """Each method, its accuracy at every severity with a limit, the box's answers there, and the
+    origin.
+    """
     curves = {plain_name(name): entry["curves"] for name, entry in result["methods"].items()}
     curves |= {
         f"box {answer}": result["box"]["curves"][answer]
@@ -125,7 +128,7 @@ def stress_facts(result: Any) -> Facts:
 
 
 def soak_facts(records: Any) -> Facts:
-    """Boxes, sums, faults and what was run."""
+    """Boxes, sums, faults and runs."""
     for name, box in records["boxes"].items():
         sums = box["sums"]
         yield name
@@ -140,7 +143,7 @@ def soak_facts(records: Any) -> Facts:
 
 
 def choice_facts(choice: Any) -> Facts:
-    """The choice and why; all models; what is enough; budget and origin."""
+    """The choice with its reason, all models, the target, budget and origin."""
     honest = choice["honest"]
     yield (
         f"{choice['chosen']} with 0.5 s of each sweep is enough to distinguish 3 materials: a "
@@ -210,8 +213,9 @@ PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_shows_every_figure_of_its_results(name: str):
-    """All facts stand in its visible text; no brace, None or nan is left in it; its tags close and
-    no address is in it."""
+    """Its visible text contains all facts. It contains no brace, None or nan; its tags close, and
+    it links to no other place.
+    """
     render, facts = PAGES[name]
     page = render()
     read = PageReader(page)
@@ -223,14 +227,13 @@ def test_a_page_shows_every_figure_of_its_results(name: str):
     assert not re.search(r"@import|url\((?!#)|<link", page)
     assert 'name="viewport" content="width=device-width' in page
     assert "prefers-color-scheme: dark" in page
-    if name != "chart":  # its script has another table
+    if name != "chart":  # the script of the chart has another table
         assert page.count("<table") == len(re.findall(r'<div class="wide"[^>]*><table', page))
 
 
 @pytest.mark.slow
 def test_terminal_and_page_say_the_same_of_a_choice():
-    """Every sentence stands in one line of the terminal, with nothing escaped; the table has a line
-    for each model."""
+    """Every sentence is a line on the terminal, unescaped. The table has a line for each model."""
     text = selection_report.text(choice_data.choice())
     lines = text.split("\n")
     for fact in choice_facts(choice_data.choice()):
@@ -246,7 +249,9 @@ def test_terminal_and_page_say_the_same_of_a_choice():
 
 
 def test_a_choice_that_is_not_good_enough_says_so_first():
-    """Not reached stands out on the page; nothing smaller or larger, no curves, no budget."""
+    """The page emphasizes that it missed the target. It has no smaller or larger model, curve or
+    budget.
+    """
     text, page = (
         selection_report.text(choice_data.missed()),
         selection_report.page(choice_data.missed()),
@@ -267,8 +272,7 @@ def test_a_choice_that_is_not_good_enough_says_so_first():
 
 @pytest.mark.slow
 def test_what_a_template_prints_is_escaped(tmp_path: Path):
-    """Names of others cannot become tags; a picture stays what it is; data that is missing is an
-    error."""
+    """Foreign names cannot become tags. A picture stays a picture. Missing data is an error."""
     (tmp_path / "a.html.j2").write_text("<p>{{ name }} {{ picture }} {{ share | percent }}</p>")
     page = html.render(
         "a.html.j2", tmp_path, name="<b> & c", picture=html.picture("<svg/>"), share=0.5
@@ -282,7 +286,7 @@ def test_what_a_template_prints_is_escaped(tmp_path: Path):
 
 
 def test_numbers_are_written_for_people():
-    """Per cent with a sign, differences in points, durations in the unit that suits them."""
+    """Percentages have a sign, differences are in points, durations have a suitable unit."""
     assert (formatting.percent(0.973), formatting.percent(1, 0)) == ("97.3 %", "100 %")
     assert [formatting.exact_percent(v) for v in (0.86, 0.923, 0.999, 1)] == [
         "86 %",
@@ -304,7 +308,7 @@ def test_numbers_are_written_for_people():
 
 @pytest.mark.slow
 def test_an_installed_wheel_has_the_templates(tmp_path: Path):
-    """Every template and script of reports is in the wheel of the desktop."""
+    """The wheel of the desktop contains every template and script of reports."""
     source = shutil.copytree(
         ROOT / "train", tmp_path / "train", ignore=shutil.ignore_patterns("build", "*.egg-info")
     )

@@ -1,5 +1,4 @@
-"""The paper's page: which sweeps are fused, how results are counted, what the page shows, and that
-it needs nothing else."""
+"""The paper's experiment: the fused sweeps, the counts of results, and its page, a single file."""
 
 from __future__ import annotations
 
@@ -27,8 +26,10 @@ FIGURES = [f"figure-{n}" for n in (4, 5, 6, 7, 9, 10, 11, 12, 13)] + ["methods"]
 
 
 def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: int = 3) -> Outcome:
-    """Made up: 4 sweeps of each material at each place, `right` of them named right, all others
-    taken for the next."""
+    """An invented outcome: 4 sweeps of each material at each position, `right` of them correct.
+
+    All others are taken for the next material.
+    """
     labels = np.tile(np.repeat(np.arange(6), 4), places)
     place = np.repeat(np.arange(places), 24) + 10_000 * world
     given = np.where(
@@ -56,7 +57,7 @@ def outcome(part: str, method: str, world: int = 1, right: float = 0.8, places: 
 
 
 def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
-    """The results of made-up outcomes, as they are read back."""
+    """The results of invented outcomes, read back from their file."""
     outcomes = [
         outcome(p, m, w)
         for p in paper_experiment.FULL
@@ -70,19 +71,20 @@ def summary(quick: bool = False, cnn: str = "paper-cnn") -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def results() -> dict[str, Any]:
-    """A summary that many tests look at."""
+    """A summary for many tests."""
     return summary()
 
 
 @pytest.fixture(scope="module")
 def made(results: dict[str, Any]) -> tuple[str, dict[str, str]]:
-    """Its page and pictures."""
+    """The page of the summary and its pictures."""
     return paper_report.render(results)
 
 
 def test_printed_numbers_are_the_papers():
-    """One of each figure by hand; rows of the confusion matrix sum to one, rounded; .917 is 55 of
-    60."""
+    """One number of each figure by hand. Rows of the confusion matrix sum to one, rounded. .917 is
+    55 of 60.
+    """
     assert [
         paper_values.ACCURACY[p][m]
         for p, m in (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"), ("hard", "L-knn"))
@@ -92,8 +94,10 @@ def test_printed_numbers_are_the_papers():
 
 
 def test_objects_begin_with_every_sweep_once_and_mix_nothing():
-    """Numbers in a row differ, are of one material and place, and as many as the smallest such
-    group has."""
+    """The sweeps of an object are different, and of one material and position.
+
+    There are as many as the smallest group of a material and a position has.
+    """
     o = outcome("lopo", "H-svm")
     keep = np.arange(len(o.labels)) != 5
     labels, place = o.labels[keep], o.place[keep]
@@ -108,8 +112,10 @@ def test_objects_begin_with_every_sweep_once_and_mix_nothing():
 
 
 def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
-    """Half of the sweeps are sure and right, half a little wrong: votes of two stay at .5, products
-    go beyond it."""
+    """Half of the sweeps are correct with a high probability, half are narrowly wrong.
+
+    Votes of two sweeps stay at .5. Products exceed that.
+    """
     o = outcome("lopo", "H-svm", right=1)
     weak = np.arange(len(o.labels)) % 2 == 0
     o.logits[weak] = np.eye(6)[(o.labels[weak] + 1) % 6]
@@ -121,8 +127,9 @@ def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
 
 
 def test_exploration_stops_when_it_is_sure():
-    """Sure sweeps need one; sweeps that know nothing take all four and are right one time in
-    six."""
+    """Sweeps with a high probability need one sweep. Uniform probabilities use all four, and are
+    correct once in six.
+    """
     sure = outcome("lopo", "H-svm", right=1)
     assert [e["sweeps"] for e in paper_experiment.explored([sure])] == [1, 1, 1]
     assert all(e["share"][0] == 1 for e in paper_experiment.explored([sure]))
@@ -133,15 +140,19 @@ def test_exploration_stops_when_it_is_sure():
 
 
 def test_intervals_are_over_places():
-    """Eight places all right or all wrong are no 192 sweeps: the interval is far wider than of
-    independent ones."""
+    """Eight positions that are all correct or all wrong are not 192 independent sweeps.
+
+    The interval is far wider than that of independent sweeps.
+    """
     place = np.repeat(np.arange(8), 24)
     _, low, high = paper_experiment.estimate(place % 2 == 0, place)
     assert high - low > 0.5
 
 
 def test_a_cost_curve_keeps_its_ends_in_few_points():
-    """4,000 iterations become at most 160 points: the first as it was, means later, x in order."""
+    """4,000 iterations become at most 160 points: the first unchanged, later ones as means, x in
+    order.
+    """
     cost = np.stack([np.arange(1, 4001), np.geomspace(2, 0.001, 4000)], axis=1)
     thin = paper_experiment._thinned(cost)
     assert len(thin) <= 160
@@ -152,8 +163,10 @@ def test_a_cost_curve_keeps_its_ends_in_few_points():
 
 
 def test_summary_pools_worlds_and_keeps_each_result(results):
-    """144 sweeps of two worlds, six places; printed beside it; every outcome in results, 11
-    confusion rows of 24."""
+    """144 sweeps of two worlds at six positions, beside the printed value.
+
+    The results contain every outcome, and 11 rows of 24 sweeps in the confusion matrix.
+    """
     row = next(r for r in results["table"] if (r["part"], r["method"]) == ("lopo", "H-svm"))
     assert (row["total"], row["worlds"], row["printed"], row["attachments"][0]) == (
         144,
@@ -168,8 +181,9 @@ def test_summary_pools_worlds_and_keeps_each_result(results):
 
 
 def test_the_page_is_one_file_that_a_phone_can_read(made):
-    """It parses, is as wide as its reader, follows light and dark, names no address, and its tables
-    scroll."""
+    """It is valid, as wide as the window, light or dark, and contains no address. Its tables
+    scroll.
+    """
     html, pictures = made
     read = PageReader(html)
     assert (read.wrong, read.open) == ([], [])
@@ -182,8 +196,10 @@ def test_the_page_is_one_file_that_a_phone_can_read(made):
 
 
 def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
-    """Figures 4 to 7, 9 to 13 and the table of all; each number of ours with interval, printed
-    value and difference."""
+    """Figures 4 to 7, 9 to 13 and the table of all.
+
+    Each number has its interval, the printed value and the difference.
+    """
     html, pictures = made
     assert sorted(pictures) == sorted(FIGURES)
     text = " ".join(PageReader(html).text.split())
@@ -209,13 +225,13 @@ def test_the_page_shows_every_figure_with_printed_beside_ours(results, made):
 
 @pytest.mark.slow
 def test_only_a_quick_run_says_that_it_means_nothing(results, made):
-    """The banner is there for --quick and not otherwise."""
+    """The banner is on the page of --quick and on no other."""
     assert "quick run" not in made[0]
     assert 'class="stop"' in paper_report.render(results | {"quick": True})[0]
 
 
 def test_hard_protocols_come_first(made):
-    """In the summary, and in the picture of all methods."""
+    """They come first in the summary and in the picture of all methods."""
     html, pictures = made
     assert (
         html.index("T-REAL, leave one position out")
@@ -227,7 +243,7 @@ def test_hard_protocols_come_first(made):
 
 @pytest.mark.slow
 def test_a_plan_without_the_network_still_makes_a_page():
-    """Figures 9 to 11 need the paper's CNN; all others are there."""
+    """Figures 9 to 11 need the paper's CNN. All others are there."""
     html, pictures = paper_report.render(summary(cnn=""))
     assert set(FIGURES) - set(pictures) == {"figure-9", "figure-10", "figure-11", "figure-12"}
     assert not PageReader(html).wrong
@@ -235,15 +251,17 @@ def test_a_plan_without_the_network_still_makes_a_page():
 
 @pytest.mark.slow
 def test_the_network_without_means_is_called_so():
-    """Where only sweeps without means were given to it, the page shows that and says so."""
+    """If it was trained only on sweeps without means, the page shows that and says so."""
     html, pictures = paper_report.render(summary(cnn=paper_values.CNNS[1]))
     assert set(pictures) == set(FIGURES)
     assert "Fig. 11: paper-cnn, centred" in html
 
 
 def curve(step: int = 400) -> dict[str, Any]:
-    """What cnn_curve has written after some iterations: nine places, of which the last is always
-    taken for the next."""
+    """A file of cnn_curve after some iterations, with nine positions.
+
+    The last position is always taken for the next material.
+    """
     made = {
         part: outcome(part, "paper-cnn", right=1.0, places=9)
         for part in paper_experiment.CURVE_CASES
@@ -278,7 +296,7 @@ def curve(step: int = 400) -> dict[str, Any]:
 
 
 def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
-    """Its newest point in Figs. 9 to 11 and 13, however far it is; another training is refused."""
+    """Its last point is in Figs. 9 to 11 and 13, at any iteration. Another training is refused."""
     file = save(tmp_path / "paper.json", summary(cnn=paper_values.CNNS[1]))
     followed = save(tmp_path / "cnn-curve.json", curve())
     assert main(["paper", "--curve", str(followed), "--out", str(file)]) == 0
@@ -312,7 +330,7 @@ def test_the_followed_network_stands_for_the_one_as_printed(tmp_path: Path):
 
 
 def test_some_methods_are_run_again_and_the_others_stay():
-    """Of what both results have the new one counts; a quick run does not mix with a whole one."""
+    """The new result replaces the old. A quick run is not mixed with a full run."""
     earlier, new = summary(), summary(cnn="")
     for row in new["table"]:
         row["right"] = 1
@@ -334,7 +352,7 @@ def test_some_methods_are_run_again_and_the_others_stay():
 
 
 def test_only_methods_of_the_plan_are_run():
-    """Steps without any of them are left out; an unknown one is named."""
+    """Steps without any of them are left out. An unknown method is reported."""
     steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["default", "H-svm"])
     assert [step.methods for step in steps] == [("H-svm",), *[("default",)] * 3]
     with pytest.raises(
@@ -344,11 +362,11 @@ def test_only_methods_of_the_plan_are_run():
 
 
 def test_plans_name_methods_and_parts_that_exist():
-    """Full and quick: every step's methods are known, its parts planned, and both hold every kind
-    of figure.
+    """In the full and the quick plan all methods of each step are known and its parts planned.
 
-    The paper's experiment leaves out the other sizes of our own network, its CNN in the form that
-    is not printed, and what the pages of development sets and the chart compare instead.
+    Both have every kind of figure. The paper's experiment leaves out the other sizes of the
+    project's network, the CNN in the variant that is not printed, and the methods that
+    `development` and the chart compare.
     """
     known = set(paper_experiment.methods.every())
     for parts, steps in (
@@ -390,8 +408,9 @@ def test_plans_name_methods_and_parts_that_exist():
 def test_run_writes_everything_and_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A tiny plan: page and pictures are made of its results; a second run takes the cached folds
-    and gives the same figures."""
+    """The results of a tiny plan make page and pictures. A second run uses the cached folds and
+    gives the same figures.
+    """
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
     parts = {
         "lopo": StudyCase((real,), "leave:position", one, folds=2),

@@ -1,5 +1,6 @@
-"""Pictures: what stands in them, in which order; they are the same everywhere and need nothing from
-outside."""
+"""Pictures: their content and its order. They are the same on every machine and need no other
+file.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ COUNTS = np.array([[8, 2, 0], [0, 10, 0], [1, 0, 9]])
 def result(
     method: str, protocol: str, right: int, means_removed: bool = True, seed: int = 1
 ) -> dict:
-    """One of the list that evaluate writes, of a hundred windows and ten recordings."""
+    """A result as evaluate writes it, of a hundred windows and ten recordings."""
     return {
         "method": method,
         "protocol": protocol,
@@ -68,7 +69,7 @@ def words(svg: str) -> list[str]:
 
 
 def places(svg: str) -> dict[str, tuple[float, float]]:
-    """Where each text stands; of equal ones the last."""
+    """The position of each text. Of equal texts the last counts."""
     return {
         node.text or "": (float(node.get("x", 0)), float(node.get("y", 0)))
         for node in ElementTree.fromstring(svg).iter(f"{SVG}text")
@@ -77,8 +78,10 @@ def places(svg: str) -> dict[str, tuple[float, float]]:
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_pictures_are_whole_alike_and_need_nothing(name: str):
-    """Well-formed, titled, drawn twice the same, in roles of colour, with no address but its own
-    parts."""
+    """They are well-formed, titled, equal in two runs and in roles of colour.
+
+    They link only to their own parts.
+    """
     svg = PICTURES[name]()
     root = ElementTree.fromstring(svg)
     assert root.find(f"{SVG}title").text
@@ -99,7 +102,7 @@ def test_pictures_are_whole_alike_and_need_nothing(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_no_text_leaves_the_picture(name: str):
-    """Every text begins inside of the picture, and ends there by a cautious guess of its width."""
+    """Every text begins inside the picture, and ends inside by a cautious estimate of its width."""
     root = ElementTree.fromstring(PICTURES[name]())
     _, _, width, height = map(float, root.get("viewBox").split())
     for node in root.iter(f"{SVG}text"):
@@ -113,8 +116,7 @@ def test_no_text_leaves_the_picture(name: str):
 
 
 def test_bars_show_ours_the_interval_and_what_was_printed():
-    """All four numbers stand there, in the paper's way of writing; a guess has its line only where
-    it is asked for."""
+    """All four numbers are there, in the paper's notation. The line of chance is optional."""
     shown = words(PICTURES["bars"]())
     assert {"T-HARD", "H-svm", "86 %", "81 – 90 %", "70 %", "random guess"} <= set(shown)
     plain = words(plots.bars({"": [plots.Bar("H-svm", ESTIMATE)]}, "bars"))
@@ -123,7 +125,9 @@ def test_bars_show_ours_the_interval_and_what_was_printed():
 
 
 def test_a_cost_curve_has_its_marks_even_where_nothing_was_trained():
-    """Printed marks stand at their values; ours is named only where it is."""
+    """Printed marks are at their values. The project's label is only there with a curve of the
+    project.
+    """
     assert {"0.08", "ours"} <= set(words(PICTURES["curve"]()))
     none = words(plots.curve([], [(2500, 0.002)], "cost"))
     assert "0.002" in none
@@ -131,8 +135,7 @@ def test_a_cost_curve_has_its_marks_even_where_nothing_was_trained():
 
 
 def test_confusion_gives_shares_of_each_row():
-    """Counts become shares of the truth; what the paper printed stands below them, where it printed
-    anything."""
+    """Counts become shares of the true material. The paper's printed shares stand below them."""
     shown = words(PICTURES["confusion"]())
     assert [shown.count(text) for text in ("80", "20", "100", "90", "10")] == [1, 1, 1, 1, 1]
     assert shown.count("◇ 20") == 1
@@ -140,8 +143,10 @@ def test_confusion_gives_shares_of_each_row():
 
 
 def test_sweeps_mark_what_was_printed():
-    """One sweep is the same by vote and by product and labelled once; a mark for each printed
-    value, none for None."""
+    """A single sweep gives the same by vote and by product, and is labelled once.
+
+    Each printed value has a mark, None has no mark.
+    """
     bare = PICTURES["sweeps"]()
     assert words(bare).count("86") == 5
     ours = {"H-svm": dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)}
@@ -150,8 +155,9 @@ def test_sweeps_mark_what_was_printed():
 
 
 def test_matrix_puts_hard_protocols_and_good_methods_first():
-    """Columns: leave, split, random. Rows: by the mean of the first panel, which is the one without
-    means."""
+    """Columns are leave, split, random. Rows are sorted by the mean of the first panel, without
+    means.
+    """
     order = ("random:5", "split:force=1->2", "leave:speed")
     results = [result(m, p, r) for m, r in (("bad", 40), ("good", 90)) for p in order]
     results += [result("bad", p, 95, means_removed=False) for p in order]
@@ -165,15 +171,14 @@ def test_matrix_puts_hard_protocols_and_good_methods_first():
 
 
 def test_matrix_takes_the_mean_over_seeds_and_counts_what_it_is_told():
-    """70 and 80 of 100 windows are 75 with the mean interval; by recordings it is 40."""
+    """70 and 80 of 100 windows are 75 with the mean interval. By recordings it is 40."""
     results = [result("H-svm", "leave:force", 70), result("H-svm", "leave:force", 80, seed=2)]
     assert {"75", "70–80"} <= set(words(plots.matrix(results)))
     assert {"40", "31–52"} <= set(words(plots.matrix(results, count="recording")))
 
 
 def test_titles_of_panels_do_not_collide():
-    """Each title of several sweeps ends before the next begins, by a generous guess of its
-    width."""
+    """The title of each panel ends before the next begins, by a generous estimate of its width."""
     rules = dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)
     names = ["H-svm", *map(paper_values.short_name, (paper_values.CNNS[0], "default-reattached"))]
     at = places(plots.sweeps(dict.fromkeys(names, rules), {}, "sweeps"))

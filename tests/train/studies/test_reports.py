@@ -1,5 +1,4 @@
-"""`python -m train.studies reports`: which results are stale and why, which commands run for them,
-and what happens if one fails."""
+"""`python -m train.studies reports`: stale results and reasons, their commands, and failures."""
 
 from __future__ import annotations
 
@@ -27,14 +26,13 @@ NEED = "a thing that is not here"
 
 
 def today() -> dict[str, Any]:
-    """Results of the default that is packaged now."""
+    """Results of the packaged default."""
     return TODAY | {"shipped": score.shipped()}
 
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project with four reports: of today, older, never made, and one with a need that is not
-    met here."""
+    """A project with four reports: current, older, never made, and with an unmet requirement."""
     (tmp_path / "README.md").write_text("# Project\n")
     (tmp_path / "docs" / "data").mkdir(parents=True)
     for name, results in (("current", today()), ("older", TODAY | {"shipped": "0badbead"})):
@@ -53,22 +51,23 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class RunCommands:
-    """Takes down which commands are run, and makes no page; `codes` are their exit codes, 0 where
-    none is given."""
+    """Records the commands instead of running them. codes: their exit codes, by default 0."""
 
     def __init__(self, **codes: int) -> None:
         self.words: list[list[str]] = []
         self.codes = codes
 
     def __call__(self, words: Sequence[str]) -> int:
-        """Run one."""
+        """Record a command; returns its exit code."""
         self.words.append(list(words))
         return self.codes.get(words[1], 0)
 
 
 def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.CaptureFixture[str]):
-    """Each page with its command as a person types it; what is of today, what is older, what is
-    missing and what it needs."""
+    """Each page has its command as a person types it, and its state: current, older or missing.
+
+    A missing page has its requirement.
+    """
     assert main(["reports", "--list"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "older    stale: Made with an older default, bundle 0badbead; "
@@ -87,8 +86,10 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
 
 
 def test_stale_pages_are_made_in_order(project: Path):
-    """The first tells most; what is of today is not made; only commands of folds get the options of
-    where they run."""
+    """The order is that of the list. Current pages are not made.
+
+    Only commands of folds get the options of the machine that runs them.
+    """
     run, lines = RunCommands(), []
     reports.make((), ("--scheduler", "tcp://here"), lines.append, run)
     assert run.words == [["train", "older", "--scheduler", "tcp://here"], ["appliance", "new"]]
@@ -97,7 +98,7 @@ def test_stale_pages_are_made_in_order(project: Path):
 
 
 def test_after_an_interruption_only_what_is_left_is_made(project: Path):
-    """A page that was made is of today then; the next run begins behind it."""
+    """A finished page is current, so the next run begins after it."""
     save(project / "docs" / "data" / "older.json", today())
     run = RunCommands()
     reports.make((), (), lambda line: None, run)
@@ -105,15 +106,14 @@ def test_after_an_interruption_only_what_is_left_is_made(project: Path):
 
 
 def test_a_named_page_is_made_again_whatever_it_is(project: Path):
-    """In the order of the list, not of the names."""
+    """The pages are made in the order of the list, not of the names."""
     run = RunCommands()
     reports.make(("current", "older"), (), lambda line: None, run)
     assert [words[1] for words in run.words] == ["older", "current"]
 
 
 def test_a_failure_is_named_and_the_others_are_made(project: Path):
-    """All that did not come stands in the error: what failed, and what was named but lacks
-    something."""
+    """The error lists all missing pages: those that failed, and those with an unmet requirement."""
     run = RunCommands(older=3)
     with pytest.raises(
         FormatError, match="older ended with exit code 3; see above, and run the command again"
@@ -127,7 +127,7 @@ def test_a_failure_is_named_and_the_others_are_made(project: Path):
 def test_an_unknown_report_or_another_folder_is_an_error(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """One line that says which there are, or where to go."""
+    """One line lists the reports, or names the right folder."""
     assert main(["reports", "olde"]) == FormatError.exit_code
     assert "no report olde; there are older, current, lacking, new" in capsys.readouterr().err
     monkeypatch.chdir(project / "docs")
@@ -136,7 +136,7 @@ def test_an_unknown_report_or_another_folder_is_an_error(
 
 
 def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPatch):
-    """`python -m` and the words, in the project's folder; its exit code comes back."""
+    """It runs `python -m` with the words in the project's folder, and returns the exit code."""
     (project / "made.py").write_text(
         "import pathlib, sys; pathlib.Path('said').write_text(sys.argv[1]); sys.exit(7)"
     )

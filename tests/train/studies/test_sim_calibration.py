@@ -1,5 +1,4 @@
-"""Tests of the simulator's calibration (`train.studies.sim_calibration`): the printed numbers,
-and what is measured beside them."""
+"""The simulator's calibration (`train.studies.sim_calibration`): printed and measured numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ EVERYTHING_ELSE = frozenset(EFFECTS) - {"position", "attachment"}
 
 @pytest.fixture(scope="module")
 def measured() -> dict:
-    """One seed with few sweeps and few folds, and without each effect."""
+    """A measurement of one seed with few sweeps and folds, with and without each effect."""
     with pytest.MonkeyPatch.context() as patch:
         few = {4: "random:2", 6: "random:3"}
         patch.setattr(
@@ -42,8 +41,9 @@ def test_the_printed_numbers_are_the_papers() -> None:
 
 
 def test_each_figure_is_measured_on_its_own_sets() -> None:
-    """One attachment in T-LAB, nine in T-REAL, several in T-HARD; Fig. 7 is tested on all of T-HARD
-    and on nothing else."""
+    """T-LAB has one attachment, T-REAL nine, T-HARD several. Fig. 7 is tested on all of T-HARD
+    alone.
+    """
     sweeps = sim_calibration.draw(SEED, per_material=EACH)
     positions = [
         sweeps.group("position")[np.isin(sweeps.group("set"), kind)] for kind in (LAB, REAL, HARD)
@@ -58,8 +58,9 @@ def test_each_figure_is_measured_on_its_own_sets() -> None:
 
 
 def test_the_far_attachments_are_a_row_off() -> None:
-    """The leading row of T-HARD's sweeps carries next to nothing, that of the others does; no two
-    are attached alike."""
+    """The leading row has nearly no load in T-HARD, and some in the other sets. All attachments
+    differ.
+    """
     sweeps = sim_calibration.draw(SEED, per_material=1)
     load = sweeps.samples[:, :, 3].mean((1, 2))
     hard = np.isin(sweeps.group("set"), HARD)
@@ -75,8 +76,9 @@ def test_the_far_attachments_are_a_row_off() -> None:
 
 
 def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
-    """The same seed gives the same sweeps; a changed world changes them and keeps labels and
-    places."""
+    """The same seed gives the same sweeps. A changed world changes them and keeps labels and
+    positions.
+    """
     one, same, other = (
         sim_calibration.draw(SEED, w, 1) for w in (WORLD, WORLD, World(off=frozenset({"texture"})))
     )
@@ -88,12 +90,13 @@ def test_a_world_is_the_same_for_all_who_draw_it_and_others_differ() -> None:
 @pytest.mark.slow
 @pytest.mark.thorough  # measures the whole simulator
 def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
-    """Four figures by five methods of shares, their differences and what they come to; it is
-    JSON."""
+    """Accuracies of four figures by five methods, and the differences to the printed ones, with the
+    largest and the mean. All of it is valid JSON.
+    """
     assert json.loads(json.dumps(measured)) == measured
     printed, ours, away = (np.array(measured[k]) for k in ("printed", "ours", "difference"))
     assert printed.shape == ours.shape == away.shape == np.array(measured["spread"]).shape == (4, 5)
-    assert (ours[1:] > 0.3).all()  # better than guessing, even so
+    assert (ours[1:] > 0.3).all()  # still better than chance
     assert (ours <= 1).all()
     assert away == pytest.approx(ours - printed)
     assert measured["largest"] == pytest.approx(abs(away).max())
@@ -102,8 +105,9 @@ def test_what_is_measured_is_complete_and_adds_up(measured: dict) -> None:
 
 @pytest.mark.slow
 def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
-    """Each row holds the accuracies without the effect and their change; each effect changes some
-    of them."""
+    """Each row has the accuracies without an effect and their change. Each effect changes some of
+    them.
+    """
     assert tuple(measured["without"]) == EFFECTS
     for row in measured["without"].values():
         assert row["change"] == pytest.approx(np.array(row["ours"]) - measured["ours"])
@@ -112,8 +116,7 @@ def test_every_effect_is_switched_off_in_turn(measured: dict) -> None:
 
 @pytest.mark.slow
 def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sweeps whose features all equal their label are all named rightly; with shifted labels in the
-    test sets none is."""
+    """Sweeps whose features equal their label are all correct. With shifted test labels none is."""
     monkeypatch.setattr(sim_calibration, "FIGURES", FIGURES[3:])
     monkeypatch.setattr(sim_calibration, "PRINTED", sim_calibration.PRINTED[3:])
     sweeps = sim_calibration.draw(SEED, per_material=4)
@@ -133,7 +136,7 @@ def test_accuracies_count_right_answers(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.slow
 def test_the_table_shows_every_number(measured: dict) -> None:
-    """A row a figure and a row an effect, each number beside the printed one."""
+    """A row for each figure and each effect, with each number beside the printed number."""
     text = sim_calibration.table(measured)
     lines = text.splitlines()
     for figure, name in enumerate(measured["figures"]):
@@ -147,7 +150,7 @@ def test_the_table_shows_every_number(measured: dict) -> None:
 
 
 def test_without_ablation_nothing_is_switched_off() -> None:
-    """`measure` computes nothing beyond what it was asked for, and logs its progress."""
+    """`measure` computes only the requested numbers, and logs its progress."""
     lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(

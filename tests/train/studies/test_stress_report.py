@@ -1,5 +1,4 @@
-"""The stress page: what breaks first, in which order, told apart from what does not, and what the
-box makes of it."""
+"""The page of the study `stress`: the corruptions by their effect, and the box's answers."""
 
 from __future__ import annotations
 
@@ -36,7 +35,9 @@ def words(svg: str) -> list[str]:
 
 
 def test_what_breaks_first_needs_the_smallest_part_of_its_range():
-    """Hum at .625 of 2, dead taxels at 1.19 of 2, more gain never; a part of a taxel is one."""
+    """Hum fails at .625 of 2, dead taxels at 1.19 of 2, more gain never. A part of a taxel is a
+    taxel.
+    """
     assert stress_report.first(CURVES[OURS]) == (
         ["50 Hz hum: 0.62 deviations", "dead taxels: 2 taxels"],
         2,
@@ -59,13 +60,15 @@ def test_what_breaks_first_needs_the_smallest_part_of_its_range():
     ],
 )
 def test_a_severity_has_its_unit(unit: str, severity: float, shown: str):
-    """Shares are per cent, and there is no part of a taxel."""
+    """Shares are in percent. Numbers of taxels are whole."""
     assert formatting.level({"unit": unit}, severity) == shown
 
 
 def test_nowhere_a_point_below_the_recipe_before():
-    """Of three lines one is two points below: it counts, and is bold; without the earlier recipe
-    nothing was wanted."""
+    """One of three lines is two points below the earlier recipe: it misses the target and is bold.
+
+    Without the earlier recipe the page has no target.
+    """
     (line,) = stress_report.targets(CURVES, OURS)
     assert (line["here"], line["target"], line["met"]) == ("2 of 3", "3 of 3", False)
     lines = {line["what"]: line for line in stress_report.target_lines(CURVES, OURS, {})}
@@ -76,7 +79,9 @@ def test_nowhere_a_point_below_the_recipe_before():
 
 
 def test_five_methods_are_drawn():
-    """The sixth is in the tables alone; what breaks only it has no picture."""
+    """The sixth method is only in the tables. A corruption that affects only that method has no
+    picture.
+    """
     shown = words(stress_plots.methods(CURVES))
     assert set(map(plain_name, ("default", "minirocket", "compact", "H-svm", "L-svm"))) <= set(
         shown
@@ -90,7 +95,9 @@ def test_five_methods_are_drawn():
 
 
 def test_the_box_is_shown_where_it_falls_silent_or_names_wrongly():
-    """Dead taxels and hum cost it answers; higher gain gives it seven wrong names of a hundred."""
+    """Dead taxels and hum cost the box answers. Higher gain gives seven wrong labels in a
+    hundred.
+    """
     box = stress_data.figures()["box"]["curves"]
     shown = words(stress_plots.box(box))
     assert {
@@ -109,8 +116,11 @@ def test_the_box_is_shown_where_it_falls_silent_or_names_wrongly():
 
 
 def test_the_page_holds_the_figures():
-    """Headline, table, box, origin; tags closed, no braces, nothing from elsewhere; a refused
-    method has its reason."""
+    """Headline, table, box and origin. Tags close, no brace is left, and it links to no other
+    place.
+
+    A refused method has its reason.
+    """
     page, pictures = stress_report.render(stress_data.figures())
     reader = PageReader(page)
     assert (reader.wrong, reader.open) == ([], [])
@@ -135,8 +145,10 @@ def test_the_page_holds_the_figures():
 
 
 def test_without_a_box_and_with_nothing_that_breaks():
-    """A set that the packaged bundle cannot answer: its columns and picture are missing; a method
-    that nothing breaks says so."""
+    """Without answers of the packaged bundle its columns and its picture are missing.
+
+    A method that withstands all corruptions says so.
+    """
     figures = stress_data.figures()
     figures["box"]["curves"] = {}
     figures["methods"] = {"H-svm": figures["methods"]["H-svm"]}
@@ -152,7 +164,7 @@ def test_without_a_box_and_with_nothing_that_breaks():
 
 
 def test_the_page_is_drawn_from_its_results(tmp_path: Path):
-    """Page, pictures, and the results to which the page links."""
+    """Page, pictures, and the results that the page links to."""
     page = published("stress", stress_data.figures(), tmp_path)
     assert {path.name for path in page.parent.iterdir()} == {
         "stress.json",
@@ -168,7 +180,8 @@ def test_the_page_is_drawn_from_its_results(tmp_path: Path):
 @pytest.mark.parametrize("width", rendered.WIDTHS)
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
 def test_a_reader_sees_all_of_it(browser: Any, tmp_path: Path, width: int, scheme: str):
-    """On a phone and on a wide screen, light and dark: nothing is cut off, every axis has a title,
-    all can be read."""
+    """On a phone and a wide screen, light and dark: nothing is cut off, every axis has a title, and
+    all texts can be read.
+    """
     page = published("stress", stress_data.figures(), tmp_path)
     assert rendered.faults(browser, rendered.address(page), width, scheme) == {}

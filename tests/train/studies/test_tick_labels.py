@@ -1,4 +1,4 @@
-"""Every tick label of every picture shows the value at which its tick stands."""
+"""Every tick label of every picture shows the value at the position of its tick."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DRAWN_HERE = [
 
 
 def image() -> str:
-    """A sweep of a skin that is too large for a plot of each taxel."""
+    """A sweep of a skin with too many taxels for a plot of each."""
     form = SweepFormat(12, 12, 50.0, 40, "float32")
     counts = np.random.default_rng(0).random((40, 12, 12), np.float32)
     return sweep_plot.draw(
@@ -90,7 +90,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Figure, tuple[str, str]
 
     def saved(figure: Figure, *args: Any, **options: Any) -> None:
         save(figure, *args, **options)
-        code = sys._getframe(2).f_code  # below it is plot_style.to_svg
+        code = sys._getframe(2).f_code  # the caller of plot_style.to_svg
         found.append((figure, (Path(code.co_filename).name, code.co_name)))
 
     monkeypatch.setattr(Figure, "savefig", saved)
@@ -105,10 +105,10 @@ def axes_of(figure: Figure) -> Iterator[Axis]:
 
 
 def wrong_labels(axis: Axis) -> list[tuple[float, str]]:
-    """Ticks (position, label) whose label is another number than their position; a unit follows the
-    last label.
+    """Ticks (position, label) whose label is another number than their position.
 
-    A label is right to five significant digits, which is far less than half of its last place.
+    The last label has a unit. A label is correct to five significant digits, which is far less than
+    half of its last place.
     """
     ticks = [(tick.get_loc(), tick.label1.get_text()) for tick in axis.get_major_ticks()]
     shown = [(at, label) for at, label in ticks if label]
@@ -125,8 +125,7 @@ def wrong_labels(axis: Axis) -> list[tuple[float, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PICTURES)
 def test_labels_are_where_they_say(name: str, drawn: list[tuple[Figure, tuple[str, str]]]):
-    """Where an axis has values its labels are those of its ticks; only names of things may be
-    another text."""
+    """The labels of an axis with values are those of its ticks. Only names may be another text."""
     PICTURES[name]()
     assert drawn
     named = 0
@@ -169,7 +168,7 @@ def test_no_picture_is_left_out(drawn: list[tuple[Figure, tuple[str, str]]]):
     ],
 )
 def test_ticks_have_as_many_decimals_as_they_need(ticks: tuple[float, ...], labels: list[str]):
-    """None is rounded to the places of another."""
+    """No label is rounded to the places of another."""
     figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)
     axes.set_xlim(-1, 1)
     plot_style.set_ticks(axes.xaxis, ticks, percent=True)
@@ -181,7 +180,7 @@ def test_ticks_have_as_many_decimals_as_they_need(ticks: tuple[float, ...], labe
 
 
 def test_a_rounded_label_is_found():
-    """The check itself: .975 called 98 or 97 is wrong, and so is .987 called 98."""
+    """The check itself: .975 as 98 or 97 is wrong, and so is .987 as 98."""
     figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)
     axes.set_xlim(0, 1)
     for text in ("97 %", "98 %"):
