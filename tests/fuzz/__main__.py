@@ -80,18 +80,7 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
         f"-dict={place / 'words'}",
         inputs,
     )
-    smallest = place / "smallest"
-    rmtree(smallest, ignore_errors=True)
-    smallest.mkdir()
-    _engine(target, 0, "-merge=1", smallest, inputs)
-    kept = [
-        file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED
-    ]
-    if not kept:
-        raise SystemExit(
-            f"{target}: the merge kept no input; see {place / 'log'}; "
-            "the saved corpus stays as it is"
-        )
+    kept = _smallest(target, inputs)
     corpus.save(target, kept)
     print(
         f"{target}: {run.executions} executions in {run.cpu_s:.0f} s of processor time, "
@@ -107,6 +96,23 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
             "tests/appliance/bundle/test_fuzzed_input.py"
         )
     return 1 if run.crashes else 0
+
+
+def _smallest(target: str, inputs: Path) -> list[bytes]:
+    """The fewest of the inputs that cover as much as all, without those too large to be saved."""
+    smallest = WORK / target / "smallest"
+    rmtree(smallest, ignore_errors=True)
+    smallest.mkdir()
+    _engine(target, 0, "-merge=1", smallest, inputs)
+    kept = [
+        file.read_bytes() for file in smallest.iterdir() if file.stat().st_size <= LONGEST_SAVED
+    ]
+    if not kept:
+        raise SystemExit(
+            f"{target}: the merge kept no input; see {WORK / target / 'log'}; "
+            "the saved corpus stays as it is"
+        )
+    return kept
 
 
 def _engine(target: str, seconds: float, *options: object) -> FuzzRun:

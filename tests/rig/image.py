@@ -247,24 +247,6 @@ def _make_root(part: Path, version: str) -> None:
     """Debian with the box's virtual environment, the agent and the modules of its kernel."""
     shutil.copy(part / emulated_machines.LOCK.name, part / "wheels")
     (part / "wheels").chmod(0o755)
-    pip = (
-        "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links "
-        "/wheels"
-    )
-    hooks = (
-        f"copy-in {part / 'wheels'} /",
-        f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service "
-        "$1/etc/systemd/system/",
-        'chroot "$1" python3 -m venv /opt/palpate',
-        f'chroot "$1" {pip} --require-hashes -r /wheels/{emulated_machines.LOCK.name}',
-        'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; '
-        'echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
-        'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
-        'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer '
-        "e2scrub_reap.service "
-        "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
-        'chroot "$1" systemctl disable ssh.service systemd-networkd.service',
-    )
     here = (
         []
         if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode
@@ -279,12 +261,35 @@ def _make_root(part: Path, version: str) -> None:
         "--dpkgopt=path-exclude=/usr/share/man/*",
         "--dpkgopt=path-exclude=/usr/share/doc/*",
         "--dpkgopt=path-exclude=/usr/share/locale/*",
-        *(f"--customize-hook={hook}" for hook in hooks),
+        *(f"--customize-hook={hook}" for hook in _hooks(part)),
         "--format=directory",
         SUITE,
         part / "root",
     )
     _modules(part / "kernel", part / "root", version, MODULES)
+
+
+def _hooks(part: Path) -> tuple[str, ...]:
+    """Shell commands with which mmdebstrap installs the box's dependencies and the agent; $1 is the
+    root."""
+    pip = (
+        "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links "
+        "/wheels"
+    )
+    return (
+        f"copy-in {part / 'wheels'} /",
+        f"mkdir -p $1/opt/rig && cp {GUEST}/agent.py $1/opt/rig/ && cp {GUEST}/agent.service "
+        "$1/etc/systemd/system/",
+        'chroot "$1" python3 -m venv /opt/palpate',
+        f'chroot "$1" {pip} --require-hashes -r /wheels/{emulated_machines.LOCK.name}',
+        'rm -r "$1/wheels"; echo box > "$1/etc/hostname"; '
+        'echo uninitialized > "$1/etc/machine-id"; : > "$1/etc/fstab"',
+        'chroot "$1" systemctl enable agent.service serial-getty@ttyAMA0.service',
+        'chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer '
+        "e2scrub_reap.service "
+        "getty@tty1.service systemd-timesyncd.service systemd-binfmt.service",
+        'chroot "$1" systemctl disable ssh.service systemd-networkd.service',
+    )
 
 
 def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> list[Path]:
