@@ -108,10 +108,14 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
     """The largest difference of a logit between PyTorch and the float graph. Raises ExportRefused
     above MOST_TORCH_DIFFERENCE."""
-    import torch  # here: a fit without trained stages is exported without PyTorch
+    # here: a fit without trained stages is exported without PyTorch
+    import torch
 
+    from train.models.recipe.stages import network_of
+
+    counts = torch.from_numpy(fit.held.samples.astype(np.float32))
     with torch.no_grad():
-        wanted = fit.network()(torch.from_numpy(fit.held.samples.astype(np.float32))).numpy()
+        wanted = network_of(fit)(counts).numpy()
     difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
     if not difference <= MOST_TORCH_DIFFERENCE:
         raise ExportRefused(

@@ -281,7 +281,7 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
     little is left for all others."""
     wild = tight.train.samples[:1].astype(np.float32)
     wild = wild.mean(axis=1, keepdims=True) + 1000 * (wild - wild.mean(axis=1, keepdims=True))
-    network = tight.network()
+    network = stages.network_of(tight)
     with torch.no_grad():
         responses = network.responses(network.prepare(torch.from_numpy(wild)))
     with pytest.raises(
@@ -531,7 +531,9 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
         n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node
     }
     with torch.no_grad():
-        logits = made.network()(torch.from_numpy(made.held.samples.astype(np.float32))).numpy()
+        logits = stages.network_of(made)(
+            torch.from_numpy(made.held.samples.astype(np.float32))
+        ).numpy()
     assert [it.logits(x).argmax() for x in made.held.samples] == logits.argmax(1).tolist()
     result = it.bundle.manifest.figures["parity"]
     assert (result["agreement"], result["lost"]) == (1, 0)

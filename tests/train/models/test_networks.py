@@ -300,7 +300,9 @@ def test_compact_is_what_palpate_train_fits():
     for given in (s, line):
         same, model = stages.fit_network(given, 1, FitRecipe(steps=6)), train("compact", given)
         with torch.no_grad():
-            want = same.network()(torch.from_numpy(given.samples.astype(np.float32))).numpy()
+            want = stages.network_of(same)(
+                torch.from_numpy(given.samples.astype(np.float32))
+            ).numpy()
         have = model.precisions["float"].logits(given.samples)
         np.testing.assert_allclose(have, want - want.mean(1, keepdims=True), rtol=1e-4, atol=1e-3)
         int8 = graph_builder.run(

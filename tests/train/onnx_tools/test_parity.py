@@ -113,13 +113,13 @@ def test_tensors_are_reported_as_pytorch_has_them(fitted: Fit):
     """Percentiles and the share out of range of each stage, compared with its responses in PyTorch;
     weights of seven bits."""
     found = measured(fitted)
-    model = fitted.network()
+    model = stages.network_of(fitted)
     with torch.no_grad():
         counts = torch.from_numpy(fitted.held.samples.astype(np.float32))
         responses = [x.numpy() for x in model.responses(model.prepare(counts))]
-    stages = activations(found)
-    assert len(stages) == len(responses)
-    for layer, x in zip(stages, responses, strict=True):
+    layers = activations(found)
+    assert len(layers) == len(responses)
+    for layer, x in zip(layers, responses, strict=True):
         np.testing.assert_allclose(
             layer.percentiles, np.percentile(x, parity.PERCENTILES), atol=1e-4
         )

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import onnx
@@ -31,9 +31,6 @@ from train.models.recipe.architectures import Architecture
 from train.models.recipe.augment import COPIES, Augmentation, copies
 from train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
 from train.onnx_tools.graph_builder import run, with_head
-
-if TYPE_CHECKING:
-    from train.models.recipe.stages import Compact
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -99,21 +96,6 @@ class Fit:
     def augmentation(self) -> Augmentation:
         """The augmentation of its training."""
         return Augmentation(**self.about["recipe"]["augmentation"])
-
-    def network(self) -> Compact:
-        """The network in PyTorch, ready to run; of a fit without a filter bank."""
-        import torch  # here: a fit without stages is made and packed without PyTorch
-
-        from train.models.recipe.stages import Compact
-
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn and overwritten
-            format, classes = self.train.format, len(self.train.materials)
-            model = Compact(format, classes, self.scale, False, self.keep_means, self.architecture)
-        state = {
-            k: torch.from_numpy(v) for k, v in self.weights.items() if not k.startswith("int8.")
-        }
-        model.load_state_dict(state)
-        return model.eval()
 
     def trunk(self, int8: bool = True, prefixes: bool = False) -> onnx.ModelProto:
         """`sweep` -> `features` float32 [1, F]; with `prefixes` float32 [1, 10, F]. See

@@ -18,7 +18,7 @@ from train.models.linear_head import expanded_head, hold_out_or_all
 from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.recipe.architectures import ARCHITECTURES, DEFAULT, Architecture
 from train.models.recipe.fitted import CompactModel
-from train.models.recipe.stages import FitRecipe, fit_network_on
+from train.models.recipe.stages import FitRecipe, fit_network_on, network_of
 from train.models.training import NetworkModel, describe_run, scale_steps
 
 Array = NDArray[Any]
@@ -43,7 +43,7 @@ def train_compact(
     known = replace(sweeps, samples=inputs).select(())
     fit = fit_network_on(*hold_out_or_all(known, seed), seed, recipe, log, architecture)
     network, present, ran = (
-        fit.network(),
+        network_of(fit),
         np.unique(sweeps.labels),
         describe_run(recipe, "cpu", False, False),
     )

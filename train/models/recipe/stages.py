@@ -249,6 +249,16 @@ class Compact(Network):
         return Ranges(largest, tuple(responses))
 
 
+def network_of(fit: Fit) -> Compact:
+    """The network of a fit, ready to run; the fit has no filter bank."""
+    with torch.random.fork_rng(devices=[]):  # its first weights are drawn and overwritten
+        format, classes = fit.train.format, len(fit.train.materials)
+        model = Compact(format, classes, fit.scale, False, fit.keep_means, fit.architecture)
+    state = {k: torch.from_numpy(v) for k, v in fit.weights.items() if not k.startswith("int8.")}
+    model.load_state_dict(state)
+    return model.eval()
+
+
 @dataclass(frozen=True)
 class FitRecipe(training.TrainingRecipe):
     """The training of the compact network.

@@ -426,7 +426,7 @@ def test_a_fit_without_a_convolution_survives_its_file(
     counts = easy(2).samples
     with torch.no_grad():
         x = torch.from_numpy(counts.astype(np.float32))
-        assert torch.equal(again.network()(x), bare.fit.network()(x))
+        assert torch.equal(stages.network_of(again)(x), stages.network_of(bare.fit)(x))
     for prefixes in (False, True):
         assert again.trunk(prefixes=prefixes) == bare.fit.trunk(prefixes=prefixes)
         assert again.trunk(int8=False, prefixes=prefixes) == again.trunk(prefixes=prefixes)

@@ -125,7 +125,7 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
     other = easy(seed=9)
     with torch.no_grad():
         p = torch.softmax(
-            fitted.network()(torch.from_numpy(other.samples.astype(np.float32))), 1
+            stages.network_of(fitted)(torch.from_numpy(other.samples.astype(np.float32))), 1
         ).numpy()
     assert np.mean(p.argmax(1) == other.labels) > 0.9
     assert p.max(1).mean() == pytest.approx(np.mean(p.argmax(1) == other.labels), abs=0.1)
@@ -192,7 +192,8 @@ def test_the_size_without_convolutions_learns_its_head_alone(tmp_path: Path):
     again = Fit.load(tmp_path / "fit.npz")
     assert (again.architecture, again.ranges) == (made.architecture, made.ranges)
     np.testing.assert_array_equal(
-        stages.features(again.network(), made.held), stages.features(made.network(), made.held)
+        stages.features(stages.network_of(again), made.held),
+        stages.features(stages.network_of(made), made.held),
     )
     assert again.trunk() == made.trunk()
 
@@ -229,6 +230,8 @@ def test_fabrics_are_distinguished(tmp_path: Path):
     made = stages.fit_network(seen, 1, FitRecipe(steps=300))
     with torch.no_grad():
         given = (
-            made.network()(torch.from_numpy(unseen.samples.astype(np.float32))).argmax(1).numpy()
+            stages.network_of(made)(torch.from_numpy(unseen.samples.astype(np.float32)))
+            .argmax(1)
+            .numpy()
         )
     assert np.mean(given == unseen.labels) > 0.9
