@@ -125,7 +125,7 @@ def _merged(choice: Json) -> dict[str, Any] | None:
 
 
 def _caveats(choice: Json) -> Iterator[str]:
-    """Reasons to doubt the figures."""
+    """Limits of the figures."""
     if not choice["varies"]:
         yield "nothing varies in this scene, so recordings were left out at random: that flatters"
     if choice["effort"] != 1:
