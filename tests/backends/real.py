@@ -57,5 +57,5 @@ class Real:
             self._rival = usb.core.find(
                 idVendor=self.sensor.vendor_id, idProduct=self.sensor.product_id
             )
-            assert self._rival, "no skin to hold"
+            assert self._rival, "no skin is plugged in"
             usb.util.claim_interface(self._rival, 0)

@@ -32,7 +32,7 @@ def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
         if there():
             return
         threading.Event().wait(0.02)
-    pytest.fail("it did not come")
+    pytest.fail(f"the condition did not hold within {limit_s} s")
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
                 pytest.fail("".join(said))
             threading.Thread(target=process.stderr.read, daemon=True).start()
             yield found[1], int(found[2])
-            assert process.poll() is None, "the bridge has ended by itself"
+            assert process.poll() is None, "the bridge has ended before the test did"
         finally:
             process.terminate()
             try:

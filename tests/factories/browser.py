@@ -43,7 +43,7 @@ def until(done: Callable[[], bool]) -> None:
     """Wait for `done()`; fails after WAIT_S."""
     end = time.monotonic() + WAIT_S
     while not done():
-        assert time.monotonic() < end, "nothing happened"
+        assert time.monotonic() < end, f"the condition did not hold within {WAIT_S} s"
         time.sleep(0.02)
 
 

@@ -62,7 +62,7 @@ def processes(path: Path, **arguments: str) -> list[tuple[ExecuteProcess, list[s
         one.name: one.default_value for one in described if isinstance(one, DeclareLaunchArgument)
     }
     values = declared | arguments
-    assert values.keys() == declared.keys(), "an argument that the file does not declare"
+    assert values.keys() == declared.keys(), "the file does not declare all given arguments"
 
     def text(part: Any) -> str:
         if isinstance(part, LaunchConfiguration):

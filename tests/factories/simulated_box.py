@@ -72,7 +72,8 @@ class Rigged:
         verdicts = []
         end_ns = self.simulated.clock.now_ns() + limit_s * SECOND
         while not done():
-            assert self.simulated.clock.now_ns() < end_ns, "nothing happened"
+            late = f"the condition did not hold within {limit_s} s of simulated time"
+            assert self.simulated.clock.now_ns() < end_ns, late
             verdicts += self.box.step()
             self.listen()
         self.listen(SETTLE_S)

@@ -113,8 +113,9 @@ def test_every_axis_moves_the_dots_and_draws_the_front_anew(seen: BrowsedChart, 
 
 
 def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
-    """Near a dot the tip shows its name, its interval and the dots that beat it. Elsewhere there is
-    no tip.
+    """Near a dot the tip shows its name, its interval and the dots that beat it.
+
+    Elsewhere the tip is hidden.
     """
     x, y = seen.places()[3]
     frame = seen.page.locator("#plot svg").bounding_box()

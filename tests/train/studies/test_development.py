@@ -405,8 +405,9 @@ def test_the_int8_form_of_a_peer_has_a_dot_of_its_own():
 
 
 def test_int8_is_held_against_its_own_float():
-    """If both were timed, the target of int8 is half of float's time. Otherwise there is no
-    target.
+    """If both were timed, the target of int8 is half of float's time.
+
+    Otherwise int8 has no target.
     """
     times = [
         {"method": "default", "precision": name, "ms_p50": ms}
@@ -491,9 +492,7 @@ def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
 
 
 def test_times_are_told_in_those_of_minirocket():
-    """The unit is MiniRocket's quickest time. Without a time of MiniRocket there is no
-    comparison.
-    """
+    """The unit is MiniRocket's quickest time. Without it times are not compared."""
     times = [
         {"method": "minirocket", "ms_p50": 12.0},
         {"method": "minirocket", "ms_p50": 10.0},

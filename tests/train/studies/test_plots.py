@@ -92,9 +92,9 @@ def test_pictures_are_whole_alike_and_need_nothing(name: str):
     svg = svg.replace(plot_style.SCHEMES, "")
     assert "font-family: " not in svg
     for colour in plot_style.ROLES.values():
-        assert re.search(f"(?<!, ){colour}", svg) is None, "a colour that no page can change"
+        assert re.search(f"(?<!, ){colour}", svg) is None, "the page cannot change this colour"
     assert all("fill: var(--" in text.get("style") for text in root.iter(f"{SVG}text")), (
-        "black, also by night"
+        "black in dark mode, too"
     )
     assert all(float(size) >= 7 for size in re.findall(r"font-size: ([\d.]+)px", svg))
 
