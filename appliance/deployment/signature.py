@@ -31,7 +31,8 @@ DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
 person who types a passphrase or touches a key."""
 LINE = re.compile(
     r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
-    r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
+    r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)"
+    r"|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
     re.ASCII,
 )
@@ -118,7 +119,8 @@ def _trusted(signers: Path) -> bytes:
                 else "it is not understood"
             )
             raise ConfigError(
-                f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a .pub file"
+                f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a "
+                ".pub file"
             )
     return data
 

@@ -142,7 +142,8 @@ class BundleFolder:
         signed = self.read(self.at(sha))
         if signed.sha != sha:
             raise BundleError(
-                f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one again"
+                f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one "
+                "again"
             )
         return signed
 
@@ -466,7 +467,8 @@ class Store:
         try:
             if (owner := os.fstat(folder).st_uid) != os.geteuid():
                 raise ConfigError(
-                    f"{self.folder} belongs to user {owner}; do this as that user (sudo -u palpate ...)"
+                    f"{self.folder} belongs to user {owner}; do this as that user (sudo -u palpate "
+                    "...)"
                 )
             end_ns = self._clock.now_ns() + round(wait_s * 1e9)
             while not _try_lock(folder):

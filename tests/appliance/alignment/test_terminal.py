@@ -1,4 +1,4 @@
-"""The View of where the skin is touched, and its picture in a terminal."""
+"""The View of the contact on the skin, and its picture in a terminal."""
 
 from __future__ import annotations
 
@@ -46,8 +46,7 @@ def model(default_bundle: Bundle) -> Bundle:
 def views_of(
     simulated: devices.SimDevices, model: Bundle | Expected
 ) -> Callable[[float], list[View]]:
-    """A function that reads the skin of `simulated` for some seconds and returns the Views of this
-    time."""
+    """A function that reads the skin of `simulated` for some seconds and returns the Views."""
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
     alignment = Alignment(
         settings, model if isinstance(model, Expected) else Expected.by(model), simulated
@@ -77,13 +76,13 @@ def resting(seed: int = 1) -> devices.SimDevices:
 
 
 def states(views: list[View]) -> list[str]:
-    """States one after another, each once."""
+    """The states in order, without repetitions."""
     return [v.state for i, v in enumerate(views) if i == 0 or v.state != views[i - 1].state]
 
 
 def test_views_follow_the_touches(model: Bundle):
-    """Finger off, then four touches, each nearer: the message follows, up to the last one, which is
-    in place."""
+    """Finger off, then four touches, each nearer than the last: the message follows, and the last
+    touch is in place."""
     views = views_of(resting(), model)
     seen = views(17)
     assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
@@ -100,7 +99,7 @@ def test_views_follow_the_touches(model: Bundle):
 
 
 def pressed(*loads: float) -> devices.SimDevices:
-    """A skin with these loads on all taxels but the last, a second each."""
+    """A skin with these loads on all taxels except the last, for a second each."""
     on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
     on[:, 3, 3] = 3
     return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
@@ -117,8 +116,8 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
 
 
 def test_a_skin_that_is_never_near_zero(model: Bundle):
-    """What the bundle knows of the unloaded skin is no load: the finger is told from it, and the
-    hint counts above it."""
+    """The bundle's counts of the unloaded skin are subtracted: the finger is detected, and the hint
+    counts above them."""
     rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
     seen = views_of(pressed(130, 145, 52, 130), rest)(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
@@ -129,8 +128,8 @@ def test_a_skin_that_is_never_near_zero(model: Bundle):
 
 
 def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
-    """What is a contact comes from the unloaded skin of this moment, as without a bundle; no
-    position is compared."""
+    """The threshold comes from the present unloaded skin, as without a bundle. No position is
+    compared."""
     m = model.manifest
     limits = replace(m.thresholds, contact=None)
     without = replace(
@@ -145,8 +144,8 @@ def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
 
 
 def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
-    """Unplugged: its state and what to do, no old picture. Plugged in again: the unloaded skin is
-    measured anew."""
+    """While the skin is unplugged, the View has its state and advice, and no old picture. After it
+    is plugged in, the unloaded skin is measured anew."""
     simulated = resting()
     views = views_of(simulated, model)
     views(2)
@@ -161,7 +160,7 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
 
 
 def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
-    """The View says that there are none, and what to do; the centre is in taxels."""
+    """The View says that the bundle has no positions, and what to do. The centre is in taxels."""
     without = replace(
         default_bundle, manifest=replace(default_bundle.manifest, contact=None, displacement=None)
     )
@@ -174,8 +173,8 @@ def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
 
 
 def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
-    """A skin that no bundle is for: load and centre, in taxels; what is a contact comes from the
-    unloaded skin."""
+    """For a skin without a bundle the View has load and centre, in taxels. The threshold comes from
+    the unloaded skin."""
     seen = views_of(resting(), Expected(model.format))(14.5)
     assert [state for state in states(seen) if state != "wait"][:2] == [
         "no-contact",
@@ -191,7 +190,7 @@ def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
     ("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")]
 )
 def test_a_view_says_what_it_is_of(source: str, word: str):
-    """A replayed set is not called simulated; a real skin is not called anything."""
+    """A replayed set is not called simulated. A real skin has no note."""
     shown = Canvas(replace(VIEW, source=source), ASCII, 80, 24, "").lines(False)[0]
     assert shown.endswith(word or VIEW.bundle)
     assert line(replace(VIEW, source=source)).startswith(f"{word}  " * bool(word) + VIEW.message)
@@ -207,7 +206,8 @@ def test_align_with_what_is_simulated(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """`align --sim skin` and `--sim replay:SET` find a contact, and say what they are."""
+    """`align --sim skin` and `--sim replay:SET` find a contact, and say that they are simulated or
+    replayed."""
     np.savez(
         tmp_path / "s.npz",
         samples=default_bundle.golden,
@@ -227,7 +227,7 @@ def test_align_with_what_is_simulated(
 
 
 def test_another_skin_shape(model: Bundle):
-    """A skin of 2 x 3 taxels with floating-point counts, some of which are NaN."""
+    """A skin of 2 x 3 taxels with floating-point counts, some of them NaN."""
     format = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
         model,
@@ -249,8 +249,8 @@ def test_another_skin_shape(model: Bundle):
 
 
 def test_only_the_normal_axis_is_looked_at(model: Bundle):
-    """A finger on the simulated skin with shear is found where it is; shear, which goes below zero,
-    is not shown."""
+    """A finger on the simulated skin with shear is found at its position. Shear, which may be
+    negative, is not shown."""
     world = skin.World(shear=True)
     other = replace(model, manifest=replace(model.manifest, format=world.format))
     script_of = script.named("rest", world.format, 1)[0]
@@ -279,7 +279,8 @@ VIEW = View(
 
 
 def test_a_pipe_gets_one_plain_line_a_second():
-    """No control characters; message, centre, and that it is simulated."""
+    """The line has message, centre and the note that the skin is simulated, and no control
+    characters."""
     out, clock = io.StringIO(), rig.VirtualClock()
     begin_ns = clock.now_ns()
     with Screen(out, clock, "http://127.0.0.1:8137") as screen:
@@ -297,8 +298,8 @@ def test_a_pipe_gets_one_plain_line_a_second():
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
 @pytest.mark.parametrize("signs", [BLOCKS, ASCII])
 def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
-    """It has no more and no longer lines than fit; at 80 x 24 all numbers, both points, texts and
-    the key are there."""
+    """The number and length of the lines fit the terminal. At 80 x 24 all numbers, both points, the
+    texts and the key are shown."""
     lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
     plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
     assert len(lines) == height
@@ -330,7 +331,7 @@ def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
 
 
 def test_a_place_beside_the_skin_is_shown_at_its_edge():
-    """However far it is: a bundle may name any number."""
+    """At any distance, since a bundle may have any number."""
     far = replace(VIEW, contact=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
     lines = Canvas(far, ASCII, 80, 24, "").lines(False)
     assert [
@@ -341,7 +342,7 @@ def test_a_place_beside_the_skin_is_shown_at_its_edge():
 
 
 def test_only_a_terminal_that_knows_colours_gets_them():
-    """38;5 for 256 colours; bold and inverse for all."""
+    """38;5 for terminals with 256 colours; bold and inverse for all."""
     assert any("38;5" in line for line in Canvas(VIEW, BLOCKS, 80, 24, "").lines(True))
     plain = Canvas(VIEW, BLOCKS, 80, 24, "").lines(False)
     assert not any("38;5" in line for line in plain)
@@ -349,8 +350,8 @@ def test_only_a_terminal_that_knows_colours_gets_them():
 
 
 def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """There is a View every VIEW_NS, not one for each frame; `stopped` ends it and the skin is
-    released."""
+    """There is a View every VIEW_NS, not a View for each frame. `stopped` ends the command, and the
+    skin is released."""
     simulated, out = resting(), io.StringIO()
     end_ns = simulated.clock.now_ns() + 5 * SECOND
     monkeypatch.setattr("appliance.alignment.terminal.LINE_NS", 0)
@@ -367,7 +368,7 @@ def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyP
 
 
 def test_a_denied_skin_is_named(model: Bundle):
-    """The View says why the skin cannot be read and what helps; the command goes on."""
+    """The View says why the skin cannot be read and what to do. The command goes on."""
     simulated = idle_devices()
     simulated.backend.errors["open"] = errno.EACCES
     alignment = Alignment(config.load(None, [], site=NO_SITE), Expected.by(model), simulated)
@@ -402,8 +403,8 @@ def terminal() -> Iterator[tuple[int, int]]:
 def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(
     folder: Path, terminal: tuple[int, int], kind: str
 ):
-    """The command in a terminal: exit code 0; the alternate screen is left at the end; a dumb
-    terminal gets none."""
+    """In a terminal the command ends with exit code 0 and leaves the alternate screen. A dumb
+    terminal gets no alternate screen."""
     far, near = terminal
     command = [
         sys.executable,

@@ -1,5 +1,4 @@
-"""enrolment.npz: what it adds to a bundle, and that it can add nothing else, whatever stands in
-it."""
+"""enrolment.npz adds labels to a bundle, and with any content can add nothing else."""
 
 from __future__ import annotations
 
@@ -28,12 +27,12 @@ def base() -> dict[str, bytes]:
 
 @pytest.fixture
 def made(base: dict[str, bytes]) -> dict[str, bytes]:
-    """With felt, then cork."""
+    """The files after the enrolment of felt and then cork."""
     return grown(grown(base, "felt"), "cork", SWEEPS[:, ::-1])
 
 
 def grown(files: dict[str, bytes], label: str, sweeps: np.ndarray = SWEEPS) -> dict[str, bytes]:
-    """The files with one label more."""
+    """The files after the enrolment of another label."""
     return enrolment.files(
         files, enrolment.enrol(bundle.from_files(files, "toy"), label, sweeps), None
     )
@@ -46,7 +45,7 @@ def content(files: dict[str, bytes]) -> dict[str, np.ndarray]:
 
 
 def changed(files: dict[str, bytes], **arrays: np.ndarray) -> dict[str, bytes]:
-    """With other arrays in enrolment.npz; None takes one out."""
+    """The files with other arrays in enrolment.npz; None removes an array."""
     held = {
         name: values for name, values in (content(files) | arrays).items() if values is not None
     }
@@ -54,7 +53,7 @@ def changed(files: dict[str, bytes], **arrays: np.ndarray) -> dict[str, bytes]:
 
 
 def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes], tmp_path: Path):
-    """Byte for byte, one file more; all that was trained is the same, tensor by tensor, and the id
+    """Its files do not change, and one file is added. All trained tensors are the same, and the id
     is another."""
     assert {name: data for name, data in made.items() if name != bundle.ENROLMENT} == base
     old, new = bundle.from_files(base, "old"), bundle.load(toy_bundle.put(tmp_path / "b", made))
@@ -76,8 +75,8 @@ def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes
 
 
 def test_what_an_enrolment_cannot_say_is_computed(made: dict[str, bytes]):
-    """Bias and shape of a label follow from its mean and number of sweeps: the file has no place
-    for them."""
+    """Bias and shape of a label are computed from its mean and number of sweeps, and are not in the
+    file."""
     assert set(content(made)) == set(enrolled.ARRAYS)
     louder = changed(made, bias=np.float32([1e6, 1e6]), means_of_wood=np.zeros((3, 2), np.float32))
     new, old = bundle.from_files(louder, "louder"), bundle.from_files(made, "made")
@@ -155,14 +154,15 @@ WRONG = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made: dict[str, bytes], case: str):
-    """Of another bundle, another form, out of range: a BundleError that says what to do."""
+    """An enrolment of another bundle, with wrong types or shapes, or out of range raises a
+    BundleError that says what to do."""
     changes, why = WRONG[case]
     check_refused(changed(made, **changes), why)
 
 
 @pytest.mark.parametrize("name", [bundle.ENROLMENT, bundle.GOLDEN, bundle.MEANS])
 def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str):
-    """numpy gives it as the bytes that it is; it is named before anything asks for its type."""
+    """numpy returns such a member as bytes. The error names it before its type is used."""
     file = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(made[name])) as whole, zipfile.ZipFile(file, "w") as damaged:
         for member in whole.namelist():
@@ -174,7 +174,7 @@ def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str)
 
 
 def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
-    """Cut, empty, something else, or a zip that unpacks without end."""
+    """A cut or empty file, other bytes, or a zip file that unpacks without end."""
     whole = made[bundle.ENROLMENT]
     for data in (b"", b"PK", whole[:200], b"\0" * 1000):
         check_refused(made | {bundle.ENROLMENT: data}, "enrolment.npz cannot be read")
@@ -195,7 +195,7 @@ def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
 
 
 def test_a_bundle_without_class_means_takes_no_labels(made: dict[str, bytes]):
-    """There is nothing to add them to."""
+    """The labels cannot be added without class means."""
     plain = toy_bundle.files(known=None, outputs=("logits",))
     base = np.array(bundle.digest(plain[bundle.MANIFEST]))
     check_refused(
@@ -206,8 +206,8 @@ def test_a_bundle_without_class_means_takes_no_labels(made: dict[str, bytes]):
 def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(
     base: dict[str, bytes], made: dict[str, bytes]
 ):
-    """The most that a forged label can do is to be named itself: for any sweep, the order of the
-    trained labels stays."""
+    """A forged label can only win itself. For any sweep the order of the trained labels does not
+    change."""
     forged = changed(made, means=np.float32([[6, 0], [0, 0]]), spread=np.float32([1e6, 1e6]))
     it, before = (
         Classifier(bundle.from_files(files, "toy"), SystemClock()) for files in (forged, base)
@@ -218,7 +218,7 @@ def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(
 
 
 def test_labels_are_read_in_the_order_in_which_they_were_enrolled(base: dict[str, bytes]):
-    """So that class codes of all others stay the same; the same labels give the same bytes."""
+    """So the class codes of all other labels stay the same. The same labels give the same bytes."""
     one, other = grown(grown(base, "felt"), "cork"), grown(grown(base, "cork"), "felt")
     first, second = (bundle.from_files(files, "toy") for files in (one, other))
     assert (first.manifest.labels[3:], second.manifest.labels[3:]) == (

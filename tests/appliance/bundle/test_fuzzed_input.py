@@ -1,5 +1,5 @@
-"""Results of fuzzing, tested in each run: the corpus, all former crashes, and that each broken
-promise is detected."""
+"""Results of fuzzing, tested in each run: the corpus, all former crashes, and the detection of each
+broken promise."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
 
 
 def test_each_crash_is_explained() -> None:
-    """Each input in crashes/ is explained in BROKE, and each explained one exists."""
+    """Each input in crashes/ is explained in BROKE, and each entry of BROKE has an input."""
     there = {f"{target}/{file.stem}" for target in TARGETS for file in corpus.crashes(target)}
     assert there == set(BROKE)
 
@@ -138,7 +138,8 @@ def test_each_crash_is_explained() -> None:
 def test_the_corpus_is_small_and_read_as_it_was_written(
     target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line per input, the shortest first; a file of a size that can be reviewed."""
+    """The file has one line for each input, the shortest first, and is small enough for a
+    review."""
     file = corpus.SAVED / f"{target}.txt"
     assert file.stat().st_size < 200_000
     saved = corpus.load(target)
@@ -167,7 +168,7 @@ def read_recording(data: bytes, folder: Path) -> Any:
 
 
 def frames_of(name: str, data: bytes, folder: Path) -> int:
-    """How many frames of a skin there are."""
+    """Number of frames of a skin."""
     return len(skin_codecs.codec(skins.SUBJECTS[name].profile)(skin_codecs.Rest(), data))
 
 
@@ -190,7 +191,8 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     ),
     **{f"skin-{name}": partial(frames_of, name) for name in skins.GRIDS},
 }
-"""How each target reads an input: a value, nothing, or one of its own errors."""
+"""Function of each target that reads an input. It returns a value or nothing, or raises an error of
+the project."""
 
 
 def taken(target: str, data: bytes, folder: Path) -> bool:
@@ -204,9 +206,9 @@ def taken(target: str, data: bytes, folder: Path) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
-    """Several inputs are taken and several refused: a corpus of nothing but broken files would
+    """Several inputs are accepted and several refused, since a corpus of broken files alone would
     prove little."""
-    check_inputs(target, tmp_path)  # puts beside a manifest what belongs there
+    check_inputs(target, tmp_path)  # writes the other files of a manifest's bundle
     count = sum(taken(target, data, tmp_path) for data in INPUTS[target])
     assert 2 <= count < len(INPUTS[target]) - 2
 
@@ -249,7 +251,7 @@ def trusting(data: bytes, at: int) -> Any:
 
 
 def unguarded(kind: Any, table: Any) -> Any:
-    """A dataclass from unchecked values, as the manifest was read once."""
+    """A dataclass from unchecked values, as the manifest was once read."""
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})
 
 
@@ -287,13 +289,12 @@ def broken_json(text: bytes) -> Any:
 
 
 def eager(layout: Any, data: bytes, at: int) -> bool:
-    """Takes a beginning as certain once one period has followed it, however many bytes have
-    come."""
+    """Takes a beginning as certain after one period, whatever the number of bytes."""
     return data.startswith(layout.mark, at + layout.period)
 
 
 def unsummed(data: bytes, begin: int) -> int:
-    """The next tail ends a packet, whatever its sum."""
+    """The next tail ends a packet, whatever its checksum."""
     tail = data.find(b"\xaa\xbb\xcc\xdd", begin)
     return tail + 4 if tail > begin + 2 else 0
 
@@ -505,7 +506,7 @@ def test_each_promise_can_be_seen_broken(
 def test_another_error_is_not_kept_back(
     target: str, module: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An unexpected exception leaves the target, so that the fuzzer stops at it."""
+    """An unexpected exception leaves the target, so the fuzzer stops at it."""
 
     def broken(*args: object) -> None:
         raise ZeroDivisionError("broken")
@@ -518,8 +519,7 @@ def test_another_error_is_not_kept_back(
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
-    """A mutator gives the same for the same seed, and a good part of its outputs is still
-    accepted."""
+    """A mutator gives the same outputs for the same seed, and a large part of them is accepted."""
 
     def plain(data: bytes) -> bytes:
         return data.replace(b"A", b"E")

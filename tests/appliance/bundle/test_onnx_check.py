@@ -1,5 +1,5 @@
-"""The graph's check: our own models pass, hostile ones are refused with their reason, and what
-passes cannot hurt."""
+"""The check of the graph: our own models pass, hostile models are refused with the reason, and
+accepted models do no harm."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ MANIFEST = Manifest("hostile", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255),
 
 @pytest.fixture(scope="module")
 def owns() -> list[mutated_models.Own]:
-    """Models that `palpate-train` writes, which have all allowed operators but GRU and MaxPool
-    between them."""
+    """Models of `palpate-train`, which together have all allowed operators except GRU and
+    MaxPool."""
     return mutated_models.own_models(mutated_models.QUICK)
 
 
@@ -49,7 +49,7 @@ def default() -> mutated_models.Own:
 
 @pytest.mark.slow
 def test_our_own_models_pass(owns: list[mutated_models.Own]):
-    """The default bundle's, those of all kinds of methods, and a graph of opset 18."""
+    """The default bundle's model, models of all kinds of methods, and a graph of opset 18."""
     for own in owns:
         check.check(own.model, own.manifest)
     small = replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c"))
@@ -57,13 +57,13 @@ def test_our_own_models_pass(owns: list[mutated_models.Own]):
 
 
 def test_a_harmless_model_of_the_hostile_kind_passes():
-    """What surrounds the hostile nodes is sound: they are refused for what they are."""
+    """The graph around the hostile nodes is sound, so models are refused because of these nodes."""
     check.check(hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString(), MANIFEST)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_model_is_refused(name: str):
-    """With one printable line that says why and what to try, and within a second."""
+    """The error is one printable line that says why and what to try, and comes within a second."""
     data, words = HOSTILE[name]
     with pytest.raises(BundleError, match=words) as refused:
         check.check(data, MANIFEST)
@@ -74,8 +74,8 @@ def test_a_hostile_model_is_refused(name: str):
 
 
 def in_child(work: Callable[[], Any], more: int) -> tuple[Any, float]:
-    """What `work` gives or raises in a fork that may take `more` bytes, and how many MB more it had
-    at most."""
+    """The result or error of `work` in a fork that may use `more` bytes, and the largest additional
+    memory in MB."""
 
     def child(end: Any) -> None:
         size = hostile_fuzz.memory("VmSize") * 1024 + more
@@ -124,7 +124,7 @@ def test_a_file_that_ends_anywhere_is_refused(default: mutated_models.Own):
 def test_a_link_and_a_file_beside_the_model_are_never_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """External data that is there, as a symlink: refused before anything is opened."""
+    """A model with external data in a file or a symlink is refused before anything is opened."""
     (tmp_path / "secret").write_bytes(bytes(16))
     (tmp_path / "weights.bin").symlink_to(tmp_path / "secret")
     monkeypatch.chdir(tmp_path)
@@ -133,7 +133,7 @@ def test_a_link_and_a_file_beside_the_model_are_never_followed(
 
 
 def heavy(kind: str) -> bytes:
-    """A model that costs nearly as much memory as one may, by one operator."""
+    """A model that needs nearly the largest allowed memory because of one operator."""
     node, model = hostile.node, hostile.model
     start = [
         node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0),
@@ -162,7 +162,8 @@ def heavy(kind: str) -> bytes:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["MatMul", "TopK", "ConstantOfShape", "MaxPool"])
 def test_what_passes_takes_no_more_than_was_counted(kind: str):
-    """The check's account of memory is above what onnxruntime takes, and that below 256 MB."""
+    """The memory that the check computes is above that of onnxruntime, and both are below 256
+    MB."""
     model = heavy(kind)
     check.check(model, MANIFEST)
 
@@ -179,21 +180,21 @@ def test_what_passes_takes_no_more_than_was_counted(kind: str):
     "limit", ["MOST_MEMORY", "MOST_WORK", "MOST_NODES", "MOST_CONSTANTS", "MOST_TENSOR"]
 )
 def test_every_cap_caps(limit: str, default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch):
-    """Our own model is refused where a cap is lower than what it needs."""
+    """Our own model is refused if a cap is lower than its needs."""
     monkeypatch.setattr(check, limit, 20)
     with pytest.raises(BundleError, match="limit 20"):
         check.check(default.model, default.manifest)
 
 
 def test_a_file_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch):
-    """By its size alone."""
+    """The file is refused because of its size alone."""
     monkeypatch.setattr(check, "MOST_MEMORY", 99)
     with pytest.raises(BundleError, match=r"it has 100 bytes \(limit 99\)"):
         check.check(bytes(100), MANIFEST)
 
 
 def test_values_are_counted(default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch):
-    """A file is read value by value only so far."""
+    """Only a limited number of values is read one by one."""
     monkeypatch.setattr(reader, "MOST_VALUES", 100)
     with pytest.raises(BundleError, match="more than 100 values"):
         check.check(default.model, default.manifest)
@@ -218,7 +219,7 @@ def test_the_manifest_decides_what_goes_in_and_comes_out():
 
 
 def test_enrolled_labels_and_means_decide_as_well():
-    """The model knows all labels but the enrolled ones, and its embedding is that of means.npz."""
+    """The model has all labels except the enrolled labels, and its embedding fits means.npz."""
     toy, manifest = (
         toy_bundle.model(),
         replace(MANIFEST, format=toy_bundle.FORMAT, labels=("a", "b", "c", "d")),
@@ -234,7 +235,8 @@ def test_enrolled_labels_and_means_decide_as_well():
 
 @pytest.mark.parametrize("field", [b"\x0a\x00", b"\x2a\x00"], ids=["nodes", "constants"])
 def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
-    """20 MB of empty messages, of which protobuf makes 1 GB: refused after MOST_VALUES of them."""
+    """20 MB of empty messages, which need 1 GB in protobuf, are refused after MOST_VALUES of
+    them."""
     model = (
         hostile.part(1, 8)
         + hostile.part(7, field * 10_000_000)
@@ -247,8 +249,8 @@ def test_a_parse_takes_no_memory_before_it_is_counted(field: bytes):
 
 @pytest.mark.slow
 def test_grown_models_pass_and_run():
-    """Random operators in any order, as far as the rules let them: most of them onnxruntime opens
-    and runs."""
+    """Random operators in any order that the rules allow: onnxruntime opens and runs most of the
+    models."""
     ran = 0
     for seed in range(20):
         model = grown(Random(seed))
@@ -263,8 +265,8 @@ def test_grown_models_pass_and_run():
 @pytest.mark.slow
 @pytest.mark.thorough  # a sample of the campaign hostile
 def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
-    """150 of the campaign's kind, in children of limited memory and time; enough of them get as far
-    as onnxruntime."""
+    """150 models of the campaign run in children with limited memory and time. Enough of them reach
+    onnxruntime."""
     record = hostile_fuzz.fresh(3)
     for told in hostile_fuzz.Fuzz(owns, 3).results(0, 150):
         hostile_fuzz.note(record, told)
@@ -278,8 +280,8 @@ def test_fuzzed_models_neither_hang_nor_kill(owns: list[mutated_models.Own]):
 def test_fuzzed_enrolments_are_refused_or_answer(
     owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
 ):
-    """A hundred of the campaign's enrolments alone: none names a material without a probability,
-    and some get that far."""
+    """A hundred enrolments of the campaign: no enrolment gives a label without a probability, and
+    some of them give labels."""
     monkeypatch.setattr(hostile_fuzz, "ENROLLED", 1.0)
     record = hostile_fuzz.fresh(4)
     for told in hostile_fuzz.Fuzz(owns, 4).results(0, 100):
@@ -294,7 +296,7 @@ def test_fuzzed_enrolments_are_refused_or_answer(
 def test_the_campaign_would_tell(
     how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
 ):
-    """A child that dies, hangs or takes too much memory is told, with its number, and the next
+    """A child that dies, hangs or takes too much memory is reported with its number, and the next
     model is tried."""
 
     def run(opened: Any, rng: Random) -> None:

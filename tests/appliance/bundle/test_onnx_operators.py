@@ -1,5 +1,5 @@
-"""The rules of the operators: what each refuses, and that what each says of its result is what
-onnxruntime gives."""
+"""The rules of the operators refuse wrong inputs, and predict the type and shape of onnxruntime's
+results."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ IMAGE, SWEEP = (1, 3, 8, 8), (1, FORM.window, FORM.rows, FORM.cols)
 
 
 def fixed(*numbers: int, shape: tuple[int, ...] | None = None) -> Value:
-    """A constant of int64, in a row where nothing else is said."""
+    """A constant of int64, by default in one row."""
     array = np.array(numbers, np.int64)
     return Value("int64", array.shape if shape is None else shape, array)
 
 
 def of(*shape: int, kind: str = "float32") -> Value:
-    """A tensor that a sweep moves."""
+    """A tensor that depends on the sweep."""
     return Value(kind, shape, depends_on_sweep=True)
 
 
@@ -137,7 +137,7 @@ WRONG: list[tuple[str, str, list[Value], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("words", "name", "inputs", "given"), WRONG, ids=range(len(WRONG)))
 def test_a_rule_refuses(words: str, name: str, inputs: list[Value], given: dict[str, Any]):
-    """Inputs and settings that do not go together, with what is wrong."""
+    """Inputs and settings that do not fit, with the error."""
     (operator,) = (o for (_, op), o in OPERATORS.items() if op == name)
     with pytest.raises(BundleError, match=words):
         operator.rule(Call(inputs, given))
@@ -145,8 +145,8 @@ def test_a_rule_refuses(words: str, name: str, inputs: list[Value], given: dict[
 
 @pytest.mark.slow
 def test_all_rules_say_what_onnxruntime_gives():
-    """Models of random operators: type and shape of everything that a sweep moves, as the rules
-    have it and as it is."""
+    """In models of random operators the rules and onnxruntime give the same type and shape for all
+    values that depend on the sweep."""
     seen: set[str] = set()
     compared = 0
     for seed in range(60):
@@ -174,7 +174,7 @@ def test_all_rules_say_what_onnxruntime_gives():
             gives = session(model.SerializeToString()).run(
                 None, {"sweep": np.ones(SWEEP, np.uint8)}
             )
-        except Exception:  # a place that is not there: onnxruntime looks sweep by sweep
+        except Exception:  # an index out of range, which onnxruntime checks for each sweep
             continue
         for (name, value), have in zip(dependent.items(), gives, strict=True):
             assert (value.kind, value.shape) == (have.dtype.name, have.shape), f"{seed}: {name}"

@@ -1,5 +1,4 @@
-"""Pruning: what is left of a model gives the same bits, and what only other outputs need is
-gone."""
+"""Pruning: the remaining outputs keep their bits, and nodes for other outputs are removed."""
 
 from __future__ import annotations
 
@@ -27,8 +26,8 @@ def names(model: bytes, field: str) -> list[str]:
     "outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)]
 )
 def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...]):
-    """Golden sweeps and noise: each output of the pruned model is that of the whole one, to the
-    bit."""
+    """For golden sweeps and noise, each output of the pruned model equals that of the whole model
+    bit for bit."""
     whole, pruned = (
         session(default_bundle.model),
         session(prune(default_bundle.model, set(outputs))),
@@ -43,8 +42,8 @@ def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...
 
 
 def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
-    """No node and no constant of the heads is left, nothing that no output needs, and all that the
-    outputs need."""
+    """All nodes and constants of the heads are removed, and exactly those that the outputs need are
+    left."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     graph = reader.read(pruned).graph
     needed = {name for node in graph.node for name in node.input} | set(names(pruned, "output"))
@@ -61,7 +60,7 @@ def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
 
 
 def test_what_is_left_passes_the_check(default_bundle: Bundle):
-    """A pruned model is one that the box may open, as the model of a bundle without early heads."""
+    """The check accepts a pruned model as the model of a bundle without early heads."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     manifest = default_bundle.manifest
     check.check(pruned, replace(manifest, early=None))
@@ -70,14 +69,14 @@ def test_what_is_left_passes_the_check(default_bundle: Bundle):
 
 
 def test_a_model_without_other_outputs_stays_as_it_is():
-    """The very bytes, also where a node gives nothing that anything needs."""
+    """The bytes are the same, even if the result of a node is not used."""
     model = toy_bundle.model(("logits", "embedding"))
     assert "early" in [name for node in reader.read(model).graph.node for name in node.output]
     assert prune(model, {"embedding", "logits"}) is model
 
 
 def test_declarations_of_what_is_gone_are_gone():
-    """Of inner values only those of nodes that are left stay declared."""
+    """Only the values of remaining nodes stay declared."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     inferred = onnx.shape_inference.infer_shapes(
         onnx.load_from_string(toy_bundle.model(ALL))
@@ -89,7 +88,8 @@ def test_declarations_of_what_is_gone_are_gone():
 
 
 def test_an_output_that_is_not_there_is_refused():
-    """The message names it, and what there is; so does that for bytes that are no model."""
+    """The message names the missing output and the outputs of the model. Bytes that are not a model
+    are refused, too."""
     with pytest.raises(
         BundleError, match=r"gives \['embedding', 'logits'\], not \['early'\]; export"
     ):

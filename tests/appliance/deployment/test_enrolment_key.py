@@ -119,7 +119,8 @@ def unsigned(key: EnrolmentKey) -> None:
         (of_another, "is not the key of .*enrol all labels again"),
         (
             unsigned,
-            "cannot be checked: .*signer cannot be read.*make install, which makes signer again from key",
+            "cannot be checked: .*signer cannot be read.*make install, which makes signer again "
+            "from key",
         ),
     ],
 )

@@ -86,7 +86,8 @@ def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
     logged.clear()
     assert [box.start(), box.start()] == [one, one]
     assert logged == [
-        f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 times without being committed"
+        f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 "
+        "times without being committed"
     ]
     told = {e.sha: e for e in bundle_commands.entries(box.store)}
     assert (told[two].role, told[two].detail) == (

@@ -271,7 +271,8 @@ def test_a_full_disk_is_told_once_and_tried_again(
         trial.stopping()
     assert len(calls) == 3
     assert logged[1:] == [
-        f"<4>trial of bundle {box.two[:8]}: bundles.json cannot be written: No space left on device; it is tried again"
+        f"<4>trial of bundle {box.two[:8]}: bundles.json cannot be written: No space left on "
+        "device; it is tried again"
     ]
     trial.turn(health(30))
     assert box.standing.committed

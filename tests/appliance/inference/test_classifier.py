@@ -51,8 +51,8 @@ def test_no_sweep_can_veto():
 
 
 def test_vote_is_the_papers():
-    """The most frequent label wins, of equally frequent ones the first: with two sweeps the first
-    decides."""
+    """The most frequent label wins, and the first of equally frequent labels: with two sweeps the
+    first decides."""
     a, b, c = np.eye(3) * 0.8 + 0.1
     assert fuse([b, a], "vote").argmax() == 1
     assert fuse([a, b, b], "vote").argmax() == 1
@@ -73,8 +73,8 @@ def test_golden_sweeps_can_fail(default_bundle: Bundle):
 
 
 def test_verdict_carries_what_is_known(default_bundle: Bundle):
-    """Label, probability, margin, fused, bundle id of a classified sweep; probabilities add up to
-    one."""
+    """A classified sweep has label, probability, margin, fused and bundle id. Probabilities add up
+    to one."""
     clock = VirtualClock()
     v = Classifier(default_bundle, clock)(sweep_of(default_bundle.golden[0], lost=1))
     assert v.status in (Status.OK, Status.UNSURE)
@@ -99,7 +99,7 @@ def test_below_the_threshold_is_unsure(default_bundle: Bundle):
 
 @pytest.mark.parametrize("status", [s for s in Status if not s.classified])
 def test_refused_sweeps_keep_their_status(default_bundle: Bundle, status: Status):
-    """A sweep whose status is not ok is not classified."""
+    """A sweep with another status than ok is not classified."""
     sweep = replace(sweep_of(default_bundle.golden[0]), status=status)
     v = Classifier(default_bundle, VirtualClock())(sweep)
     assert (v.status, v.label, v.fused, len(v.scores)) == (status, "", 0, 0)
@@ -129,8 +129,8 @@ def of_features(weights: np.ndarray) -> dict[str, bytes]:
 
 
 def test_features_go_through_the_same_runtime():
-    """A bundle with input L gets features, not counts: a linear model on them gives the logits that
-    numpy gives."""
+    """A bundle with input L gets features, not raw counts: a linear model gives the same logits as
+    numpy."""
     from appliance.signal import features
 
     weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
@@ -216,8 +216,7 @@ def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):
 
 
 def test_a_bundle_may_know_the_unloaded_skin(tmp_path: Path):
-    """The box starts from it as its tare; the manifest of a bundle that does not know it is what it
-    always was."""
+    """The box uses it as its first tare. Without it the manifest has no such key."""
     folder = copy(tmp_path)
     before = bundle.load(folder)
     assert Classifier(before, VirtualClock()).tare.tolist() == np.zeros((4, 4)).tolist()
@@ -231,7 +230,7 @@ def test_a_bundle_may_know_the_unloaded_skin(tmp_path: Path):
 
 
 def test_no_bundle(tmp_path: Path):
-    """A folder without a manifest, and a manifest that is no JSON."""
+    """A folder without a manifest, and a manifest that is not JSON."""
     with pytest.raises(BundleError, match="no bundle at"):
         bundle.load(tmp_path)
     (tmp_path / bundle.MANIFEST).write_text("{")
@@ -252,8 +251,8 @@ def test_golden_sweeps_of_another_format(tmp_path: Path):
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 @pytest.mark.parametrize("axes", [1, 3])
 def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
-    """Every number of every type comes back as it was, also where changes wrap; smooth sweeps take
-    less room."""
+    """Every value of every type is the same after unpacking, even if changes wrap. Smooth sweeps
+    need less space."""
     format = SweepFormat(2, 3, 100.0, 50, dtype, axes)
     rng = np.random.default_rng(1)
     any_bits = rng.integers(0, 256, (2, 50, *format.shape, format.numpy_type.itemsize), np.uint8)
@@ -273,7 +272,7 @@ def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
 
 @pytest.mark.parametrize("shape", [(1, 2, 20, 2, 2), (2, 2, 19, 2, 2), (2, 2), ()])
 def test_golden_changes_of_another_form(shape: tuple[int, ...]):
-    """Changes with too few bytes or frames, or without either, are refused in one line."""
+    """Changes with too few bytes or frames, or with none, are refused in one line."""
     manifest = SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a", "b"))
     packed = io.BytesIO()
     np.savez_compressed(packed, changes=np.zeros(shape, np.uint8), logits=np.zeros((2, 2)))
@@ -282,7 +281,7 @@ def test_golden_changes_of_another_form(shape: tuple[int, ...]):
 
 
 def test_a_golden_file_without_sweeps():
-    """Logits alone are no golden sweeps."""
+    """Logits without golden sweeps are refused."""
     packed = io.BytesIO()
     np.savez_compressed(packed, logits=np.zeros((2, 2)))
     with pytest.raises(BundleError, match="holds no sweeps; export the bundle again"):
@@ -304,7 +303,7 @@ def test_pickles_are_not_opened(tmp_path: Path):
 
 
 def test_a_model_that_is_none(default_bundle: Bundle):
-    """One that onnxruntime cannot open, if the bundle's check had accepted it."""
+    """A model that the bundle's check accepted and onnxruntime cannot open."""
     with pytest.raises(BundleError, match="refuses the model"):
         Classifier(
             replace(default_bundle, model=default_bundle.model.replace(b"Gemm", b"Gemn")),
@@ -314,8 +313,8 @@ def test_a_model_that_is_none(default_bundle: Bundle):
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
 KNOWN = {"limit": 9.0, "temperature": 2.0}
-MOVED = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
-PLACE = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
+DISPLACEMENT = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
+CONTACT = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
 
 
 def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **changes) -> Path:
@@ -332,7 +331,7 @@ def spoiled(tmp_path: Path, arrays: dict[str, np.ndarray] | None = None, **chang
 
 
 def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bundle):
-    """Without the new fields; a manifest that is written now is read again unchanged."""
+    """It does not have the new fields. A manifest that is written now is read again unchanged."""
     folder = copy(tmp_path)
     old = json.loads((folder / bundle.MANIFEST).read_text())
     (folder / bundle.MANIFEST).write_text(
@@ -392,15 +391,18 @@ def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, default_bundle: Bund
         ({"known": {"limit": 9.0}}, "temperature"),
         ({"known": None}, "both `known` and means.npz"),
         ({"schema": 1}, "schema 1 has no"),
-        ({"moved": MOVED}, "`moved` without `known` and `place`"),
-        ({"displacement": MOVED, "place": PLACE}, r"\['displacement'\] is none of"),
-        ({"contact": PLACE}, r"\['contact'\] is none of"),
-        ({"moved": MOVED | {"limit": 0}, "place": PLACE}, "moved.limit 0 must"),
-        ({"moved": MOVED | {"temperature": -1}, "place": PLACE}, "moved.temperature -1 must"),
-        ({"moved": MOVED | {"unsure": "0.5"}, "place": PLACE}, "unsure"),
-        ({"moved": {"limit": 4.0}, "place": PLACE}, "temperature"),
-        ({"moved": MOVED, "place": PLACE, "schema": 3}, "schema 3 has no `moved`"),
-        ({"moved": MOVED, "place": PLACE}, "means.npz cannot be read"),
+        ({"moved": DISPLACEMENT}, "`moved` without `known` and `place`"),
+        ({"displacement": DISPLACEMENT, "place": CONTACT}, r"\['displacement'\] is none of"),
+        ({"contact": CONTACT}, r"\['contact'\] is none of"),
+        ({"moved": DISPLACEMENT | {"limit": 0}, "place": CONTACT}, "moved.limit 0 must"),
+        (
+            {"moved": DISPLACEMENT | {"temperature": -1}, "place": CONTACT},
+            "moved.temperature -1 must",
+        ),
+        ({"moved": DISPLACEMENT | {"unsure": "0.5"}, "place": CONTACT}, "unsure"),
+        ({"moved": {"limit": 4.0}, "place": CONTACT}, "temperature"),
+        ({"moved": DISPLACEMENT, "place": CONTACT, "schema": 3}, "schema 3 has no `moved`"),
+        ({"moved": DISPLACEMENT, "place": CONTACT}, "means.npz cannot be read"),
     ],
 )
 def test_broken_early_and_known_are_named(tmp_path: Path, changes: dict, hint: str):
@@ -459,14 +461,14 @@ def test_broken_means_are_named(tmp_path: Path, arrays: dict, hint: str):
 
 
 def test_early_heads_and_enrolled_labels_exclude_each_other(tmp_path: Path):
-    """A head that was never trained on a label would never name it."""
+    """A head that was not trained on a label cannot give it."""
     with pytest.raises(BundleError, match="do not know the enrolled labels"):
         bundle.load(spoiled(tmp_path, toy_bundle.means(sweeps=np.array([0, 0, 5])), early=EARLY))
 
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"nonsense", toy_bundle.npy(np.arange(3))])
 def test_means_that_are_no_npz(tmp_path: Path, data: bytes):
-    """For any content the file is named."""
+    """The error names the file, for any content."""
     folder = spoiled(tmp_path)
     (folder / bundle.MEANS).write_bytes(data)
     files = json.loads((folder / bundle.MANIFEST).read_text())["files"]
@@ -509,8 +511,8 @@ def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: di
 
 
 def test_a_far_sweep_is_unknown(tmp_path: Path):
-    """Squared distance to the nearest mean against the limit: at 3 deviations known, beyond not; no
-    label, no score."""
+    """The squared distance to the nearest mean is compared with the limit: up to 3 deviations a
+    sweep is known, beyond it has no label and no scores."""
     it = Classifier(toy_bundle.load(tmp_path / "toy"), VirtualClock())
     assert it(toy_bundle.sweep(-3, 0)).label == "a"
     v = it(toy_bundle.sweep(-3, -0.5))
@@ -568,13 +570,13 @@ def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
 
 def borderline(**more) -> tuple[Sweep, float]:
     """A sweep that is "a" with a probability of 1 / (1 + exp(-.6)) = .65 (two labels count), and
-    that probability."""
+    this probability."""
     return toy_bundle.sweep(2.8, -1, **more), 1 / (1 + np.exp(-0.6))
 
 
 def test_sweeps_are_requested_until_the_probability_suffices(tmp_path: Path):
-    """Unsure, unsure, ok: after n sweeps the odds are those of one to the power n. A further one is
-    fused, too."""
+    """Unsure, unsure, ok: after n sweeps the odds are the odds of one sweep to the power n. A
+    further sweep is fused, too."""
     it = Classifier(
         toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=5
     )
@@ -590,8 +592,8 @@ def test_sweeps_are_requested_until_the_probability_suffices(tmp_path: Path):
 
 
 def test_at_the_limit_the_answer_is_final(tmp_path: Path):
-    """Undecided with label and probability; a robot that continues is answered by the same rule,
-    and may get ok."""
+    """The answer is undecided, with label and probability. A robot that continues is answered by
+    the same rule, and may get ok."""
     it = Classifier(
         toy_bundle.load(tmp_path / "toy"), VirtualClock(), min_probability=0.85, max_sweeps=2
     )
@@ -605,8 +607,8 @@ def test_at_the_limit_the_answer_is_final(tmp_path: Path):
 
 @pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "fusion": "none"}])
 def test_sweeps_that_stand_alone_never_reach_the_limit(tmp_path: Path, more: dict):
-    """Without NEW OBJECT, or without fusion, each sweep is its own; a limit of one makes it
-    final."""
+    """Without NEW OBJECT, or without fusion, each sweep is answered alone. A limit of one makes the
+    answer final."""
     fusion = more.pop("fusion", "product")
     it = Classifier(
         toy_bundle.load(tmp_path / "toy"),
@@ -680,8 +682,8 @@ def test_only_needed_outputs_are_requested(
 
 
 def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
-    """(means . z + bias) / temperature for every label; the nearest one wins, and its spread is
-    wider by 1 + 1 / n."""
+    """The logits are (means . z + bias) / temperature. The nearest label wins, and an enrolled
+    label's spread is wider by 1 + 1 / n."""
     bias = np.float32([0, -18, -18 + 2 / 4])
     arrays = toy_bundle.means(bias=bias, sweeps=np.array([0, 0, 2]))
     it = Classifier(toy_bundle.load(tmp_path / "toy", arrays=arrays, labels=2), VirtualClock())

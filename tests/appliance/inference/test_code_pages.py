@@ -1,4 +1,4 @@
-"""Code that only starting needed: it is given back, and what is needed comes again."""
+"""Code that only the start needed is released, and needed pages are read again."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def it(default_bundle: Bundle) -> Classifier:
 
 
 def test_what_is_given_back_is_read_again(it: Classifier):
-    """None of the code stays; the next answer is the same, to the bit, and needs a part of it."""
+    """None of the code stays in memory. The next answer is the same, bit for bit, and reads a part
+    of it again."""
     golden = it.bundle.golden[0]
     want, before = it.logits(golden), resident_code()
     assert give_back(LIBRARY) > 1024 * before > 0
@@ -48,7 +49,8 @@ def test_what_is_given_back_is_read_again(it: Classifier):
 
 
 def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
-    """Before its first answer a classifier holds less than half of what a bare session holds."""
+    """Before its first answer a classifier has less than half of the resident code of a bare
+    session."""
     session(default_bundle.model)
     opened = resident_code()
     Classifier(default_bundle, VirtualClock())
@@ -56,8 +58,8 @@ def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
 
 
 def test_nothing_else_is_touched(tmp_path: Path):
-    """No file of this name, no list of mappings: nothing is given back. Data, and code that may be
-    written, stays."""
+    """Without a file of this name, or a list of mappings, nothing is released. Data and writable
+    code stay."""
     assert give_back("/no/such/library.so") == 0
     assert give_back(LIBRARY, tmp_path / "maps") == 0
     lines = [
@@ -72,6 +74,6 @@ def test_nothing_else_is_touched(tmp_path: Path):
 
 
 def test_what_linux_refuses_counts_nothing(tmp_path: Path):
-    """A range that is not mapped."""
+    """Linux refuses a range that is not mapped."""
     (tmp_path / "maps").write_text("1000-2000 r-xp 00000000 00:00 1 /lib.so\n")
     assert give_back("/lib.so", tmp_path / "maps") == 0

@@ -1,5 +1,5 @@
-"""Early exit: a toy graph whose heads can be computed by hand, on simulated devices; each way in
-which it can fail."""
+"""Early exit on simulated devices, with a toy graph whose heads can be computed by hand; and each
+failure."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ WEIGHTS = (
 
 
 def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool = True) -> Bundle:
-    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean; that of
-    "right" is 0.
+    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean. The logit
+    of "right" is 0.
 
     Head d gets the mean of exactly the frames of its step.
     """
@@ -100,8 +100,8 @@ def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool =
 
 
 def slid(*differences: int) -> np.ndarray:
-    """A slide [SLIDE, 2, 2]: left minus right is as given in each fifth of the window, the last one
-    to the end."""
+    """A slide [SLIDE, 2, 2] with the given left minus right in each fifth of the window; the last
+    value holds to the end."""
     diff = np.repeat(differences, FMT.window // 5)[: FMT.window]
     diff = np.concatenate([diff[:1].repeat(LEAD), diff, diff[-1:].repeat(SLIDE)])[:SLIDE]
     frames = np.empty((SLIDE, 2, 2))
@@ -114,8 +114,8 @@ def slid(*differences: int) -> np.ndarray:
 def acts(
     *slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] = ()
 ) -> list[rig.Act]:
-    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts that are
-    named."""
+    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts with these
+    numbers."""
     off = np.zeros((40, 2, 2), np.uint8)
     return [
         rig.Act(np.concatenate([off, s, off]), 40, 40 + SLIDE, label, i in new_object)
@@ -137,7 +137,7 @@ def simulated_slides(
 
 
 def all_of(box: Rigged) -> list[Verdict]:
-    """The verdicts on everything that the robot does, and those of two more seconds."""
+    """The verdicts until the robot has finished, and of two more seconds."""
     verdicts = box.until(lambda: box.simulated.finished(box.box.answered))
     return verdicts + box.seconds(2)
 
@@ -169,8 +169,8 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
     ],
 )
 def test_the_rule(scores: list[float], agree: int, want: bool):
-    """The step's own least probability, and the same label in the last `agree` steps; a least above
-    1 is never reached."""
+    """An answer needs the step's least probability and the same label in the last `agree` steps. A
+    least probability above 1 is never reached."""
     rule = Early((0.9, 0.8, 1.1, 0.5), agree)
     assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
 
@@ -201,8 +201,8 @@ def test_steps_must_agree(rigged: Callable[..., Rigged]):
 def test_otherwise_the_answer_is_the_usual_one(
     rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float
 ):
-    """Off by default; or if no step is sufficient: the middle window, once, bit for bit the
-    same."""
+    """With early exit off, or if no step is sufficient, the middle window is answered once, bit for
+    bit the same."""
     (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
     simulated = simulated_slides(slid(20, 20))
     (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
@@ -372,7 +372,7 @@ def spoiled(fault: str) -> np.ndarray:
 
 @pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
 def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], fault: str):
-    """For any output of the heads the whole sweep reports the fault; without the fault the answer
+    """For any output of the heads the whole sweep reports the fault. Without the fault the answer
     is early."""
     assert summary(all_of(rigged(simulated_slides(spoiled(fault)), SETS, toy((0.5,) * STEPS)))) == [
         (fault, "", 1.0)
@@ -390,7 +390,7 @@ def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
 
 
 def test_a_tare_counts(rigged: Callable[..., Rigged]):
-    """With a tare as high as the load there is no contact, early or late."""
+    """With a tare as high as the load neither the early nor the whole sweep has contact."""
     classifier = Classifier(toy(), rig.VirtualClock())
     decider, sweep = EarlyExit(classifier), so_far(slid(60)[:20], 0.2)
     assert decider(sweep) is not None
@@ -411,8 +411,8 @@ def test_a_tare_counts(rigged: Callable[..., Rigged]):
 def test_missing_frames(
     rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]
 ):
-    """Two lost frames, also the last of a step, are interpolated and counted; after a wider gap
-    there is no early answer."""
+    """Two lost frames, also at the end of a step, are interpolated and counted. A wider gap
+    prevents an early answer."""
     simulated = simulated_slides(slid(-10, 60), packet_frames=1)
     count = itertools.count()
     simulated.backend.mangle = lambda data: (
@@ -436,8 +436,8 @@ def test_missing_frames(
 def test_what_goes_wrong_after_the_answer(
     rigged: Callable[..., Rigged], what: str, want: list[str]
 ):
-    """Unplugged, started again, aborted, edges lost: the early answer stays the only one to its
-    trigger."""
+    """After unplugging, another start, an abort or lost edges, the early answer stays the only
+    answer to its trigger."""
     simulated = simulated_slides(slid(60), stops=False)
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
@@ -494,8 +494,8 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[...,
 
 
 def test_without_ok_the_sweep_goes_on(rigged: Callable[..., Rigged]):
-    """`min_probability` is not reached by one sweep: no early answer, the whole one requests
-    another sweep; fused with that, the answer is early."""
+    """One sweep does not reach `min_probability`, so its answer is not early and requests another
+    sweep. Fused with that, the answer is early."""
     simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
     assert [(str(v.status), v.fused, v.share) for v in verdicts] == [
@@ -525,7 +525,7 @@ class Ticking(rig.VirtualClock):
 def test_a_capture_gives_the_same_answers(
     rigged: Callable[..., Rigged], tmp_path: Path, packet_frames: int
 ):
-    """Lost packets, early and whole answers, fused ones, a stop edge beside a step: replayed, all
+    """With lost packets, early, whole and fused answers, and a stop edge beside a step, the replay
     is the same."""
     rng = np.random.default_rng(7)
     slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]

@@ -1,4 +1,4 @@
-"""Enrolment: a label added by arithmetic, warnings about unsuitable sweeps, a bundle that is
+"""Enrolment: a label is added by arithmetic, unsuitable sweeps give warnings, and the new bundle is
 complete or absent."""
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
 
 
 def test_a_label_for_a_skin_with_axes(tmp_path: Path):
-    """As with one axis; sweeps without the axes are refused, naming the format."""
+    """As with one axis. Sweeps without the axes are refused with the format."""
     old = toy_bundle.load(tmp_path / "old", format=toy_bundle.THREE_AXES)
     sweeps = np.stack([toy_bundle.window(*z, format=toy_bundle.THREE_AXES) for z in FELT])
     new = enrolment.enrol(old, "felt", sweeps)
@@ -84,8 +84,8 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
 
 
 def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
-    """Written, read, self-tested: equal to what `enrol` gave; it gives the new label, the old ones,
-    and unknown."""
+    """Written and read again, the bundle equals the result of `enrol` and passes its self-test. It
+    gives the new label, the old labels, and unknown."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
     enrolment.write(enrolment.files(toy_bundle.files(), new, None), tmp_path / "new", False)
     read = bundle.load(tmp_path / "new")
@@ -113,8 +113,8 @@ def test_same_sweeps_same_bytes(old: Bundle):
 
 
 def test_a_material_that_scatters_is_kept(old: Bundle):
-    """Its spread is that of its sweeps and one assumed sweep at the trained distance: (2 + 4 * 9) /
-    (2 * 4)."""
+    """Its spread is computed from its sweeps and one assumed sweep at the trained distance: (2 + 4
+    * 9) / (2 * 4)."""
     new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
     assert new.bundle.classes is not None
     assert new.bundle.classes.spread[3] == pytest.approx(38 / 8, abs=1e-4)
@@ -125,7 +125,7 @@ def test_a_material_that_scatters_is_kept(old: Bundle):
 
 
 def test_the_golden_sweep_is_the_median_of_those_recognised(old: Bundle):
-    """By the probability of the new label, without the sweeps that get another one."""
+    """The median of the new label's probability, over the sweeps that get the new label."""
     near = [(3.0, 5.0), (3.0, 5.5), (4.0, 8.0), (3.2, 6.0), (0.5, 6.0)]
     new = enrolment.enrol(old, "felt", counts(*near))
     it = Classifier(new.bundle, VirtualClock())
@@ -155,8 +155,8 @@ def test_one_sweep_is_enough_and_labels_add_up(old: Bundle):
 
 @pytest.mark.parametrize("n", [1, 2, 5, 10])
 def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n: int):
-    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or one
-    of n sweeps."""
+    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or the
+    mean of n sweeps."""
     rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, limit=4.0)
     kept = []
     for _ in range(100):
@@ -174,8 +174,8 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
 
 
 def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
-    """Its shape is 1; where the skin has moved, its mean is turned and shifted as the trained
-    labels' means are."""
+    """Its shape is 1. For displaced contacts its mean is turned and shifted like the means of the
+    trained labels."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     signed = toy_bundle.files(
         arrays=arrays, displacement=toy_bundle.DISPLACEMENT, contact=toy_bundle.IN_PLACE
@@ -195,7 +195,7 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
 
 
 def test_early_answers_end_with_an_enrolment(tmp_path: Path):
-    """Its heads do not know the label; the command says so."""
+    """The early heads do not have the label; the command says so."""
     quick = toy_bundle.load(
         tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early")
     )
@@ -221,7 +221,8 @@ def test_early_answers_end_with_an_enrolment(tmp_path: Path):
 def test_unsuitable_sweeps_are_told_with_numbers(
     old: Bundle, at: list[tuple[float, float]], hints: list[str]
 ):
-    """Like a trained material, or unlike one another: told, and enrolled all the same."""
+    """Sweeps that are like a trained material, or unlike each other, give a warning and are
+    enrolled."""
     new = enrolment.enrol(old, "felt", counts(*at))
     found = [text for text in (new.disagreement, *new.warnings) if text]
     assert len(found) == len(hints), found
@@ -251,7 +252,8 @@ def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
     ],
 )
 def test_labels_that_cannot_be_enrolled(old: Bundle, label: str, hint: str):
-    """Already used, or not allowed in a sentence; reported before the first sweep."""
+    """Labels that are used already, or not allowed in a sentence, are reported before the first
+    sweep."""
     with pytest.raises(BundleError, match=hint):
         enrolment.admit(old, label)
     with pytest.raises(BundleError, match=hint):
@@ -270,7 +272,7 @@ def test_a_bundle_without_embedding(tmp_path: Path):
     [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)],
 )
 def test_sweeps_of_another_form(old: Bundle, sweeps: np.ndarray):
-    """One dimension short, none, another window, another type."""
+    """Sweeps with a dimension too few, no sweeps, another window, another type."""
     with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants"):
         enrolment.enrol(old, "felt", sweeps)
 
@@ -485,7 +487,7 @@ def test_too_few_sweeps_write_nothing(rig, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_sigterm_ends_an_enrolment(rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """As it ends a run; nothing is written."""
+    """SIGTERM ends an enrolment like a run, and nothing is written."""
     keep = enrolment.SweepCollector.sweep
 
     def kept(self: enrolment.SweepCollector, *what) -> None:
@@ -580,7 +582,8 @@ def test_class_bits_that_cannot_represent_the_new_label(
 
 
 def test_the_collector_takes_what_it_wants(old: Bundle, logged: list[str]):
-    """No more than wanted, though one turn of the box may answer several; too few are an error."""
+    """Not more sweeps than wanted, though one turn of the box may answer several. Too few are an
+    error."""
     taken, it = enrolment.SweepCollector(2), Classifier(old, VirtualClock())
     with pytest.raises(ApplianceError, match="0 of 2 good sweeps"):
         taken.windows()

@@ -1,5 +1,5 @@
-"""Distances of known and unknown materials, in place and where the contact has moved, on a bundle
-known by arithmetic."""
+"""Distances of known and unknown materials, with and without displacement, on a bundle that can be
+computed by hand."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from tests.factories import toy_bundle
 
 
 def elsewhere(z1: float, z2: float, number: int = 1, object: int = 0) -> Sweep:
-    """A sweep of the toy bundle whose contact is not in the middle: the second row is loaded
-    less."""
+    """A sweep of the toy bundle with a displaced contact: the second row has less load."""
     sweep = toy_bundle.sweep(z1, z2, number, object)
     sweep.frames.taxels[:, 1] -= 80
     return sweep
@@ -24,7 +23,7 @@ def elsewhere(z1: float, z2: float, number: int = 1, object: int = 0) -> Sweep:
 
 @pytest.fixture
 def displaced_box(tmp_path: Path) -> Classifier:
-    """The toy bundle with a rule for moved sweeps."""
+    """The toy bundle with a rule for displacement."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     it = toy_bundle.load(
         tmp_path / "toy",
@@ -44,9 +43,9 @@ def test_a_material_has_its_own_shape(displaced_box: Classifier):
     assert displaced_box(toy_bundle.sweep(6, -3.5)).status is Status.UNKNOWN
 
 
-def test_what_a_moved_skin_changes_makes_no_material_unknown(displaced_box: Classifier):
-    """Where the contact has moved, the first direction counts a tenth and the limit is another:
-    what is unknown in place is known there, and the reverse."""
+def test_a_displacement_makes_no_material_unknown(displaced_box: Classifier):
+    """For displaced contacts the first direction has a tenth of the weight, and the limit is
+    another. So a sweep may be unknown without displacement and known with it, and the reverse."""
     assert displaced_box(toy_bundle.sweep(-3.5, 0)).status is Status.UNKNOWN
     v = displaced_box(elsewhere(-3.5, 0))
     assert (v.status, v.label) == (Status.OK, "a")
@@ -58,9 +57,9 @@ def test_what_a_moved_skin_changes_makes_no_material_unknown(displaced_box: Clas
     assert v.displacement
 
 
-def test_a_moved_sweep_needs_its_own_probability(displaced_box: Classifier):
+def test_a_displaced_sweep_needs_its_own_probability(displaced_box: Classifier):
     """Its logits are divided by the rule's temperature, and below the rule's probability it is
-    unsure: a second sweep of the object decides, or `max_sweeps` end it."""
+    unsure. A second sweep of the object decides, or `max_sweeps` ends the object."""
     z = (2.2, 0.0)  # logits of "a" and "b" are (0, 6 * 2.2 - 18) / 2 = (0, -2.4), in place
     assert displaced_box(toy_bundle.sweep(*z)).probability == pytest.approx(
         1 / (1 + np.exp(-2.4) + np.exp(-9)), abs=1e-3
@@ -80,9 +79,9 @@ def test_a_moved_sweep_needs_its_own_probability(displaced_box: Classifier):
     assert least(elsewhere(*z, 4)).status is Status.UNSURE
 
 
-def test_without_a_rule_a_moved_sweep_is_judged_as_any(tmp_path: Path):
-    """A bundle with places alone, as older ones are: the sweep is marked, and the distances are
-    those in place."""
+def test_without_a_rule_a_displaced_sweep_is_classified_as_any(tmp_path: Path):
+    """A bundle with contact positions alone, like older bundles: the sweep is marked, and the usual
+    distances apply."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", contact=toy_bundle.IN_PLACE), VirtualClock())
     v = it(elsewhere(-3.5, 0))
     assert v.status is Status.UNKNOWN
@@ -91,8 +90,8 @@ def test_without_a_rule_a_moved_sweep_is_judged_as_any(tmp_path: Path):
 
 
 def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
-    """Once a label is enrolled, logits come from means: those of moved sweeps where the contact has
-    moved."""
+    """After an enrolment logits are computed from means, and for displaced contacts from the means
+    of displaced sweeps."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays(), sweeps=np.array([0, 0, 2]))
     made = toy_bundle.load(
         tmp_path / "toy",

@@ -1,4 +1,5 @@
-"""The model runner: a session for what is requested together, and none for what another gives."""
+"""The model runner: one session for outputs that are requested together, and no second session for
+the same outputs."""
 
 from __future__ import annotations
 
@@ -67,8 +68,8 @@ def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
 
 
 def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundle):
-    """Logits of golden sweeps and noise, to the bit, from a classifier that answers early, one that
-    does not, and from all outputs of the delivered model at once."""
+    """The logits of golden sweeps and noise are the same, bit for bit, from classifiers with and
+    without early answers, and from all outputs of the delivered model at once."""
     plain, early = (
         Classifier(default_bundle, VirtualClock()),
         Classifier(default_bundle, VirtualClock()),
@@ -89,7 +90,7 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundl
 def test_an_enrolled_bundle_runs_without_the_early_heads(
     default_bundle: Bundle, opened: list[list[str]]
 ):
-    """The bundle keeps the delivered model; the heads in it, which do not know the label, are not
+    """The bundle keeps the delivered model. Its heads, which do not have the label, are not
     computed."""
     new = enrol(default_bundle, "cork", default_bundle.golden[:1]).bundle
     assert new.model == default_bundle.model
@@ -99,7 +100,7 @@ def test_an_enrolled_bundle_runs_without_the_early_heads(
 
 
 def test_an_output_that_the_model_does_not_give(tmp_path):
-    """Refused when it is requested; the others can still be."""
+    """The output is refused when it is requested. The other outputs can still be requested."""
     it = ModelRunner(toy_bundle.model(), "logits")
     with pytest.raises(BundleError, match=r"not \['early'\]"):
         it(("early",), toy_bundle.window(0, 0))

@@ -41,7 +41,7 @@ def judged(
 
 
 def numbers(folder: Path) -> list[int]:
-    """The numbers of the sweeps in a folder, each whole."""
+    """The numbers of the complete sweeps in a folder."""
     numbers = sorted(int(path.stem[6:]) for path in folder.glob("*.npy"))
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy")
@@ -50,8 +50,8 @@ def numbers(folder: Path) -> list[int]:
 
 
 def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
-    """Each new one displaces the oldest, also in a later run and for any status; one without a
-    window does not."""
+    """Each new sweep pushes out the oldest sweep, also in a later run and for any status. A sweep
+    without a window does not."""
     first = box(tmp_path / "b")
     for n in range(1, 6):
         first.sweep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
@@ -68,7 +68,8 @@ def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
 
 
 def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The last sweeps exist at every moment: nothing is removed before the new one has its name."""
+    """The last sweeps exist at every moment: a sweep is removed only after the new sweep has its
+    name."""
     black = box(tmp_path)
     for n in range(1, 4):
         black.sweep(*judged(n))
@@ -87,8 +88,8 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
 def test_a_full_disk_drops_the_oldest_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """A new sweep displaces the oldest; if that does not help, one line is logged, and one when it
-    works again."""
+    """The oldest sweep is removed for a new sweep. If that does not help, one line is logged, and
+    another when writing works again."""
     black = box(tmp_path)
     limit = [2]
 
@@ -120,7 +121,7 @@ def test_a_full_disk_drops_the_oldest_first(
 def test_another_error_removes_no_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """A disk that fails for another reason than being full: existing sweeps are kept."""
+    """If the disk fails although it is not full, existing sweeps are kept."""
     black = box(tmp_path)
     black.sweep(*judged(1))
 
@@ -134,8 +135,8 @@ def test_another_error_removes_no_sweep(
 
 
 def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
-    """A file in its place, another program in it: the box starts all the same, one line each, and
-    later it works."""
+    """With a file instead of the folder, or another program in it, the box starts and logs one
+    line. Later the folder can be used."""
     (tmp_path / "b").write_text("in the way")
     black = box(tmp_path / "b")
     for n in (1, 2):
@@ -155,8 +156,7 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
 
 
 def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
-    """Slow disk accesses of the start are done before the box runs, and the folder is released at
-    the end."""
+    """Slow accesses to the disk come before the box runs, and the folder is released at the end."""
     black = box(tmp_path / "b")
     assert (tmp_path / "b").is_dir()
     black.close()
@@ -165,7 +165,7 @@ def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
 
 
 def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):
-    """The sentence is sent before any access to the disk; and the sweep is stored."""
+    """The sentence is sent before any access to the disk, and the sweep is stored."""
     simulated = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
     made: Rigged
     black = BlackBox(tmp_path, skin.FORMAT, 1)

@@ -56,8 +56,8 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
 
 
 def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(tmp_path: Path):
-    """A skin that came too fast has to send for some seconds first: replay gives exactly the
-    frames that the sensor passed on."""
+    """A skin that was too fast must send for some seconds before it streams. Replay gives exactly
+    the frames that the sensor returned."""
     capture = CaptureWriter(tmp_path / "capture", profile("matrix").format, profile("matrix"))
     wired = WiredSkin("matrix", rate=2.0, tap=capture)
     wired.seconds(4)
@@ -83,8 +83,8 @@ def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(tmp_path: P
 def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """Drift, spikes, lost transfers, an unplugged skin, NEW OBJECT: windows, times and scores are
-    the same when replayed."""
+    """With drift, spikes, lost transfers, an unplugged skin and NEW OBJECT, replay gives the same
+    windows, times and scores."""
     rng = np.random.default_rng(5)
     acts = list(script.tubes(1010, 8))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
@@ -120,7 +120,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
 
 
 def test_a_capture_from_before_there_were_axes(tmp_path: Path):
-    """Its sweeps get the verdicts that the box gave then."""
+    """Its sweeps get their original verdicts."""
     model = toy_bundle.load(tmp_path / "bundle")
     verdicts, sweeps = played(ONE_AXIS / "capture", model)
     then = json.loads((ONE_AXIS / "verdicts.json").read_text())
@@ -137,8 +137,8 @@ def test_a_capture_from_before_there_were_axes(tmp_path: Path):
 def test_commands_are_part_of_a_capture(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """NEW and ABORT change what comes after them, so they are captured: replayed sweeps fuse and
-    end as they did."""
+    """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
+    before."""
     simulated = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
     box = rigged(simulated, capture=capture)
@@ -161,8 +161,8 @@ def test_commands_are_part_of_a_capture(
 def test_a_capture_of_a_skin_that_sent_another_form(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """Packets of another grid in mid stream: the sweep is `sensor-lost` when it happens and when it
-    is replayed."""
+    """After packets of another grid in the stream the sweep is `sensor-lost`, live and in the
+    replay."""
     simulated = devices.build(skin.FORMAT, script.tubes(1015, 2), rig.VirtualClock(), "sim")
     count = itertools.count()
     other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
@@ -179,7 +179,7 @@ def test_a_capture_of_a_skin_that_sent_another_form(
 def test_a_capture_that_was_cut_off_plays_up_to_there(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
-    """A power cut in mid record: everything before it is played."""
+    """After a power cut within a record, all earlier records are played."""
     simulated = devices.build(skin.FORMAT, script.tubes(1011, 2), rig.VirtualClock(), "sim")
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
     box = rigged(simulated, capture=capture)
@@ -193,8 +193,8 @@ def test_a_capture_that_was_cut_off_plays_up_to_there(
 
 
 def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
-    """Under the next number; when there are too many, the start is refused and nothing is
-    overwritten."""
+    """Earlier captures get the next number. If there are too many, the start is refused and nothing
+    is overwritten."""
     path = tmp_path / "capture"
     for edges in range(3):
         capture = CaptureWriter(path, skin.FORMAT)
@@ -221,7 +221,7 @@ def test_a_restart_keeps_the_capture_before(tmp_path: Path, logged: list[str]):
     ],
 )
 def test_other_files_are_named(tmp_path: Path, content: bytes, hint: str):
-    """A file that is no capture says so."""
+    """The error says that the file is not a capture."""
     (tmp_path / "x").write_bytes(content)
     with pytest.raises(FormatError, match=hint):
         Playback(tmp_path / "x")
@@ -246,7 +246,7 @@ def test_an_unknown_record(tmp_path: Path):
 
 
 def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_path: Path):
-    """Frames, times, numbers, status: all come back; nothing is left over beside the two files."""
+    """Frames, times, numbers and status are read again, and there are only the two files."""
     simulated = devices.build(skin.FORMAT, script.tubes(1012, 1), rig.VirtualClock(), "sim")
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
@@ -308,7 +308,7 @@ def kept(n: int) -> Sweep:
 
 
 def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path: Path):
-    """The second of the two files cannot get its name: the first one goes too."""
+    """If the second of the two files cannot be renamed, the first file is removed, too."""
     (tmp_path / "sweep-000001.npy").mkdir()
     with pytest.raises(OSError, match="directory"):
         save(tmp_path / "sweep-000001.npy", kept(1), skin.FORMAT)

@@ -1,4 +1,4 @@
-"""What is still missing of a recording, in words."""
+"""The progress of a recording, in words."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from appliance.recording.progress import RecordingProgress
 
 
 def test_each_material_is_wanted_at_every_position():
-    """A position that one material has is wanted of all; a long list is cut."""
+    """All materials are wanted at each position of any material. A long list is cut."""
     progress = RecordingProgress(2)
     for material in "abcd":
         progress.add(material, "1")
@@ -29,7 +29,8 @@ def test_nothing_is_missing_at_the_target():
 
 
 def test_what_was_removed_is_missing_again():
-    """The last sweep of a pair takes the pair with it; a sweep without a material never counts."""
+    """After its last sweep was removed, a pair is no longer listed. A sweep without a material
+    never counts."""
     progress = RecordingProgress(1)
     for material in ("a", "b", "c", ""):
         progress.add(material, "1")

@@ -52,7 +52,7 @@ class Desk:
         return self.recording.commands[name](text)
 
     def sweep(self, number: int, start_ns: int = 0, status: Status = Status.RECORDED) -> list[str]:
-        """Give a sweep; the REC sentence's fields."""
+        """Record a sweep; returns the fields of the REC sentence."""
         self.recording.sweep(*judged(number, start_ns, status), {"bundle": "b"})
         return self.sentences[-1]
 
@@ -100,8 +100,8 @@ def heard(box: Rigged) -> list[list[str]]:
 def test_a_label_applies_to_sweeps_that_start_after_it(
     recorded: Callable[..., Rigged], tmp_path: Path
 ):
-    """Over the serial line, with real edges: a label that is sent during a sweep applies to the
-    next one."""
+    """On the serial line with real edges, a label that is sent during a sweep applies to the next
+    sweep."""
     first, *others = script.tubes(1, 3)
     before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
     first = rig.Act(
@@ -132,8 +132,8 @@ def test_a_label_applies_to_sweeps_that_start_after_it(
 
 
 def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: Path):
-    """Verdict, board, clock, trigger, unloaded skin and run stand beside the frames, in plain JSON;
-    of a bundle nothing."""
+    """The sidecar has verdict, readout board, clock, trigger, unloaded skin and run in plain JSON,
+    and nothing of a bundle."""
     simulated = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels("wood", "3", "monday"))
     (verdict,) = box.until(lambda: simulated.finished(box.box.answered))
@@ -158,8 +158,8 @@ def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: P
 
 
 def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_path: Path):
-    """What the box records is what `palpate-train --set DIR` reads: materials, positions, sessions,
-    windows."""
+    """`palpate-train --set DIR` reads the materials, positions, sessions and windows that the box
+    recorded."""
     files = pytest.importorskip(
         "train.data.readers", reason="the desktop's tools are not here; make test installs them"
     )
@@ -198,7 +198,7 @@ def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
 
 
 def test_the_label_at_the_start_edge_counts(tmp_path: Path):
-    """Each sweep has the labels that applied when it began, also if it is answered after a later
+    """Each sweep has the labels that applied at its start, even if it is answered after a later
     sweep."""
     desk = Desk(tmp_path, Labels())
     for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
@@ -213,7 +213,8 @@ def test_the_label_at_the_start_edge_counts(tmp_path: Path):
 
 
 def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
-    """A sweep that began before all kept changes is stored without labels, not with later ones."""
+    """A sweep that began before all kept changes is stored without labels, not with later
+    labels."""
     desk = Desk(tmp_path)
     for desk.t_ns in range(1, recording.MOST_CHANGES + 1):
         desk.do("MATERIAL", "metal")
@@ -256,8 +257,8 @@ def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
 
 
 def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
-    """Down to the first sweep of this run; those of an earlier run stay, and no number is given
-    twice, after a restart neither."""
+    """DISCARD can remove all sweeps of this run and no sweep of an earlier run. No number is used
+    twice, even after a restart."""
     before = Desk(tmp_path)
     before.sweep(1)
     before.recording.close()
@@ -281,8 +282,8 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
 
 
 def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
-    """With a number it removes the last stored sweep alone if it is this one: not one that has come
-    since then."""
+    """With a number, DISCARD removes the last stored sweep only if it has this number, and never a
+    later sweep."""
     desk = Desk(tmp_path)
     for n in (1, 2):
         desk.sweep(n)
@@ -294,7 +295,8 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
 
 
 def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):
-    """For who shows the recording: as in REC, and which sweep DISCARD would remove."""
+    """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would
+    remove."""
     desk = Desk(tmp_path, Labels("wood", "3", "a"))
     assert [desk.recording.about()[name] for name in ("last", "discard")] == [None, None]
     desk.sweep(1)
@@ -352,8 +354,8 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
 
 
 def test_a_folder_of_another_form_is_refused(tmp_path: Path):
-    """Sweeps of two forms cannot be trained on together; the folder stays as it was and can be used
-    by others."""
+    """A model cannot be trained on sweeps of two formats. The folder does not change and can be
+    used by other programs."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
@@ -410,7 +412,7 @@ def test_a_later_run_writes_nothing_over(tmp_path: Path):
 
 
 def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
-    """A second one would use the same numbers; it is refused, and the first continues."""
+    """A second program would use the same numbers, so it is refused, and the first continues."""
     first = Desk(tmp_path)
     with pytest.raises(ConfigError, match="another program keeps sweeps there"):
         Desk(tmp_path)
@@ -435,8 +437,8 @@ def test_no_room_for_the_system_stops_recording(
     detail: str,
     logged: list[str],
 ):
-    """Below the reserved space nothing is written: REC says so, one log line, a new try with each
-    sweep, one log line."""
+    """In the reserved space nothing is written: REC says so, and one line is logged. Each sweep
+    tries again, and one line is logged after a success."""
     free = [left]
     monkeypatch.setattr(
         os,
@@ -476,8 +478,8 @@ def test_a_disk_that_refuses(
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]):
-    """The disk is full after n bytes, for n across both files: failed, nothing stays, existing
-    files are complete."""
+    """If the disk is full after n bytes, for any n within both files, the sweep has failed, no part
+    of it stays, and existing files are complete."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -517,8 +519,8 @@ def test_a_folder_that_cannot_be_made(folder: str):
 def test_folders_are_on_the_disk_before_their_sweeps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Each is synced into its parent, at every start: a power failure cannot remove them all
-    later."""
+    """Each folder is synced into its parent at every start, so a power failure cannot remove the
+    sweeps later."""
     synced: list[Path] = []
     monkeypatch.setattr(recording.storage, "sync", synced.append)
     for _ in range(2):
@@ -546,7 +548,7 @@ def test_a_disk_that_is_full_costs_no_answer(
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():
-    """Floats through JSON: the same bits, also where they have no short form; and no field is left
+    """Floats keep their bits in JSON, even without a short decimal form, and no field is left
     out."""
     _, verdict = judged(1)
     again = json.loads(json.dumps(verdict.as_dict()))

@@ -1,5 +1,4 @@
-"""Sweeps that are recorded before there is a bundle: `recorded`, or what the counts alone show to
-be wrong."""
+"""Sweeps in recordings without a bundle: `recorded`, or a fault that the raw counts show."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ def played(frames: np.ndarray) -> rig.Act:
 
 
 def slide(level: int | None = None) -> np.ndarray:
-    """Three seconds on a rough tube; level: of one taxel in the middle, where it is broken."""
+    """Three seconds on a rough tube. level: of one broken taxel in the middle."""
     place = skin.placements("T-LAB", 1)[0]
     frames = skin.sweep(
         "plastic rough", place, np.random.default_rng(3), rest_s=0, slide_s=3, after_s=0
@@ -41,7 +40,7 @@ def recording(rigged: Callable[..., Rigged], *acts: rig.Act) -> Rigged:
 
 
 def test_good_sweeps_are_recorded(rigged: Callable[..., Rigged]):
-    """No label, no bundle, no class code; the robot gets RESULT VALID all the same."""
+    """The answer has no label, bundle or class code, and the robot gets RESULT VALID."""
     simulated = devices.build(skin.FORMAT, script.tubes(1, 6), rig.VirtualClock(), "sim")
     box = rigged(simulated, commands={})
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
@@ -66,7 +65,7 @@ def test_good_sweeps_are_recorded(rigged: Callable[..., Rigged]):
 def test_a_faulty_skin_is_seen(
     rigged: Callable[..., Rigged], frames: np.ndarray, status: Status, detail: str
 ):
-    """After a good sweep, from which the skin is known with and without contact."""
+    """Faults are detected after a good sweep, which shows the skin with and without contact."""
     box = recording(rigged, played(slide()), played(frames))
     first, second = box.until(lambda: box.box.answered == 2)
     assert (first.status, second.status) == (Status.RECORDED, status)
@@ -81,8 +80,8 @@ def test_what_the_window_lacks_is_answered_as_ever(rigged: Callable[..., Rigged]
 
 
 def test_contact_that_cannot_be_judged_is_said(rigged: Callable[..., Rigged]):
-    """A skin that was only ever seen lifted: recorded, and the answer says that contact was not
-    checked."""
+    """If the finger never touched the skin, sweeps are recorded, and the answer says that contact
+    was not checked."""
     off = skin.idle(8 * RATE, np.random.default_rng(1))
     box = recording(rigged, rig.Act(off, RATE, 4 * RATE, ""))
     (verdict,) = box.until(lambda: box.box.answered == 1)
@@ -102,8 +101,8 @@ def test_a_tare_makes_it_certain(rigged: Callable[..., Rigged]):
 
 
 def test_commands_that_need_a_bundle(rigged: Callable[..., Rigged]):
-    """ID says that sweeps are recorded, and what the skin sends; TEST that there is nothing to
-    test."""
+    """ID says that sweeps are recorded, and gives the skin's format. TEST says that there is
+    nothing to test."""
     box = recording(rigged, played(slide()))
     box.seconds(0.5)
     assert "ID,ok,recording,,,4x4 uint8 at 750 Hz  window 1500,palpate-sim SIM0001" in box.ask(
@@ -115,7 +114,7 @@ def test_commands_that_need_a_bundle(rigged: Callable[..., Rigged]):
 
 
 def test_another_skin_is_judged_by_itself():
-    """After a new enumeration nothing of the skin before counts."""
+    """After a new enumeration the unloaded skin is measured anew."""
     check = SweepCheck(skin.FORMAT, rig.VirtualClock())
     off, on = skin.idle(RATE, np.random.default_rng(1)), slide()
     for epoch in (0, 1):

@@ -58,7 +58,7 @@ class Bench:
 
 
 def sweep_of(drop: tuple[int, ...] = (), start: int = 500, stop: int = 2750) -> Sweep:
-    """A three-second sweep over frames of which some are missing."""
+    """A three-second sweep with some missing frames."""
     bench = Bench()
     bench.put(frames(0, 3000, drop))
     bench.edge(EdgeKind.START, start)
@@ -193,7 +193,8 @@ def one(bench: Bench, after_s: float = 0) -> Status:
 
 
 def test_short():
-    """A sweep one frame shorter than the window is refused, one of just its length is taken."""
+    """A sweep that is one frame shorter than the window is refused, a sweep of the window's length
+    is not."""
     bench = Bench()
     bench.put(frames(0, 3000))
     bench.edge(EdgeKind.START, 500)
@@ -250,7 +251,7 @@ def test_double_start():
 
 
 def test_not_ready():
-    """A start edge while the box cannot take it is answered at once; its stop edge brings no second
+    """A start edge is answered at once if the box is not ready. Its stop edge gives no second
     answer."""
     bench = Bench()
     bench.edge(EdgeKind.START, 100, ready=False)
@@ -261,8 +262,8 @@ def test_not_ready():
 
 
 def test_lost_edges():
-    """Edges dropped by the kernel end the open sweep; with none open, that something was lost is
-    still answered."""
+    """Edges dropped by the kernel end the open sweep. Without an open sweep the loss is answered,
+    too."""
     bench = Bench()
     bench.edge(EdgeKind.START, 100)
     bench.edge(EdgeKind.LOST, 200)
@@ -275,8 +276,7 @@ def test_lost_edges():
 
 @pytest.mark.parametrize("ready", [False, True])
 def test_a_start_beside_lost_edges_gets_one_answer(ready: bool):
-    """Both come in one turn, in which the trigger is blind already, or is not: the sweep that began
-    ends once."""
+    """Both come in one turn, with the trigger blind already or not: the sweep is answered once."""
     bench = Bench()
     edges = [Edge(EdgeKind.START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
     bench.recorder.trigger(edges, ready, bench.now)
@@ -295,7 +295,8 @@ def test_new_enumeration_cuts_the_sweep():
 
 
 def test_two_sweeps_in_flight_keep_their_order():
-    """A second sweep starts before the first has its frames: both are answered, in order."""
+    """A second sweep starts before the frames of the first have arrived: both are answered, in
+    order."""
     bench = Bench()
     bench.put(frames(0, 1700))
     bench.edge(EdgeKind.START, 0)
@@ -321,7 +322,7 @@ def test_objects_are_counted():
 
 
 def test_the_ring_overwrites_only_old_frames():
-    """After many turns of the ring a window is still cut correctly; one that was overwritten is a
+    """After many turns of the ring a window is still cut correctly. An overwritten window is a
     `gap`."""
     bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
@@ -334,7 +335,7 @@ def test_the_ring_overwrites_only_old_frames():
 
 
 def test_latest_is_complete_or_none():
-    """The newest frames, or None if one is missing."""
+    """The newest frames, or None if a frame is missing."""
     bench = Bench()
     assert bench.recorder.latest(10) is None
     bench.put(frames(0, 100))
@@ -344,7 +345,7 @@ def test_latest_is_complete_or_none():
 
 
 def steps_of(bench: Bench, steps: int = 9) -> list[Sweep]:
-    """The open sweep at the steps that have come."""
+    """The open sweep at the steps that were reached."""
     return list(bench.recorder.so_far(steps, bench.now))
 
 
@@ -417,7 +418,8 @@ def test_a_sweep_that_is_settled_has_had_its_answer():
 
 
 def test_a_sweep_whose_answer_is_still_to_come_goes_first():
-    """The one before waits for frames behind a gap: no step of the open one before its answer."""
+    """The previous sweep waits for frames after a gap: the open sweep has no step before the
+    previous sweep is answered."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 1700))
     bench.edge(EdgeKind.START, 0)

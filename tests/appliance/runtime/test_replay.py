@@ -148,8 +148,8 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
 
 
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
-    """Without the earlier sweeps there is no early answer: the scores are compared, and no sentence
-    is written."""
+    """Without the earlier sweeps the answer would not be early: the scores are compared, and no
+    sentence is written."""
     model = toy_bundle.load(
         tmp_path / "bundle", early=Early((0.5,) * 3, 1), outputs=("logits", "embedding", "early")
     )
@@ -333,7 +333,7 @@ def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
     ],
 )
 def test_sidecars_that_make_no_sense(tmp_path: Path, about: dict[str, object], hint: str):
-    """The error names the file; there is no traceback."""
+    """The error names the file and has no traceback."""
     model = toy_bundle.load(tmp_path / "bundle")
     save(tmp_path / "s.npy", toy_bundle.sweep(0, 0), toy_bundle.FORMAT, about)
     with pytest.raises(FormatError, match=f"s.npy: .*{hint}"):
