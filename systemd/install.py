@@ -238,6 +238,20 @@ echo {Path(release).name} > {release}/stamp
 sync -f {release}"""
 
 
+def _set_board(board: str) -> str:
+    """Write the board into the site file; all other settings stay."""
+    file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
+    new = (
+        f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; "
+        f"}} > {file}.new"
+    )
+    return (
+        f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} &&"
+        f" sync -f {file}.new && mv {file}.new {file} &&"
+        f" echo {shlex.quote(f'{line} stands in {file} now')}; fi"
+    )
+
+
 def prepare(release: str, board: str, signers: str) -> str:
     """Commands that set up users, folders, settings and links outside of the release, and print a
     line for each file that was there and for a changed board. The old release can run with them,
@@ -259,17 +273,7 @@ def prepare(release: str, board: str, signers: str) -> str:
             "exit 1; fi"
         ]
     if board:
-        file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
-        # all other settings stay
-        new = (
-            f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; "
-            f"}} > {file}.new"
-        )
-        lines += [
-            f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} && sync -f "
-            f"{file}.new &&"
-            f" mv {file}.new {file} && echo {shlex.quote(f'{line} stands in {file} now')}; fi"
-        ]
+        lines.append(_set_board(board))
     for path, target in LINKS.items():
         settings = path.startswith("/etc/palpate/")
         own = (

@@ -131,6 +131,20 @@ class ContactTracker:
         self._full = max(self._full, float(load.max()))
         return self._touched(load, centre(self._latest, self._lowest, threshold))
 
+    def _untrained(self) -> str:
+        """Why there is no trained position."""
+        if self._expected.bundle == NO_BUNDLE:
+            return (
+                "no bundle fits this skin, so there is no trained position; palpate record "
+                "needs no bundle"
+            )
+        if self._expected.threshold is None:
+            return (
+                "this bundle cannot detect contact, so it has no trained position; train a "
+                "bundle on sweeps of palpate record"
+            )
+        return "this bundle does not say where the skin sat in training; export it again"
+
     def _touched(self, load: NDArray[np.float64], found: Point | None) -> View:
         """The View of a streaming skin with this load [R, C], raw counts, and centre of contact
         (None: no contact)."""
@@ -153,20 +167,8 @@ class ContactTracker:
                 "no-contact", "nothing touches the skin", "rest the finger on the tube", **shown
             )
         if trained is None:
-            hint = "this bundle does not say where the skin sat in training; export it again"
-            if self._expected.bundle == NO_BUNDLE:
-                hint = (
-                    "no bundle fits this skin, so there is no trained position; palpate record "
-                    "needs no bundle"
-                )
-            elif self._expected.threshold is None:
-                hint = (
-                    "this bundle cannot detect contact, so it has no trained position; train a "
-                    "bundle on sweeps of palpate record"
-                )
-            return self._view(
-                "no-positions", "the contact's centre alone", hint, **shown, centre=found
-            )
+            title, hint = "the contact's centre alone", self._untrained()
+            return self._view("no-positions", title, hint, **shown, centre=found)
         offset = trained.offset(found)
         at = found[0] * trained.pitch_mm, found[1] * trained.pitch_mm
         shown |= {"centre": at, "nearest": (at[0] - offset[0], at[1] - offset[1])}

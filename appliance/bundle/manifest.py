@@ -160,18 +160,7 @@ class Manifest:
             )
         _check_age(self)
         _check_files(self.files)
-        if (self.known is not None) != (MEANS in self.files):
-            raise BundleError(
-                f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
-            )
-        if self.displacement and not (self.known and self.contact):
-            raise BundleError(
-                "manifest has `moved` without `known` and `place`; export the bundle again"
-            )
-        if self.contact and self.thresholds.contact is None:
-            raise BundleError(
-                "manifest has `place` without `thresholds.contact`; export the bundle again"
-            )
+        _check_parts(self)
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
                 f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have "
@@ -233,6 +222,22 @@ def version(text: object) -> tuple[int, ...]:
     if not isinstance(text, str) or not _VERSION.fullmatch(text):
         raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
     return tuple(map(int, text.split(".")))
+
+
+def _check_parts(manifest: Manifest) -> None:
+    """Parts that need each other are there together. Raises BundleError."""
+    if (manifest.known is not None) != (MEANS in manifest.files):
+        raise BundleError(
+            f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
+        )
+    if manifest.displacement and not (manifest.known and manifest.contact):
+        raise BundleError(
+            "manifest has `moved` without `known` and `place`; export the bundle again"
+        )
+    if manifest.contact and manifest.thresholds.contact is None:
+        raise BundleError(
+            "manifest has `place` without `thresholds.contact`; export the bundle again"
+        )
 
 
 def _check_age(m: Manifest) -> None:

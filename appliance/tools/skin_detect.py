@@ -86,6 +86,14 @@ def detect(
             yield PortFinding(port, "", str(e))
 
 
+def _another_grid(port: PortInfo, name: str, taxels: int) -> str:
+    return (
+        f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x columns,"
+        f' skin.profile = "{name}", skin.port = "{port.path}"; if it is another skin, describe it'
+        " with `palpate skin new`"
+    )
+
+
 def _on_port(
     port: PortInfo,
     profiles: Mapping[str, SkinProfile],
@@ -115,16 +123,7 @@ def _on_port(
                 return
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
-            grid = (
-                f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x"
-                " columns"
-            )
-            own = "if it is another skin, describe it with `palpate skin new`"
-            yield PortFinding(
-                port,
-                name,
-                f'{known}{grid}, skin.profile = "{name}", skin.port = "{port.path}"; {own}',
-            )
+            yield PortFinding(port, name, known + _another_grid(port, name, taxels))
             return
     if write and (who := _asked(port.path, open_port, clock)):
         yield PortFinding(
