@@ -130,7 +130,8 @@ def _add_stress(add: Add) -> None:
         "--method",
         default=STRESSED_METHODS,
         metavar="NAME[,NAME...]",
-        help=f"ours first; the first five are drawn; or all; see palpate-train methods ({STRESSED_METHODS})",
+        help="ours first; the first five are drawn; or all; "
+        f"see palpate-train methods ({STRESSED_METHODS})",
     )
     command.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
