@@ -77,24 +77,17 @@ def _add_fit(add: Add) -> None:
     command.add_argument(
         "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
     )
+    _add_augmentation(command)
+    _add_model(command)
+
+
+def _add_model(command: argparse.ArgumentParser) -> None:
+    """Options for the kind of model and its training."""
     command.add_argument(
         "--steps",
         type=numbers.whole("--steps", 0),
         default=STEPS,
         help=f"training steps of the stages (default {STEPS}; 0 for none)",
-    )
-    command.add_argument(
-        "--row-shift",
-        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
-        metavar="SHARE",
-        dest="displaced",
-        help="share of training sweeps with a displacement of up to a row (default 0.5)",
-    )
-    command.add_argument(
-        "--stretch",
-        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
-        metavar="SHARE",
-        help="change the speed of training sweeps by up to this share (default 0)",
     )
     command.add_argument(
         "--mains",
@@ -103,16 +96,8 @@ def _add_fit(add: Add) -> None:
         default=int(MAINS_HZ),
         metavar="HZ",
         help=(
-            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}: its hum "
-            f"is not heard (default {MAINS_HZ:g})"
-        ),
-    )
-    command.add_argument(
-        "--reattached",
-        action="store_true",
-        help=(
-            "the skin will be taken off and put back after the recordings: train all heads on "
-            "augmented copies of that, too"
+            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}; the "
+            f"features ignore its hum (default {MAINS_HZ:g})"
         ),
     )
     command.add_argument(
@@ -128,6 +113,31 @@ def _add_fit(add: Add) -> None:
         "--keep-means",
         action="store_true",
         help="also give the head the mean of each taxel, for comparison",
+    )
+
+
+def _add_augmentation(command: argparse.ArgumentParser) -> None:
+    """Options for augmented copies of the training sweeps."""
+    command.add_argument(
+        "--row-shift",
+        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
+        metavar="SHARE",
+        dest="displaced",
+        help="share of training sweeps with a displacement of up to a row (default 0.5)",
+    )
+    command.add_argument(
+        "--stretch",
+        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
+        metavar="SHARE",
+        help="change the speed of training sweeps by up to this share (default 0)",
+    )
+    command.add_argument(
+        "--reattached",
+        action="store_true",
+        help=(
+            "the skin will be taken off and put back after the recordings: train all heads on "
+            "augmented copies of that, too"
+        ),
     )
 
 
@@ -205,6 +215,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
 
     Raises FormatError if options contradict each other.
     """
+    _check(args)
     changes = {
         name: share
         for name in ("displaced", "stretch")
@@ -216,16 +227,6 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     )
     unfinished = _unfinished(args, sweeps, augmentation)
     if args.size in ARCHITECTURES:
-        if args.reattached:
-            raise FormatError(
-                f"--reattached is for the default recipe; --size {args.size} sees such "
-                "copies anyway, leave it out"
-            )
-        if args.steps < LEAST_STEPS:
-            raise FormatError(
-                f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with "
-                f"--size {args.size}"
-            )
         from train.models.recipe import stages  # here: the default recipe needs no PyTorch
 
         trained = stages.FitRecipe(
@@ -234,11 +235,6 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
         return stages.fit_network(
             sweeps, args.seed, trained, options.Log(), architecture, unfinished
         ), unfinished
-    if args.keep_means:
-        raise FormatError(
-            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default "
-            "recipe removes means"
-        )
     settings = recipe.Settings(
         args.steps,
         augmentation,
@@ -249,6 +245,26 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
     made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
     return made, unfinished
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raises FormatError if options contradict each other."""
+    network = args.size in ARCHITECTURES
+    if network and args.reattached:
+        raise FormatError(
+            f"--reattached is for the default recipe; --size {args.size} sees such "
+            "copies anyway, leave it out"
+        )
+    if network and args.steps < LEAST_STEPS:
+        raise FormatError(
+            f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with "
+            f"--size {args.size}"
+        )
+    if args.keep_means and not network:
+        raise FormatError(
+            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default "
+            "recipe removes means"
+        )
 
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:

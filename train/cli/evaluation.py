@@ -34,6 +34,14 @@ def register(add: Add) -> None:
         help="the methods that --method takes, and nothing else",
     )
     options.add_set(command)
+    _add_grid(command)
+    command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
+    options.add_effort(command)
+    options.add_where(command)
+
+
+def _add_grid(command: argparse.ArgumentParser) -> None:
+    """Options for the protocols, methods and seeds."""
     command.add_argument(
         "--protocol",
         action="append",
@@ -68,9 +76,6 @@ def register(add: Add) -> None:
             "curve (all)"
         ),
     )
-    command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
-    options.add_effort(command)
-    options.add_where(command)
 
 
 def method_lines() -> Iterator[str]:

@@ -15,6 +15,11 @@ from train.reports import sweep_pages, sweep_plot
 
 def register(add: Add) -> None:
     """sets and pull."""
+    _add_sets(add)
+    _add_pull(add)
+
+
+def _add_sets(add: Add) -> None:
     known = add("sets", run_known)
     commands = known.add_subparsers(metavar="COMMAND")
     describe = commands.add_parser(
@@ -40,25 +45,28 @@ def register(add: Add) -> None:
         help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
     )
     view.set_defaults(run=run_view)
-    pull_command = add("pull", run_pull)
-    pull_command.set_defaults(resumes=True)
-    pull_command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
-    pull_command.add_argument(
+
+
+def _add_pull(add: Add) -> None:
+    command = add("pull", run_pull)
+    command.set_defaults(resumes=True)
+    command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
+    command.add_argument(
         "--from",
         default=pull.FOLDER,
         metavar="DIR",
         dest="folder",
         help=f"on the box ({pull.FOLDER})",
     )
-    pull_command.add_argument(
+    command.add_argument(
         "--out",
         type=Path,
         required=True,
         metavar="DIR",
         help="here; its folders are those of the box",
     )
-    pull_command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
-    pull_command.add_argument(
+    command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
+    command.add_argument(
         "--ssh-option",
         action="append",
         default=[],

@@ -60,7 +60,7 @@ def _on_cluster(
 ) -> Iterator[tuple[Task, Result]]:
     try:
         # not through joblib: its Dask backend waits for ever if a task cannot run any more
-        from distributed import Client, KilledWorker, wait
+        from distributed import Client, KilledWorker
     except ImportError as e:
         raise FormatError(
             "--scheduler needs dask; install it with pip install 'palpate-train[dask]'"
@@ -75,16 +75,10 @@ def _on_cluster(
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
             everywhere = client.scatter(list(shared), broadcast=True) if shared else ()
-            left = {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks}
-            while left:
-                with suppress(
-                    TimeoutError
-                ):  # from time to time, to see below whether a worker is alive
-                    done = wait(left, timeout=CONNECT_S, return_when="FIRST_COMPLETED").done  # type: ignore[no-untyped-call]
-                    yield from (future.result() for future in done)
-                    left -= done
-                if left and not client.nthreads():
-                    raise TimeoutError
+            yield from _finished(
+                client,
+                {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks},
+            )
         except TimeoutError as e:
             start = f"dask worker {scheduler}"
             raise FormatError(
@@ -101,3 +95,22 @@ def _on_cluster(
             raise FormatError(
                 f"the workers at {scheduler!r} died too often ({e}); see their logs and memory"
             ) from e
+
+
+def _finished(client: Any, left: set[Any]) -> Iterator[Any]:
+    """The results of the futures `left` as they finish. Raises TimeoutError if no worker is left.
+
+    Nothing else may refer to the futures: a finished one that is not released runs again if its
+    worker dies.
+    """
+    from distributed import wait
+
+    while left:
+        with suppress(TimeoutError):  # wait in turns, so that a cluster without workers is noticed
+            done = wait(  # type: ignore[no-untyped-call]
+                left, timeout=CONNECT_S, return_when="FIRST_COMPLETED"
+            ).done
+            yield from (future.result() for future in done)
+            left -= done
+        if left and not client.nthreads():
+            raise TimeoutError

@@ -98,28 +98,12 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
             name: np.concatenate([score(case, done) for case, done in held])
             for name, score in SCORES.items()
         }
-        ours = scores["distance"]
-        low, high = bootstrap(partial(_auroc_of, ours, known), places)
-        at = np.quantile(ours[known], 0.95)
-        materials_of[materials[k]] = {
-            "auroc": round(auroc(ours[known], ours[~known]), 4),
-            "low": low,
-            "high": high,
-            "kept": round(float(np.mean(ours[known] <= 1)), 4),
-            "false_known": round(float(np.mean(ours[~known] <= 1)), 4),
-            "false_known_at_95": round(float(np.mean(ours[~known] <= at)), 4),
-            "known": int(known.sum()),
-            "unknown": int((~known).sum()),
-        }
-        labels = joined(held, "labels")
-        passed.append(
-            np.array(
-                [
-                    [_passed(ours, known, places, labels, factor, n) for n in (1, 2)]
-                    for factor in LIMITS
-                ]
-            )
-        )
+        ours, labels = scores["distance"], joined(held, "labels")
+        materials_of[materials[k]] = _detection(ours, known, places)
+        twice = [
+            [_passed(ours, known, places, labels, factor, n) for n in (1, 2)] for factor in LIMITS
+        ]
+        passed.append(np.array(twice))
         for name, row in scores.items():
             every.setdefault(name, []).append(auroc(row[known], row[~known]))
     mean = {
@@ -140,6 +124,22 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
         )
     ]
     return {"materials": materials_of, "mean": mean, "scores": means, "limits": limits}
+
+
+def _detection(scores: Array, known: Array, places: Array) -> Json:
+    """Figures of one material by its `scores` in units of the limit [n]. known: bool [n]."""
+    low, high = bootstrap(partial(_auroc_of, scores, known), places)
+    at = np.quantile(scores[known], 0.95)
+    return {
+        "auroc": round(auroc(scores[known], scores[~known]), 4),
+        "low": low,
+        "high": high,
+        "kept": round(float(np.mean(scores[known] <= 1)), 4),
+        "false_known": round(float(np.mean(scores[~known] <= 1)), 4),
+        "false_known_at_95": round(float(np.mean(scores[~known] <= at)), 4),
+        "known": int(known.sum()),
+        "unknown": int((~known).sum()),
+    }
 
 
 def _passed(

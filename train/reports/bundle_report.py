@@ -69,15 +69,7 @@ def page(figures: Json, sweeps: Dataset) -> str:
         materials=[_material(row) for row in figures["materials"]],
         corruption_head=CORRUPTIONS,
         corruptions=[_corruption(row) for row in figures["corruptions"]],
-        foreign=[
-            [
-                name,
-                sum(given.values()),
-                given.get("(unknown)", 0),
-                sum(n for answer, n in given.items() if answer[0] != "("),
-            ]
-            for name, given in figures["not_in_the_bundle"].items()
-        ],
+        foreign=[_foreign(*item) for item in figures["not_in_the_bundle"].items()],
         left_out_head=LEFT_OUT,
         left_out=_left_out(figures.get("left_out")),
         held_out=[
@@ -131,6 +123,12 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
         "time of a sweep, memory, disk",
         f"{cost['ms']:.2f} ms, {cost['mib']:.0f} MiB, {cost['kb']:.0f} kB",
     ]
+
+
+def _foreign(name: str, given: Mapping[str, int]) -> list[Any]:
+    """A row for a material that the bundle lacks: sweeps, and those `unknown` and with a label."""
+    named = sum(n for answer, n in given.items() if answer[0] != "(")
+    return [name, sum(given.values()), given.get("(unknown)", 0), named]
 
 
 def _left_out(found: Json | None) -> list[list[str]]:

@@ -302,9 +302,8 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
     high, wide = (top - bottom) / rows, (RIGHT - LEFT) / columns
     shown = taxels if sweep.tare is None else np.append(taxels, sweep.tare)
     low, up = shown.min(), shown.max()
-    head = (
-        NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))
-    )  # share of a plot that is free for its taxel's number
+    # share of a plot that is free for its taxel's number
+    head = NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))
     margins = max(up - low, 1) * np.array([0.08, 1.08 * head / (1 - head)])
     times, counts = round_ticks(sweep.time_s[0], sweep.time_s[-1], 4), round_ticks(low, up, 3)
     for row, column in np.ndindex(rows, columns):
@@ -312,31 +311,25 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
         axes = add_axes(figure, left, left + 0.94 * wide, above, above - 0.88 * high)
         sweep.span(axes)
         axes.set_ylim(low - margins[0], up + margins[1])
-        for k in range(sweep.format.axes):
-            if tare is not None:
-                axes.axhline(float(tare[row, column, k]), color=GREY, linewidth=0.8)
-            normal, line = (
-                k == sweep.format.axes - 1,
-                _thinned(sweep.time_s, lines[:, row, column, k]),
-            )
-            axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
-        axes.grid(color=FAINT, linewidth=0.6)
-        write(
-            axes,
-            1,
-            1 - head / 2,
-            f"{row + 1},{column + 1}",
-            GREY,
-            SMALL - 1,
-            ha="right",
-            xycoords="axes fraction",
-        )
+        _taxel(axes, sweep, lines[:, row, column], None if tare is None else tare[row, column])
+        place = {"ha": "right", "xycoords": "axes fraction"}
+        write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, **place)
         lowest, leftmost = row == rows - 1, column == 0
         for axis, ticks, outer in ((axes.xaxis, times, lowest), (axes.yaxis, counts, leftmost)):
             set_ticks(axis, ticks, bare=not outer)
         axes.set_xlabel("s" if lowest else "", color=GREY, size=SMALL, labelpad=1)
         axes.set_ylabel("counts" if leftmost else "", color=GREY, size=SMALL)
     return f"; {sweep.format.axes} axes, the normal one dark" if sweep.format.axes > 1 else ""
+
+
+def _taxel(axes: Axes, sweep: ShownSweep, counts: Array, tare: Array | None) -> None:
+    """Draw the lines of one taxel over the grid. counts: [T, A]; tare: [A]."""
+    for k in range(sweep.format.axes):
+        if tare is not None:
+            axes.axhline(float(tare[k]), color=GREY, linewidth=0.8)
+        normal, line = k == sweep.format.axes - 1, _thinned(sweep.time_s, counts[:, k])
+        axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
+    axes.grid(color=FAINT, linewidth=0.6)
 
 
 def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:

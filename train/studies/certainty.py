@@ -208,17 +208,6 @@ def early(full: Sequence[Trained]) -> Json:
         }
         for r in (done.rule for _, done in full)
     ]
-    curves = {}
-    for agree in (1, 2, 3):
-        met = [decide(p, _same(level, agree, steps)) for level in LEVELS]
-        curves[str(agree)] = [
-            {
-                "least": level,
-                "share": round(float(s.mean()), 4),
-                "accuracy": round(float(np.mean(k == labels)), 4),
-            }
-            for level, (k, s) in zip(LEVELS, met, strict=True)
-        ]
     return {
         "n": len(labels),
         "share": round(float(share.mean()), 4),
@@ -229,8 +218,21 @@ def early(full: Sequence[Trained]) -> Json:
         "whole": _accuracy(whole, places),
         "rules": rules,
         "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)],
-        "curves": curves,
+        "curves": {str(agree): _levels(p, labels, agree) for agree in (1, 2, 3)},
     }
+
+
+def _levels(p: Array, labels: Array, agree: int) -> list[Json]:
+    """Share of the sweep and accuracy for each of LEVELS by rules with `agree` steps."""
+    met = [decide(p, _same(level, agree, p.shape[1])) for level in LEVELS]
+    return [
+        {
+            "least": level,
+            "share": round(float(s.mean()), 4),
+            "accuracy": round(float(np.mean(k == labels)), 4),
+        }
+        for level, (k, s) in zip(LEVELS, met, strict=True)
+    ]
 
 
 def enrolment(
