@@ -1,8 +1,8 @@
 """A finished model: a trunk, its heads, its calibration, the contact positions, and the sweeps that
 all of it was fitted to.
 
-`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is needed for
-`network` alone.
+`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is not needed:
+stages.network_of gives the network of a fit.
 """
 
 from __future__ import annotations
