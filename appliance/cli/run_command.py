@@ -109,7 +109,7 @@ def _shadow(
             current,
             Path(settings.store.folder) / "shadow",
             devices.clock,
-            lambda judged: assembly.classifier(settings, judged, devices.clock),
+            lambda bundle: assembly.classifier(settings, bundle, devices.clock),
         )
     except (
         ApplianceError,

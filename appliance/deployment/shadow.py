@@ -150,8 +150,8 @@ class Shadow(Observer):
     and counts the agreement.
 
     current: the bundle in service. folder: for agreement and kept sweeps; files of another pair of
-    bundles are removed. judge: makes a bundle's classifier from the settings. Raises ApplianceError
-    if the candidate or the folder cannot be used.
+    bundles are removed. classifier: makes a bundle's classifier from the settings. Raises
+    ApplianceError if the candidate or the folder cannot be used.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Shadow(Observer):
         current: Bundle,
         folder: Path,
         clock: Clock,
-        judge: Callable[[Bundle], Classifier],
+        classifier: Callable[[Bundle], Classifier],
     ) -> None:
         if candidate.format != current.format:
             raise BundleError(
@@ -187,7 +187,7 @@ class Shadow(Observer):
                 f"{folder}: {e.strerror}; see that it has room and may be written"
             ) from e
         try:  # the model may kill the program here, so the start was counted before
-            self._classifier = judge(candidate)
+            self._classifier = classifier(candidate)
             self._classifier.self_test()
             self._early = EarlyExit(self._classifier) if candidate.manifest.early else None
         except ApplianceError:
@@ -205,7 +205,7 @@ class Shadow(Observer):
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:
-            other = self._judge(sweep)
+            other = self._verdict(sweep)
         except Exception as e:  # the classes of onnxruntime have no other base in common
             self._fail(str(e).strip()[:200])
             return
@@ -263,7 +263,7 @@ class Shadow(Observer):
         storage.put(self._sweeps.folder / FILE, found.json())
         return found
 
-    def _judge(self, sweep: Sweep) -> Verdict | None:
+    def _verdict(self, sweep: Sweep) -> Verdict | None:
         """The candidate's verdict; None if it needs more of the sweep."""
         if sweep.share == 1:
             return self._classifier(sweep)

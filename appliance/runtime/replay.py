@@ -50,13 +50,13 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
     unreadable file, another format or another bundle.
     """
     if path.is_dir():
-        return _folder(path, Judge(settings, bundle), out)
+        return _folder(path, SweepReplay(settings, bundle), out)
     if path.suffix != ".npy":
         _capture(path, settings, bundle)
         return 0
-    judge = Judge(settings, bundle)
-    *_, judged = [judge(kept) for kept in _with_earlier(path)]
-    return int(_print(path, judged, out) == DIFFERENT)
+    classify = SweepReplay(settings, bundle)
+    *_, last = [classify(kept) for kept in _with_earlier(path)]
+    return int(_print(path, last, out) == DIFFERENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,7 @@ class ReplayClock:
         """Return at once; a replay does not wait."""
 
 
-class Judge:
+class SweepReplay:
     """Classifies kept sweeps again, in their order, and fuses the sweeps of each object."""
 
     def __init__(self, settings: Config, bundle: Bundle) -> None:
@@ -168,7 +168,7 @@ class Judge:
         sweep of another bundle or format."""
         if kept.bundle not in ("", self._bundle.id):
             raise OtherBundle(
-                f"sweep {kept.sweep.id} was judged by bundle {kept.bundle}, this is "
+                f"sweep {kept.sweep.id} was classified by bundle {kept.bundle}, this is "
                 f"{self._bundle.id}; name the sweep's bundle with --set classifier.bundle=DIR"
             )
         _check(f"sweep {kept.sweep.id}", kept.format, self._bundle)
@@ -217,14 +217,14 @@ def _change(name: str, was: object, now: object) -> str:
     return f"other {name}" if isinstance(was, list) else f"{name} {was!r} is now {now!r}"
 
 
-def _print(path: Path, judged: ReplayResult, out: Callable[[str], object]) -> str:
-    if judged.verdict:
-        out(result(judged.verdict, "replay").decode("ascii"))
-    out(f"{path.name}: {judged.outcome}{judged.detail and f' ({judged.detail})'}\n")
-    return judged.outcome
+def _print(path: Path, found: ReplayResult, out: Callable[[str], object]) -> str:
+    if found.verdict:
+        out(result(found.verdict, "replay").decode("ascii"))
+    out(f"{path.name}: {found.outcome}{found.detail and f' ({found.detail})'}\n")
+    return found.outcome
 
 
-def _folder(folder: Path, judge: Judge, out: Callable[[str], object]) -> int:
+def _folder(folder: Path, classify: SweepReplay, out: Callable[[str], object]) -> int:
     """Replay all kept sweeps in `folder` and below. A sweep of another bundle is listed, but does
     not count as a difference."""
     outcomes: Counter[str] = Counter()
@@ -236,10 +236,10 @@ def _folder(folder: Path, judge: Judge, out: Callable[[str], object]) -> int:
         )
     for path in paths:
         try:
-            judged = judge(KeptSweep.read(path))
+            found = classify(KeptSweep.read(path))
         except FormatError as e:  # the others may be readable
-            judged = ReplayResult(None, OTHER if isinstance(e, OtherBundle) else BROKEN, str(e))
-        outcomes[_print(path, judged, out)] += 1
+            found = ReplayResult(None, OTHER if isinstance(e, OtherBundle) else BROKEN, str(e))
+        outcomes[_print(path, found, out)] += 1
     out(f"{len(paths)} sweeps: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.items())}\n")
     return int(bool(outcomes.keys() & {DIFFERENT, BROKEN}) or outcomes[OTHER] == len(paths))
 

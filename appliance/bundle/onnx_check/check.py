@@ -59,7 +59,7 @@ TOUCH = 8
 operators."""
 MOST_LETTERS = 400
 """Longest error text in a message; its names and lists come from the file."""
-Form = Sequence[int | None]
+ShapePattern = Sequence[int | None]
 """A shape; None means any number."""
 CONSTANTS = ("float32", "uint8", "int8", "int16", "int32", "int64")
 """Types of constants. Values of other types only come from the sweep or from a comparison."""
@@ -156,13 +156,13 @@ def _takes(graph: Message, manifest: Manifest, features: int | None) -> None:
     need(len(graph.input) == 1, f"it has {len(graph.input)} inputs instead of one")
     kind, shape = _declared(graph.input[0])
     f = manifest.format
-    want, form = (
+    want, pattern = (
         (f.dtype, (1, f.window, *f.shape))
         if manifest.input == "raw"
         else ("float32", (1, features))
     )
-    fits = kind == want and _fits(shape, form)
-    need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(form)}")
+    fits = kind == want and _fits(shape, pattern)
+    need(fits, f"it takes {kind} {list(shape)}, the manifest has {want} {list(pattern)}")
 
 
 def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
@@ -191,9 +191,9 @@ def _followed(graph: Message, size: int) -> tuple[dict[str, Value], _Cost]:
     return known, cost
 
 
-def _fits(shape: Shape, form: Form) -> bool:
-    return len(shape) == len(form) and all(
-        want in (None, n) for n, want in zip(shape, form, strict=True)
+def _fits(shape: Shape, pattern: ShapePattern) -> bool:
+    return len(shape) == len(pattern) and all(
+        want in (None, n) for n, want in zip(shape, pattern, strict=True)
     )
 
 
@@ -343,7 +343,7 @@ def _gives(
     allowed and has the right shape."""
     early, labels = manifest.early, len(manifest.labels)
     trained = labels - enrolled
-    forms: dict[str, Form] = {
+    patterns: dict[str, ShapePattern] = {
         "logits": (1, trained),
         "early": (1, len(early.least) if early else None, trained),
         "embedding": (1, rank),
@@ -351,14 +351,14 @@ def _gives(
     needed = (
         {"logits"} | ({"early"} if early else set()) | ({"embedding"} if manifest.known else set())
     )
-    asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(forms)}"
+    asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(patterns)}"
     need(
-        len(names) == len(set(names)) and needed <= set(names) <= forms.keys(),
+        len(names) == len(set(names)) and needed <= set(names) <= patterns.keys(),
         f"it gives {names[:9]}; {asked}",
     )
     for name in names:
         need(name in known, f"no node gives the output {name!r}")
-        have, axes = known[name], len(forms[name])
+        have, axes = known[name], len(patterns[name])
         need(
             have.kind == "float32"
             and have.depends_on_sweep
@@ -374,5 +374,5 @@ def _gives(
         f"it tells {classes} materials apart, the manifest has {labels} labels{new}",
     )
     for name in names:
-        shape, form = known[name].shape, forms[name]
-        need(_fits(shape, form), f"{name} is {list(shape)} instead of {list(form)}")
+        shape, pattern = known[name].shape, patterns[name]
+        need(_fits(shape, pattern), f"{name} is {list(shape)} instead of {list(pattern)}")

@@ -219,7 +219,7 @@ def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bun
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(
         FormatError,
-        match=f"judged by bundle {default_bundle.id}, this is 0badcafe; .*classifier.bundle=DIR",
+        match=f"classified by bundle {default_bundle.id}, this is 0badcafe; .*classifier.bundle=DIR",
     ):
         played(folder / "sweep-000001.npy", other)
     code, sentences, outcomes = played(folder, other)
@@ -228,7 +228,7 @@ def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bun
     code, _, outcomes = played(folder, default_bundle)
     assert code == 0
     assert (
-        "sweep-000030.npy: of another bundle (sweep 30 was judged by bundle 0badcafe"
+        "sweep-000030.npy: of another bundle (sweep 30 was classified by bundle 0badcafe"
         in outcomes[-2]
     )
     assert outcomes[-1] == "30 sweeps: 29 the same, 1 of another bundle"
