@@ -132,7 +132,7 @@ class ContactTracker:
         return self._touched(load, centre(self._latest, self._lowest, threshold))
 
     def _untrained(self) -> str:
-        """Why there is no trained position."""
+        """The reason for a missing trained position, for a person."""
         if self._expected.bundle == NO_BUNDLE:
             return (
                 "no bundle fits this skin, so there is no trained position; palpate record "

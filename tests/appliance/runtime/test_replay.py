@@ -219,7 +219,8 @@ def test_another_bundle_is_named(in_service, tmp_path: Path, default_bundle: bun
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(
         FormatError,
-        match=f"classified by bundle {default_bundle.id}, this is 0badcafe; .*classifier.bundle=DIR",
+        match=f"classified by bundle {default_bundle.id}, this is 0badcafe; .*--set "
+        "classifier.bundle=DIR",
     ):
         played(folder / "sweep-000001.npy", other)
     code, sentences, outcomes = played(folder, other)
