@@ -99,7 +99,7 @@ $(FLEET): $(RUNTIME)
 
 # The same with training and export.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml
-	$(INSTALL) -e '.[page]' -e train
+	$(INSTALL) -e train
 	@touch $@
 
 # The same with tests, studies, and the tools that check the code.
