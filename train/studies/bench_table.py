@@ -44,10 +44,22 @@ def _caption(figures: Json) -> str:
 
 def _rows(figures: Json) -> Iterator[tuple[str, str]]:
     """Name and value of each measured figure."""
-    accuracy, inference, memory = figures["accuracy"], figures["inference_ms"], figures["rss_mb"]
+    yield from _answer_rows(figures)
+    inference = figures["inference_ms"]
+    yield "inference of the packaged bundle (int8)", _times(inference["int8"])
+    yield "for comparison, inference of its network alone in float32", _times(inference["fp32"])
+    yield (
+        "for comparison, inference of the paper's network (CNN) in int8",
+        _times(inference["paper_int8"]),
+    )
+    yield from _resource_rows(figures)
+
+
+def _answer_rows(figures: Json) -> Iterator[tuple[str, str]]:
+    """Accuracy and time of the answers."""
+    accuracy = figures["accuracy"]
     right, n = accuracy["right"], accuracy["total"]
     low, high = (100 * value for value in accuracy["interval"])
-    growth = round(memory["growth_next_900"], 1) + 0.0  # 0 has no sign
     yield (
         f"simulated sweeps named rightly (not the skin's accuracy), n = {n}, with 95 % interval; "
         "`unknown` counts as wrong",
@@ -63,12 +75,12 @@ def _rows(figures: Json) -> Iterator[tuple[str, str]]:
         "USB packet)",
         _times(figures["edge_seen_ms"]),
     )
-    yield "inference of the packaged bundle (int8)", _times(inference["int8"])
-    yield "for comparison, inference of its network alone in float32", _times(inference["fp32"])
-    yield (
-        "for comparison, inference of the paper's network (CNN) in int8",
-        _times(inference["paper_int8"]),
-    )
+
+
+def _resource_rows(figures: Json) -> Iterator[tuple[str, str]]:
+    """Memory, processor time, start and size."""
+    memory = figures["rss_mb"]
+    growth = round(memory["growth_next_900"], 1) + 0.0  # 0 has no sign
     yield (
         "resident memory after 1,000 sweeps, with the simulated readout board in it",
         f"{memory['after_1000']:.1f} MiB; {growth:+.1f} MiB in the next 900",

@@ -62,16 +62,7 @@ def html(
         key: axis for key, axis in COSTS.items() if any(dot.get(key) is not None for dot in dots)
     }
     chosen, of = subject(dots), networks(dots)
-    named = [
-        dict(dot)
-        | {
-            "name": name(dot),
-            "label": label(dot),
-            "network": network,
-            "chosen": chosen in _methods(dots, of, network),
-        }
-        for dot, network in zip(dots, of, strict=True)
-    ]
+    named = _named(dots, of, chosen)
     data = json.dumps(
         {"dots": named, "costs": _plain(costs), "accuracies": _plain(there)}, allow_nan=False
     )
@@ -96,16 +87,36 @@ def html(
         rows=rows,
         source=source,
         sheet=_sheet(dots, there, costs),
-        origin={
-            key: " and ".join(sorted({str(dot[key]) for dot in dots}))
-            for key in ("commit", "machine", "set")
-        },
+        origin=_origin(dots),
         seeds=", ".join(map(str, sorted({seed for dot in dots for seed in dot["seeds"]}))),
         left_out=left_out or {},
         box_on_hard=box_on_hard,
         data=Markup(data.replace("<", "\\u003c")),  # no name of a model can end the script
         script=Markup(SCRIPT.read_text()),
     )
+
+
+def _named(dots: Sequence[Dot], of: Sequence[int], chosen: str) -> list[dict[str, Any]]:
+    """The dots for the page's script, with names. of: the network of each, as `networks` numbers
+    them."""
+    return [
+        dict(dot)
+        | {
+            "name": name(dot),
+            "label": label(dot),
+            "network": network,
+            "chosen": chosen in _methods(dots, of, network),
+        }
+        for dot, network in zip(dots, of, strict=True)
+    ]
+
+
+def _origin(dots: Sequence[Dot]) -> dict[str, str]:
+    """The commits, machines and sets of all dots."""
+    return {
+        key: " and ".join(sorted({str(dot[key]) for dot in dots}))
+        for key in ("commit", "machine", "set")
+    }
 
 
 def _plain(axes: Mapping[str, ChartAxis]) -> dict[str, dict[str, Any]]:

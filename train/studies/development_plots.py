@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from train.reports.plot_style import (
@@ -52,21 +53,14 @@ def lines(
         axes.plot(row[ours]["mean"], y, "o", color=ACCENT, markersize=6, clip_on=False)
         if best:
             axes.plot(there[best], y, "o", color=BLACK, markersize=4, clip_on=False)
-        for up, text, shade in (
-            (6, plain_case(case), BLACK),
-            (-6, plain_name(best) if best else "no peer", GREY),
-        ):
-            axes.annotate(
-                text,
-                (0, y),
-                (-6, up),
-                ("axes fraction", "data"),
-                textcoords="offset points",
-                ha="right",
-                va="center",
-                color=shade,
-                size=SMALL,
-            )
+        beside: dict[str, Any] = {
+            "ha": "right",
+            "va": "center",
+            "xycoords": ("axes fraction", "data"),
+        }
+        _text(axes, plain_case(case), (0, y), (-6, 6), BLACK, **beside)
+        peer = plain_name(best) if best else "no peer"
+        _text(axes, peer, (0, y), (-6, -6), GREY, **beside)
         lows += [row[ours]["low"], chance, *there.values()]
     axes.set_ylim(len(cases) - 0.5, -0.5)
     accuracy_axis.stretch(axes, "x", lows, FEW)
@@ -80,16 +74,22 @@ def lines(
         (8, 0.35, "| guessing", GREY),
     )
     for up, x, text, shade in legend:
-        axes.annotate(
-            text,
-            (x, 1),
-            (0, up),
-            "axes fraction",
-            textcoords="offset points",
-            color=shade,
-            size=SMALL,
-        )
+        _text(axes, text, (x, 1), (0, up), shade)
     return to_svg(figure, f"accuracy of {plain_name(ours)} and its peers on each development set")
+
+
+def _text(
+    axes: Axes,
+    text: str,
+    at: tuple[float, float],
+    offset: tuple[float, float],
+    shade: str,
+    **style: Any,
+) -> None:
+    """Write `text` at a point in shares of the axes, moved by `offset` in points."""
+    look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    look |= {"size": SMALL} | style
+    axes.annotate(text, at, offset, color=shade, **look)
 
 
 def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> str:
@@ -125,20 +125,9 @@ def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> st
             va="bottom",
         )
         axes.yaxis.set_label_coords(-0.11, 1.19)
-        for x, text, shade in (
-            (-0.11, f"━ {plain_name(ours)}", ACCENT),
-            (0.3, f"╍ {plain_name(peer)}" if peer else "", BLACK),
-            (0.72, "thin: other peers", GREY),
-        ):
-            axes.annotate(
-                text,
-                (x, 1),
-                (0, 9),
-                "axes fraction",
-                textcoords="offset points",
-                color=shade,
-                size=SMALL,
-            )
+        _text(axes, f"━ {plain_name(ours)}", (-0.11, 1), (0, 9), ACCENT)
+        _text(axes, f"╍ {plain_name(peer)}" if peer else "", (0.3, 1), (0, 9), BLACK)
+        _text(axes, "thin: other peers", (0.72, 1), (0, 9), GREY)
         axes.grid(axis="y", color=FAINT, linewidth=0.6)
         axes.set_xlim(-0.1, len(EACH) + 0.1)
         accuracy_axis.stretch(

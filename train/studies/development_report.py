@@ -58,7 +58,6 @@ def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
 
     Raises FormatError without a result of a method of ours.
     """
-    quick: bool = figures.get("quick", False)
     table = by_case(figures["results"])
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
@@ -67,20 +66,8 @@ def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
     of = {case["case"]: case for case in cases}
     means = _means(table, cases, ours, names, peers)
     main = means[REAL]
-    times = figures.get("times") or {"entries": [], "left_out": {}}
-    pages, pictures = {}, {}
-    if dots := development_chart.dots(times["entries"], table, cases, main["shared"]):
-        axes = development_chart.axes(cases, main["shared"])
-        pictures["front"] = scatter.chart(dots, list(axes)[:1], accuracies=axes)
-        pages["chart"] = chart_page.html(
-            _with_origin(dots, figures),
-            pictures["front"],
-            quick,
-            times["left_out"],
-            accuracies=axes,
-            source="development.json",
-            header=provenance.of(figures),
-        )
+    times = _times(figures)
+    pages, pictures = _timed(figures, table, cases, main["shared"])
     pictures["accuracy"] = development_plots.lines(cases, table, ours, peers)
     curves = learning_curves(figures["results"])
     if curves:
@@ -91,7 +78,7 @@ def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
         header=provenance.of(figures),
         home=html.HOME,
         figures=figures,
-        quick=quick,
+        quick=_quick(figures),
         ours=ours,
         names=names,
         means=means,
@@ -104,18 +91,50 @@ def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
         relative=relative_times(times["entries"], names),
         precisions=list(precisions(table, main["shared"], names)),
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
-        costs=[
-            [
-                method_names.plain_name(one["method"]),
-                *(one[key] for key in ("precision", "runtime", "ms_p50", "ms_p99")),
-            ]
-            for one in times["entries"]
-        ],
+        costs=[_cost(one) for one in times["entries"]],
         fits=[[method_names.plain_name(name), _fit_s(table, name)] for name in names],
         **_beside_peers(of, table, ours, peers, main, times["entries"]),
         **_words(of, names, _missing(table, of, names, figures["left_out"])),
     )
     return pages, pictures
+
+
+def _quick(figures: Json) -> bool:
+    """Whether the run was too small for figures."""
+    return bool(figures.get("quick", False))
+
+
+def _times(figures: Json) -> Json:
+    """The measured times; empty if nothing was timed."""
+    return figures.get("times") or {"entries": [], "left_out": {}}
+
+
+def _cost(one: Json) -> list[Any]:
+    """A row of the table of times."""
+    columns = ("precision", "runtime", "ms_p50", "ms_p99")
+    return [method_names.plain_name(one["method"]), *(one[key] for key in columns)]
+
+
+def _timed(
+    figures: Json, table: Mapping[str, Accuracies], cases: Sequence[Json], shared: Sequence[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """The page of the chart over times, and its picture; both empty if nothing was timed."""
+    times = _times(figures)
+    dots = development_chart.dots(times["entries"], table, cases, shared)
+    if not dots:
+        return {}, {}
+    axes = development_chart.axes(cases, shared)
+    picture = scatter.chart(dots, list(axes)[:1], accuracies=axes)
+    page = chart_page.html(
+        _with_origin(dots, figures),
+        picture,
+        _quick(figures),
+        times["left_out"],
+        accuracies=axes,
+        source="development.json",
+        header=provenance.of(figures),
+    )
+    return {"chart": page}, {"front": picture}
 
 
 def _beside_peers(

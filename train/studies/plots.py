@@ -120,20 +120,7 @@ def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: s
     for cost in folds:
         axes.plot(*cost.T, **THIN)
     if folds:
-        n = min(map(len, folds))
-        median = np.median([cost[:n] for cost in folds], axis=0)
-        axes.plot(*median.T, **STRONG[0])
-        late = median[-1, 0] > 1500
-        axes.annotate(
-            "ours",
-            median[-1],
-            (0, 7) if late else (0, -7),
-            textcoords="offset points",
-            color=ACCENT,
-            size=MEDIUM,
-            va="bottom" if late else "top",
-            ha="right" if late else "center",
-        )
+        _median(axes, folds)
     for at in printed:
         axes.plot(*at, zorder=3, **PRINTED)
         axes.annotate(
@@ -157,6 +144,24 @@ def curve(costs: Sequence[Array], printed: Sequence[tuple[int, float]], about: s
     )
     set_titles(axes, "iteration", "cross entropy   ◇ printed")
     return to_svg(figure, about)
+
+
+def _median(axes: Axes, folds: Sequence[Array]) -> None:
+    """The median of the curves [n, 2] over their common length, with its name at the end."""
+    n = min(map(len, folds))
+    median = np.median([cost[:n] for cost in folds], axis=0)
+    axes.plot(*median.T, **STRONG[0])
+    late = median[-1, 0] > 1500
+    axes.annotate(
+        "ours",
+        median[-1],
+        (0, 7) if late else (0, -7),
+        textcoords="offset points",
+        color=ACCENT,
+        size=MEDIUM,
+        va="bottom" if late else "top",
+        ha="right" if late else "center",
+    )
 
 
 def sweeps(

@@ -182,18 +182,9 @@ def _mark(axes: Axes, spot: Spot, y: str, chosen: str) -> None:
     )
     if spot.other:
         tail, head = (spot.other, (spot.x, spot.y)) if int8 else ((spot.x, spot.y), spot.other)
+        arrow = {"arrowstyle": "->", "color": shade, "linewidth": 1, "alpha": strength}
         axes.annotate(
-            "",
-            head,
-            tail,
-            arrowprops={
-                "arrowstyle": "->",
-                "color": shade,
-                "linewidth": 1,
-                "alpha": strength,
-                "shrinkA": 0,
-                "shrinkB": MARK if int8 else 0,
-            },
+            "", head, tail, arrowprops=arrow | {"shrinkA": 0, "shrinkB": MARK if int8 else 0}
         )
     look: dict[str, Any] = {"color": shade, "clip_on": False}
     axes.plot(

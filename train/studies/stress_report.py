@@ -56,23 +56,28 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         headline=headline(curves[ours]),
         targets=targets(curves, ours),
-        first=[
-            [name, *first(those)]
-            for name, those in (curves | ({PACKAGED: box["rightly"]} if box else {})).items()
-        ],
+        first=[[name, *first(those)] for name, those in _with_box(curves, box).items()],
         most_wrong=most_wrong(box["wrongly"]) if box else None,
         lines=list(target_lines(curves, ours, box)),
         falls=fall_lines(curves, box),
         missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
-        refused={
-            plain_name(name): entry["refused"]
-            for name, entry in result["methods"].items()
-            if entry["refused"]
-        },
+        refused=_refused(result["methods"]),
         trouble=trouble(entries, result["box"]["uninformative"]),
     )
     return page, pictures
+
+
+def _with_box(curves: Json, box: Json) -> Json:
+    """The curves of methods, and those of the box's right answers if there are any."""
+    return {**curves, **({PACKAGED: box["rightly"]} if box else {})}
+
+
+def _refused(methods: Json) -> Json:
+    """The reason of each refused method, by its plain name."""
+    return {
+        plain_name(name): entry["refused"] for name, entry in methods.items() if entry["refused"]
+    }
 
 
 def headline(curves: Json) -> Json:
