@@ -15,7 +15,8 @@ NO_HOST = $(error name a box with HOST=user@box, or many with HOSTS=inventory.py
 WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(NO_HOST)))
 # Files of tests are in memory if there is 1 GB for them: a sync to a disk takes as long as a test.
 SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 1000000 { print $$6 }'),/tmp)
-PYTEST = $(BIN)/python -m pytest -q -n auto
+# One process more than there are cores: some tests wait for time to pass.
+PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
 .PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install clean
