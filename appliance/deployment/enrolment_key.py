@@ -41,8 +41,8 @@ class EnrolmentKey:
         private."""
         path = self.folder / KEY
         again = (
-            "enrol as the user palpate (sudo -u palpate palpate enrol); if the key does not exist, "
-            f"remove {SIGNER} and run make install"
+            "enrol as the user palpate (sudo -u palpate palpate enrol); if the key does not "
+            f"exist, run make install, which makes a key unless {SIGNER} exists"
         )
         try:
             mode = path.stat().st_mode

@@ -36,7 +36,7 @@ from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.inference.session import session
 from tests.factories import mutated_enrolments
-from tests.factories.grown_models import FORM, grown
+from tests.factories.grown_models import FORMAT, grown
 from tests.factories.mutated_models import Own, mutated, own_models
 from train.metrics.score import provenance
 
@@ -53,7 +53,9 @@ ENROLLED = 0.1
 ENROLLING = Own("enrolment", b"", bundle.load(bundle.DEFAULT).manifest)
 """Stands for the default bundle with an enrolment; its bytes are replaced by those of the
 enrolment."""
-GROWING = Own("grown", b"", Manifest("grown", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {}))
+GROWING = Own(
+    "grown", b"", Manifest("grown", "1", FORMAT, "raw", ("a", "b"), Thresholds(1, 255), {})
+)
 SORRY = ("refused", "onnxruntime refused", "run refused", "ran")
 """The expected outcomes of a model; any other is a find."""
 

@@ -19,7 +19,7 @@ from appliance.bundle.onnx_check.shapes import INDEX, Call, Value
 from appliance.core.errors import BundleError
 from appliance.core.types import SweepFormat
 
-FORM = SweepFormat(2, 2, 100.0, 24, "uint8")
+FORMAT = SweepFormat(2, 2, 100.0, 24, "uint8")
 SIZES = (1, 1, 1, 2, 2, 3, 4, 6, 8, 24, 96)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 3.0, 1e-39, 1e38, -1e38, 255.0, float("inf"), float("nan"))
 TRIES = 20
@@ -33,7 +33,9 @@ class Sprout:
     def __init__(self, rng: Random) -> None:
         self.rng, self.nodes, self.constants = rng, [], []
         self.known = {
-            "sweep": Value("uint8", (1, FORM.window, FORM.rows, FORM.cols), depends_on_sweep=True)
+            "sweep": Value(
+                "uint8", (1, FORMAT.window, FORMAT.rows, FORMAT.cols), depends_on_sweep=True
+            )
         }
 
     def constant(self, kind: str, shape: tuple[int, ...]) -> str:

@@ -13,11 +13,11 @@ import numpy as np
 import onnx
 from onnx import AttributeProto, TensorProto, helper, numpy_helper
 
-from tests.factories.grown_models import FORM
+from tests.factories.grown_models import FORMAT
 
 Models = Iterator[tuple[str, onnx.ModelProto | bytes, str]]
 node, info = helper.make_node, helper.make_tensor_value_info
-SWEEP = [1, FORM.window, FORM.rows, FORM.cols]
+SWEEP = [1, FORMAT.window, FORMAT.rows, FORMAT.cols]
 OPSETS = (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))
 FLOATS = node("Cast", ["sweep"], ["x"], to=TensorProto.FLOAT)
 

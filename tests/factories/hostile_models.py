@@ -2,7 +2,7 @@
 
 They ask for unlimited memory or time, for files beside the model or for foreign code, or they are
 not models (hostile_bytes.py). onnx makes some of them. It refuses to write the others, so they are
-made byte by byte. All declare the sweep of `grown_models.FORM` as their input.
+made byte by byte. All declare the sweep of `grown_models.FORMAT` as their input.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from onnx import TensorProto, helper
 
-from tests.factories.grown_models import FORM
+from tests.factories.grown_models import FORMAT
 from tests.factories.hostile_bytes import (
     OPSETS,
     SWEEP,
@@ -232,7 +232,7 @@ def giant() -> Models:
         "pads",
         model(
             [node("Conv", ["x", "w"], ["y"], pads=[2**40] * 4)],
-            {"w": np.ones((1, FORM.window, 1, 1), np.float32)},
+            {"w": np.ones((1, FORMAT.window, 1, 1), np.float32)},
         ),
         "pads",
     )
@@ -341,7 +341,7 @@ def dangerous() -> Models:
         model([*ints, node("Div", ["i", "d"], ["j"]), back], {"d": [0]}),
         "int64, not float32",
     )
-    weights = {"w": np.ones((1, FORM.window, 1, 1), np.float32)}
+    weights = {"w": np.ones((1, FORMAT.window, 1, 1), np.float32)}
     for setting in (
         {"strides": [0, 0]},
         {"dilations": [0, 1]},

@@ -16,7 +16,7 @@ from train.models.methods import Method
 from train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
 from train.onnx_tools.quantize import quantize
 
-FORM = SweepFormat(2, 2, 100.0, 40, "uint8")
+FORMAT = SweepFormat(2, 2, 100.0, 40, "uint8")
 
 
 def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
@@ -32,7 +32,7 @@ def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
     )
 
 
-def loudness(format: SweepFormat = FORM) -> onnx.ModelProto:
+def loudness(format: SweepFormat = FORMAT) -> onnx.ModelProto:
     """A graph that distinguishes both: a convolution takes differences, a threshold their mean
     size.
     """

@@ -6,7 +6,7 @@ import onnx
 from appliance.core.types import SweepFormat
 from train.onnx_tools.graph_builder import TENSOR, GraphBuilder
 
-FORM = SweepFormat(2, 2, 100.0, 163, "int16")
+FORMAT = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
 def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:

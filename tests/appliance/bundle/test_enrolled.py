@@ -135,7 +135,7 @@ WRONG = {
     ),
     "a small spread": ({"spread": np.float32([1, 0.5])}, "number of sweeps or a spread below 1"),
     "a spread without end": ({"spread": np.float32([1, np.inf])}, "spread that are not finite"),
-    "golden sweeps of another form": (
+    "golden sweeps of another shape": (
         {"changes": np.zeros((1, 2, 20, 2, 2), np.uint8)},
         "changes uint8",
     ),

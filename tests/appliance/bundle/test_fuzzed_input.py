@@ -410,7 +410,7 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
     ("manifest", "a message of two lines", manifest.json, "loads", broken_json),
     (
         "manifest",
-        "golden sweeps of any form",
+        "golden sweeps of any shape",
         bundle,
         "_golden",
         lambda data, manifest: (np.ones((1, 2, 3, 4)), None),
@@ -518,7 +518,7 @@ def test_another_error_is_not_kept_back(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
-def test_changes_keep_the_form(target: str, tmp_path: Path) -> None:
+def test_mutated_inputs_stay_well_formed(target: str, tmp_path: Path) -> None:
     """A mutator gives the same outputs for the same seed, and a large part of them is accepted."""
 
     def plain(data: bytes) -> bytes:

@@ -28,10 +28,10 @@ from appliance.inference.session import session
 from tests.campaigns import hostile_fuzz
 from tests.factories import hostile_models as hostile
 from tests.factories import mutated_models
-from tests.factories.grown_models import FORM, grown
+from tests.factories.grown_models import FORMAT, grown
 
 HOSTILE = hostile.every()
-MANIFEST = Manifest("hostile", "1", FORM, "raw", ("a", "b"), Thresholds(1, 255), {})
+MANIFEST = Manifest("hostile", "1", FORMAT, "raw", ("a", "b"), Thresholds(1, 255), {})
 
 
 @pytest.fixture(scope="module")

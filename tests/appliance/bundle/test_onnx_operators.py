@@ -16,7 +16,7 @@ from appliance.bundle.onnx_check.operators import OPERATORS
 from appliance.bundle.onnx_check.shapes import Call, Value
 from appliance.core.errors import BundleError
 from appliance.inference.session import session
-from tests.factories.grown_models import FORM, Sprout
+from tests.factories.grown_models import FORMAT, Sprout
 
 TABLES = {
     "classlabels_ints": [0, 1],
@@ -28,7 +28,7 @@ TABLES = {
     "kernel_type": b"RBF",
     "post_transform": b"NONE",
 }
-IMAGE, SWEEP = (1, 3, 8, 8), (1, FORM.window, FORM.rows, FORM.cols)
+IMAGE, SWEEP = (1, 3, 8, 8), (1, FORMAT.window, FORMAT.rows, FORMAT.cols)
 
 
 def fixed(*numbers: int, shape: tuple[int, ...] | None = None) -> Value:

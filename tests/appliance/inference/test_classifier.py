@@ -271,7 +271,7 @@ def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
 
 
 @pytest.mark.parametrize("shape", [(1, 2, 20, 2, 2), (2, 2, 19, 2, 2), (2, 2), ()])
-def test_golden_changes_of_another_form(shape: tuple[int, ...]):
+def test_golden_changes_of_another_shape(shape: tuple[int, ...]):
     """Changes with too few bytes or frames, or with none, are refused in one line."""
     manifest = SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a", "b"))
     packed = io.BytesIO()

@@ -271,7 +271,7 @@ def test_a_bundle_without_embedding(tmp_path: Path):
     "sweeps",
     [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)],
 )
-def test_sweeps_of_another_form(old: Bundle, sweeps: np.ndarray):
+def test_sweeps_of_another_format(old: Bundle, sweeps: np.ndarray):
     """Sweeps with a dimension too few, no sweeps, another window, another type."""
     with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants"):
         enrolment.enrol(old, "felt", sweeps)

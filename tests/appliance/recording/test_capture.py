@@ -158,7 +158,7 @@ def test_commands_are_part_of_a_capture(
         assert a.scores.tobytes() == b.scores.tobytes()
 
 
-def test_a_capture_of_a_skin_that_sent_another_form(
+def test_a_capture_of_a_skin_that_sent_another_format(
     rigged: Callable[..., Rigged], default_bundle: Bundle, tmp_path: Path
 ):
     """After packets of another grid in the stream the sweep is `sensor-lost`, live and in the

@@ -353,7 +353,7 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
     ]
 
 
-def test_a_folder_of_another_form_is_refused(tmp_path: Path):
+def test_a_folder_of_another_format_is_refused(tmp_path: Path):
     """A model cannot be trained on sweeps of two formats. The folder does not change and can be
     used by other programs."""
     first = Desk(tmp_path)

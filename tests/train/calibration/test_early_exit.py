@@ -14,7 +14,7 @@ from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
 from appliance.inference.novelty import ClassDistances
 from tests.factories.calibration_inputs import plain_inputs
-from tests.factories.trunk import FORM, trunk
+from tests.factories.trunk import FORMAT, trunk
 from train.calibration import early_exit
 from train.export.bundle_graph import bundle_graph
 from train.export.pack import means_file
@@ -170,22 +170,22 @@ def made():
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])
-    counts = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORM.window, 2, 2, 3))[
+    counts = level[labels][:, None] + rng.normal(0, [4, 9, 6], (FORMAT.window, 2, 2, 3))[
         None, ..., 0
     ].repeat(72, 0)
     counts = np.rint(counts + rng.normal(0, 5, counts.shape)).astype(np.int16)
-    trunks = trunk(FORM, True)
+    trunks = trunk(FORMAT, True)
     x, size = run(trunks, counts), 1
     done = calibrate.fit_calibration(
         plain_inputs(x, labels, np.repeat(np.arange(6), 12), np.ones(72, bool), size)
     )
     done = replace(done, rule=early_exit.EarlyRule(Early((0.9,) * 9, 2)))
-    model = bundle_graph(done, trunk(FORM), trunks)
+    model = bundle_graph(done, trunk(FORMAT), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: means_file(done.classes())}
     manifest = Manifest(
         "toy",
         "1",
-        FORM,
+        FORMAT,
         "raw",
         ("a", "b", "c"),
         Thresholds(1.0, 32767.0),
@@ -219,9 +219,11 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
     """Without prefixes or without a rule there are only logits and embedding."""
     done, x, counts, _, _ = made
     for model in (
-        bundle_graph(done, trunk(FORM)),
+        bundle_graph(done, trunk(FORMAT)),
         bundle_graph(
-            replace(done, rule=early_exit.EarlyRule(None, "why")), trunk(FORM), trunk(FORM, True)
+            replace(done, rule=early_exit.EarlyRule(None, "why")),
+            trunk(FORMAT),
+            trunk(FORMAT, True),
         ),
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
@@ -237,7 +239,7 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
     done, _, _, _, whole = made
     assert (
         prune(whole.model, {"logits", "embedding"})
-        == bundle_graph(done, trunk(FORM)).SerializeToString()
+        == bundle_graph(done, trunk(FORMAT)).SerializeToString()
     )
     assert len(prune(whole.model, {"early"})) < len(whole.model)
 

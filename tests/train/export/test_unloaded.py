@@ -18,8 +18,8 @@ from appliance.sim.skins.sweeps import SCALES, view
 from tests.factories.simulated_box import Rigged
 from train.cli.main import main
 
-FORM = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
-SEEN, REST = view("xela-can", FORM), SCALES["xela-can"].rest
+FORMAT = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
+SEEN, REST = view("xela-can", FORMAT), SCALES["xela-can"].rest
 MATERIALS = "metal", "plastic rough"
 PLACES = skin.placements("T-REAL", 3)[:4]
 EACH = 3
@@ -41,10 +41,10 @@ def answered(
     rigged: Callable[..., Rigged], acts: Sequence[rig.Act], **how: object
 ) -> list[Verdict]:
     """The answers of a box whose robot plays these acts."""
-    simulated = devices.build(FORM, acts, rig.VirtualClock(), "sim")
+    simulated = devices.build(FORMAT, acts, rig.VirtualClock(), "sim")
     if folder := how.pop("folder", None):
         session = RecordingSession(
-            folder, FORM, how.pop("labels"), simulated.clock, lambda line: None
+            folder, FORMAT, how.pop("labels"), simulated.clock, lambda line: None
         )
         how = {"observers": [session], "commands": session.commands}
     box = rigged(simulated, **how)
@@ -86,7 +86,7 @@ def test_the_whole_way(
     model = exported(folder, tmp_path / "known")
     assert "no-contact cannot be detected" not in capsys.readouterr().out
     m = model.manifest
-    assert m.tare == pytest.approx(np.full(FORM.shape, REST), abs=40)
+    assert m.tare == pytest.approx(np.full(FORMAT.shape, REST), abs=40)
     assert m.contact
     assert m.thresholds.contact < 0.2 * REST
     rng = np.random.default_rng(5)
@@ -99,7 +99,7 @@ def test_the_whole_way(
 
     more = 4000
     simulated = devices.build(
-        FORM, [act("", None, rng, more), act("", None, rng, more)], rig.VirtualClock(), "sim"
+        FORMAT, [act("", None, rng, more), act("", None, rng, more)], rig.VirtualClock(), "sim"
     )
     box = rigged(simulated, model=model)
     (before,) = box.until(lambda: box.box.answered == 1)

@@ -13,7 +13,7 @@ from appliance.core.types import SweepFormat
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import GraphBuilder, joined, run, slim
 
-FORM = SweepFormat(2, 2, 100.0, 20, "uint8")
+FORMAT = SweepFormat(2, 2, 100.0, 20, "uint8")
 
 
 def made(output: str, by: float) -> onnx.ModelProto:
@@ -25,7 +25,7 @@ def made(output: str, by: float) -> onnx.ModelProto:
     sums = g("Reshape", g("ReduceSum", x, same, keepdims=1), g.constant([1, 4], "int64"))
     g.nodes.append(onnx.helper.make_node("TopK", [sums, g.constant([2], "int64")], ["most", "who"]))
     return g.model(
-        FORM, g("Mul", g("Mul", "most", g.constant(by)), g.constant(3.0), output=output), 2
+        FORMAT, g("Mul", g("Mul", "most", g.constant(by)), g.constant(3.0), output=output), 2
     )
 
 
@@ -75,7 +75,7 @@ def test_constants_are_told_apart_by_type_and_shape():
         x = g("Cast", g("Reshape", "sweep", g.constant([80], "int64")), to=1)
         ones = g("Cast", g.constant(np.zeros(shape), dtype), to=1)
         return g.model(
-            FORM, g("Reshape", g("Add", x, ones), g.constant([1, 80], "int64"), output=output), 80
+            FORMAT, g("Reshape", g("Add", x, ones), g.constant([1, 80], "int64"), output=output), 80
         )
 
     both = joined(shaped("a", [80], "uint8"), shaped("b", [1, 80], "uint8"))
@@ -90,7 +90,7 @@ def test_a_slim_model_gives_the_same_bits_in_fewer_bytes():
     x = g("Cast", g("Reshape", "sweep", g.constant([1, 20, 4], "int64")), to=1)
     y = g("MatMul", x, g.constant(np.arange(12).reshape(4, 3)))
     y = g("Add", g("Mul", y, g.constant(0.5)), g.constant(0.5))
-    model = g.model(FORM, g("Reshape", y, g.constant([1, 60], "int64"), output="logits"), 60)
+    model = g.model(FORMAT, g("Reshape", y, g.constant([1, 60], "int64"), output="logits"), 60)
     small = slim(model)
     np.testing.assert_array_equal(run(small, drawn()), run(model, drawn()))
     assert len(small.SerializeToString()) < 0.9 * len(model.SerializeToString())
