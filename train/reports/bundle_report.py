@@ -114,7 +114,7 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
     if breaks := [row for row in figures["corruptions"] if row["falls"] is not None]:
         first = breaks[0]
         yield [
-            "what breaks it first",
+            "the first corruption to break it",
             f"{first['title']}: five points lost at {level(first, first['falls'])}",
         ]
     yield ["mean error of its probabilities", formatting.percent(figures["calibration"]["error"])]

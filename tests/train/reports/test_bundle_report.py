@@ -158,7 +158,7 @@ def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
         "refused) 10.0 %, 2 of 20",
         "least often: wood 25.0 % [10.0, 50.0]",
         "yet it names them 75.0 % [50.0, 90.0]",
-        "Of the sweeps of its own materials it calls 10.0 % [0.0, 30.0] unknown",
+        "10.0 % [0.0, 30.0] of the sweeps of its own materials are called unknown",
     ):
         assert line in text, line
 
