@@ -57,13 +57,13 @@ class HeardBytes:
 
 def listed(name: str, profile: SkinProfile) -> str:
     """A profile in a line, with missing features, and whether it was compared with a device."""
-    form = "as its board says" if profile.codec == DEFAULT else form_of(profile.format)
+    format = "as its board says" if profile.codec == DEFAULT else described(profile.format)
     lacks = f"lacks {', '.join(profile.lacks)}" if profile.lacks else "lacks nothing"
     measured = f"measured: {profile.measured}" if profile.measured else "not measured on a device"
-    return f"{name:<14} {profile.about}; {form}; {lacks}; {measured}"
+    return f"{name:<14} {profile.about}; {format}; {lacks}; {measured}"
 
 
-def form_of(format: SweepFormat) -> str:
+def described(format: SweepFormat) -> str:
     """Shape, type and rate for a person."""
     return f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
 
@@ -200,8 +200,8 @@ def _settings(
     if hz and not profile.rates_hz and abs(hz / profile.rate_hz - 1) > SAME_RATE:
         sets.append(f"skin.rate_hz = {hz:.1f}")
     more = f" (and as {', '.join(fitting[1:])})" if len(fitting) > 1 else ""
-    form = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
-    return f"sends {form_of(form)}{more}; set {', '.join(sets)}"
+    format = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
+    return f"sends {described(format)}{more}; set {', '.join(sets)}"
 
 
 def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:

@@ -143,7 +143,7 @@ class RecordPage(Observer):
         )
         self._known = {
             "source": source,
-            "form": str(format),
+            "format": str(format),
             "trigger": trigger_words(trigger),
             "commands": self._commands,
         }

@@ -98,10 +98,14 @@ class WatchedBox:
         )
 
     def _take_hello(self, line: Mapping[str, Any]) -> None:
-        form = typed(SweepFormat, dict(line["format"]))
-        self.hello = {**line, "form": str(form), "labels": [str(label) for label in line["labels"]]}
+        format = typed(SweepFormat, dict(line["format"]))
+        self.hello = {
+            **line,
+            "format": str(format),
+            "labels": [str(label) for label in line["labels"]],
+        }
         self.load, self.full, self._lowest = (), 1.0, None
-        self.window, self.rate_hz = None, form.rate_hz
+        self.window, self.rate_hz = None, format.rate_hz
 
     def _take_health(self, line: Mapping[str, Any]) -> None:
         health = {name: value for name, value in line.items() if name != "type"}
@@ -211,7 +215,7 @@ def _what(state: WatchedBox) -> str:
         return ""
     simulated = {"usb": "", "replay": "REPLAYED   "}.get(state.hello["source"], "SIMULATED   ")
     return _plain(
-        f"{simulated}{state.hello['skin']} {state.hello['form']}   bundle"
+        f"{simulated}{state.hello['skin']} {state.hello['format']}   bundle"
         f" {state.hello['bundle'] or 'none'}"
     )
 

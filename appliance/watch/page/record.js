@@ -41,8 +41,8 @@ function drawHeader() {
   byId("state").className = live() && recording.skin === "streaming" ? "pill fine" : "pill";
   byId("simulated").hidden = !recording || recording.source === "usb";
   put("simulated", recording?.source === "replay" ? "REPLAYED" : "SIMULATED");
-  byId("form").hidden = !recording;
-  if (recording) put("form", recording.form);
+  byId("format").hidden = !recording;
+  if (recording) put("format", recording.format);
 }
 
 function drawLabels() {
@@ -66,9 +66,9 @@ function drawCounts() {
   const {counts, material, position, target} = recording, held = new Map(counts.map(([m, p, n]) => [JSON.stringify([m, p]), n]));
   const materials = sorted([...counts.map((one) => one[0]), ...(material ? [material] : [])]);
   const positions = sorted([...counts.map((one) => one[1]), ...(material ? [position] : [])]);
-  const form = JSON.stringify([materials, positions]), box = byId("counts");
-  if (form !== table) {
-    table = form;
+  const content = JSON.stringify([materials, positions]), box = byId("counts");
+  if (content !== table) {
+    table = content;
     const head = made("tr"), body = materials.map((name) => {
       const row = made("tr");
       made("th", "", name, row).scope = "row";

@@ -35,14 +35,14 @@ export function shades() {
 
 /* Draws views (appliance/alignment/view.py) into an element. */
 export class SkinPicture {
-  constructor(parent) { this.parent = parent; this.form = ""; }
+  constructor(parent) { this.parent = parent; this.drawn = ""; }
 
   show(view) {
-    const form = JSON.stringify([view.shape, view.contact, view.fingertip]);
-    if (form !== this.form) {
+    const drawn = JSON.stringify([view.shape, view.contact, view.fingertip]);
+    if (drawn !== this.drawn) {
       this.parent.replaceChildren();
       this.build(view);
-      this.form = form;
+      this.drawn = drawn;
     }
     const loads = view.load.flat(), shade = shades();
     this.tiles.forEach((tile, i) => {

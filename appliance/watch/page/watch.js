@@ -228,9 +228,9 @@ function drawHistory() {
   const first = known.verdicts[0];
   put("counted", first ? `since ${clock(wall(first.time_ns))}; what this page's program has seen` : "no sweep yet");
   const shown = wanted.slice(0, showAll ? KEPT : SHOWN), rows = byId("rows");
-  const form = JSON.stringify([shown.length, shown[0] && key(shown[0]), known.notes.length, [...statuses], known.run, wallMs > 0]);
-  if (form !== drawnRows) {
-    drawnRows = form;
+  const content = JSON.stringify([shown.length, shown[0] && key(shown[0]), known.notes.length, [...statuses], known.run, wallMs > 0]);
+  if (content !== drawnRows) {
+    drawnRows = content;
     const before = rows.scrollTop, height = rows.scrollHeight, notes = statuses.size ? [] : [...known.notes].reverse();
     const parts = [];
     for (const one of shown) {
