@@ -348,7 +348,7 @@ def test_groups_that_can_be_left_out_judge():
     assert [part.group for part in parts] == ["recording"] * 5
     assert np.sum([part.out for part in parts], axis=0).tolist() == [1] * n
     one = replace(pure, labels=(recording == 3).astype(int))
-    with pytest.raises(FormatError, match="a material has one recording; two of each are needed"):
+    with pytest.raises(FormatError, match="one recording; choosing a model needs two of each"):
         inner_parts(one)
 
 
