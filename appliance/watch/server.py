@@ -409,7 +409,8 @@ class OrderHandler(_Handler):
         assert self.page.orders
         order = self.page.orders(self.request.body)
         try:
-            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(order)), DONE_S)
+            async with asyncio.timeout(DONE_S):
+                return await asyncio.shield(asyncio.wrap_future(order))
         except TimeoutError as e:
             known = (
                 "it was not carried out; try again"

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from appliance.core.errors import BundleError, FormatError
 from train.data import sets
 from train.data.sets import Dataset
 from train.evaluation import evaluate, parallel, robustness
-from train.evaluation.evaluate import Plan, Where
+from train.evaluation.evaluate import Plan
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import fingerprint
 from train.export import measure
@@ -85,121 +85,113 @@ QUICK = Study(
 QUICK_EFFORT, QUICK_ROUNDS = Effort(share=0.02), 5
 
 
-@dataclass
-class Chart:
-    """One run of the study. touch: the share of a sweep that methods need with early answers."""
+def results(study: Study, run: StudyRun, touch: Mapping[str, float] | None = None) -> list[Json]:
+    """The results of the study: an entry for each bundle. touch: by method the share of a sweep
+    that it needs with early answers."""
+    accuracy, train = accuracies(study, run), _train(study)
+    with tempfile.TemporaryDirectory() as work:
+        names = {method for method, _ in accuracy}
+        made = list(packed(study, run, names, run.where.cache or Path(work)))
+        run.log(f"{len(made)} models take turns")
+        rounds = QUICK_ROUNDS if run.quick else measure.ROUNDS
+        costs = precisions.measured(made, train.samples, rounds)
+    known: Json = {"seeds": list(run.seeds), "set": train.source} | score.provenance()
+    if run.quick:
+        known["quick"] = True
+    return [
+        _dot(one, cost, accuracy.get((one.method, one.form), {}), touch or {}) | known
+        for one, cost in zip(made, costs, strict=True)
+    ]
 
-    study: Study
-    run: StudyRun
-    touch: dict[str, float] = field(default_factory=dict)
 
-    def dots(self) -> list[Json]:
-        """An entry for each bundle: the results of the study."""
-        accuracy = self.accuracy()
-        with tempfile.TemporaryDirectory() as work:
-            made = list(
-                self.packed({method for method, _ in accuracy}, self.run.where.cache or Path(work))
-            )
-            self.run.log(f"{len(made)} models take turns")
-            train = self._train()
-            rounds = QUICK_ROUNDS if self.run.quick else measure.ROUNDS
-            costs = precisions.measured(made, train.samples, rounds)
-        known: Json = {"seeds": list(self.run.seeds), "set": train.source} | score.provenance()
-        if self.run.quick:
-            known["quick"] = True
-        return [
-            self._dot(one, cost, accuracy.get((one.method, one.form), {})) | known
-            for one, cost in zip(made, costs, strict=True)
-        ]
+def _dot(one: Packed, costs: Json, accuracy: Json, touch: Mapping[str, float]) -> Json:
+    """Costs and accuracy of one bundle. Touch time is the mean part of the window that the method
+    itself needs with early answers."""
+    share = touch.get(one.method, 1.0) if not one.form else 1.0
+    return costs | {
+        "touch_s": round(one.window_s * share, 3),
+        "family": family(one.method),
+        "accuracy": accuracy,
+    }
 
-    def _dot(self, one: Packed, costs: Json, accuracy: Json) -> Json:
-        """Costs and accuracy of one bundle. Touch time is the mean part of the window that the
-        method itself needs with early answers."""
-        share = self.touch.get(one.method, 1.0) if not one.form else 1.0
-        return costs | {
-            "touch_s": round(one.window_s * share, 3),
-            "family": family(one.method),
-            "accuracy": accuracy,
-        }
 
-    def accuracy(self) -> Accuracy:
-        """Accuracies of all methods and their forms, by case."""
-        known = methods.every(self.run.effort)
-        named = [name for name in self.study.methods if name in known]
-        self.run.left_out |= {
-            name: "no such method here" for name in self.study.methods if name not in known
-        }
-        found: Accuracy = {}
-        for names, where in (
-            (named, self.run.where),
-            (self.study.joining, replace(self.run.where, kept=True)),
-        ):
-            if not names:
-                continue
-            for name, case in self.study.cases.items():
-                if case.protocol:
-                    self._evaluated(found, name, case, names, where)
-            self._stressed(found, [name for name in names if (name, "") in found], where)
-        return found
+def accuracies(study: Study, run: StudyRun) -> Accuracy:
+    """Accuracies of all methods and their forms, by case."""
+    known = methods.every(run.effort)
+    named = [name for name in study.methods if name in known]
+    run.left_out |= {name: "no such method here" for name in study.methods if name not in known}
+    found: Accuracy = {}
+    for names, where in ((named, run.where), (study.joining, replace(run.where, kept=True))):
+        if not names:
+            continue
+        part = replace(run, where=where)  # left_out is the same dictionary
+        for name, case in study.cases.items():
+            if case.protocol:
+                _evaluate(found, name, case, names, part)
+        _stress(found, study, [name for name in names if (name, "") in found], part)
+    return found
 
-    def _evaluated(
-        self, found: Accuracy, key: str, case: StudyCase, names: Sequence[str], where: Where
-    ) -> None:
-        """Add the accuracies of methods and their forms in one case."""
-        sweeps = case.load(self.run.data)
-        if sweeps is None:
-            self.run.left_out[key] = NO_DATA
-            return
-        by_form: dict[tuple[str, str], list[Json]] = {}
-        run = self.run
-        plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort)
-        for result in evaluate.evaluate(sweeps, plan, where, run.log):
-            if result.refused:
-                run.left_out[f"{result.method}, {key}"] = result.refused
-                continue
-            figures = result.json()
-            for form, one in {"": figures, **figures.get("forms", {})}.items():
-                by_form.setdefault((result.method, form), []).append(one | {"seed": result.seed})
-        for named, results in by_form.items():
-            found.setdefault(named, {})[key] = joined(results)
 
-    def _stressed(self, found: Accuracy, names: Sequence[str], where: Where) -> None:
-        """Add accuracies under corruption of the methods themselves; robustness does not test their
-        other forms."""
-        (trial,) = self.study.cases[STRESS].sets
-        result = robustness.run(
-            names,
-            self._train(),
-            EvaluationSweeps.simulated(trial),
-            where,
-            seeds=self.run.seeds,
-            effort=self.run.effort,
-            log=self.run.log,
-        )
-        for name, entry in result["methods"].items():
-            if entry["curves"]:
-                found[name, ""] |= under_stress(entry)
+def _evaluate(
+    found: Accuracy, key: str, case: StudyCase, names: Sequence[str], run: StudyRun
+) -> None:
+    """Add the accuracies of methods and their forms in one case."""
+    sweeps = case.load(run.data)
+    if sweeps is None:
+        run.left_out[key] = NO_DATA
+        return
+    by_form: dict[tuple[str, str], list[Json]] = {}
+    plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort)
+    for result in evaluate.evaluate(sweeps, plan, run.where, run.log):
+        if result.refused:
+            run.left_out[f"{result.method}, {key}"] = result.refused
+            continue
+        figures = result.json()
+        for form, one in {"": figures, **figures.get("forms", {})}.items():
+            by_form.setdefault((result.method, form), []).append(one | {"seed": result.seed})
+    for named, several in by_form.items():
+        found.setdefault(named, {})[key] = joined(several)
 
-    def packed(self, names: set[str], cache: Path) -> Iterator[Packed]:
-        """Yield the bundles of those `names` that can be packed."""
-        train, run = self._train(), self.run
-        order = [name for name in (*self.study.methods, *self.study.joining) if name in names]
-        progress = parallel.Progress(len(order), run.log)
-        for method in methods.find(order, run.effort):
-            folder = kept_folder(method, train, run.seeds[0], cache)
-            if run.where.kept and not folder.exists():
-                run.left_out[method.name] = "not packed yet"
-                continue
-            try:
-                yield from precisions.packed(method, train, run.seeds[0], folder)
-            except (FormatError, BundleError) as e:
-                run.left_out[method.name] = str(e)
-            progress(f"{method.name} packed")
 
-    def _train(self) -> Dataset:
-        train = self.study.cases[TRAIN].load()
-        assert train is not None  # it is simulated
-        return train
+def _stress(found: Accuracy, study: Study, names: Sequence[str], run: StudyRun) -> None:
+    """Add accuracies under corruption of the methods themselves; robustness does not test their
+    other forms."""
+    (trial,) = study.cases[STRESS].sets
+    result = robustness.run(
+        names,
+        _train(study),
+        EvaluationSweeps.simulated(trial),
+        run.where,
+        seeds=run.seeds,
+        effort=run.effort,
+        log=run.log,
+    )
+    for name, entry in result["methods"].items():
+        if entry["curves"]:
+            found[name, ""] |= under_stress(entry)
+
+
+def packed(study: Study, run: StudyRun, names: set[str], cache: Path) -> Iterator[Packed]:
+    """Yield the bundles of those `names` that can be packed."""
+    train = _train(study)
+    order = [name for name in (*study.methods, *study.joining) if name in names]
+    progress = parallel.Progress(len(order), run.log)
+    for method in methods.find(order, run.effort):
+        folder = kept_folder(method, train, run.seeds[0], cache)
+        if run.where.kept and not folder.exists():
+            run.left_out[method.name] = "not packed yet"
+            continue
+        try:
+            yield from precisions.packed(method, train, run.seeds[0], folder)
+        except (FormatError, BundleError) as e:
+            run.left_out[method.name] = str(e)
+        progress(f"{method.name} packed")
+
+
+def _train(study: Study) -> Dataset:
+    train = study.cases[TRAIN].load()
+    assert train is not None  # it is simulated
+    return train
 
 
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:

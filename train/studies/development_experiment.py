@@ -7,8 +7,7 @@ among the sets, because the simulator cannot be trusted with it (decision 10).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from appliance.core.errors import FormatError
@@ -82,76 +81,65 @@ def usual_methods(study: Study) -> tuple[str, ...]:
     return tuple(name for name in study.methods if name in known)
 
 
-@dataclass
-class Development:
-    """One run of the study. skipped: names of cases, or of points of their curves ("NAME, 5
-    each"), that are not run."""
+def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence[str] = ()) -> Json:
+    """The results of the methods `names`: `cases` with their sets, and entries by case, method and
+    number of training sweeps.
 
-    cases: Mapping[str, StudyCase]
-    names: Sequence[str]
-    run: StudyRun
-    skipped: Sequence[str] = ()
-
-    def results(self) -> Json:
-        """The results: `cases` with their sets, and entries by case, method and number of training
-        sweeps.
-
-        Raises FormatError for an unknown method, and for a skipped case that does not exist.
-        """
-        methods.find(self.names)
-        self._require_known(self.skipped)
-        cases: list[Json] = []
-        found: list[Json] = []
-        for number, (name, case) in enumerate(self.cases.items(), 1):
-            sweeps = case.load(self.run.data)
-            if sweeps is None:
-                self.run.left_out[name] = NO_DATA
-                continue
-            cases.append(_about(name, case, sweeps))
-            for each, point in _points(name, case):
-                if point in self.skipped or name in self.skipped:
-                    self.run.left_out[point] = f"skipped in the run of {', '.join(self.names)}"
-                else:
-                    progress = f"{number}/{len(self.cases)} {point}"
-                    found += self._evaluated(name, sweeps, each, progress)
-        known = {
-            "methods": list(self.names),
-            "seeds": list(self.run.seeds),
-            "effort": self.run.effort.share,
-        }
-        runs = [known | score.provenance()]
-        return {
-            "methods": list(self.names),
-            "runs": runs,
-            "cases": cases,
-            "results": found,
-            "left_out": self.run.left_out,
-        } | ({"quick": True} if self.run.quick else {})
-
-    def _require_known(self, names: Sequence[str]) -> None:
-        known = [point for name, case in self.cases.items() for _, point in _points(name, case)]
-        for name in names:
-            if name not in known:
-                raise FormatError(f"{name!r} is no case; leave out some of {'; '.join(known)}")
-
-    def _evaluated(self, name: str, sweeps: Dataset, each: int, progress: str) -> Iterator[Json]:
-        """Yield one entry for each method that accepts the set, over all seeds that were found."""
-        run, case = self.run, self.cases[name]
-        plan = Plan(self.names, (case.protocol,), run.seeds, case.means_removed, run.effort, each)
-        by_method: dict[str, list[Json]] = {}
-
-        def log(line: str) -> None:
-            run.log(f"{progress}: {line}")
-
-        for result in evaluate.evaluate(sweeps, plan, run.where, log):
-            if result.refused:
-                run.left_out[f"{result.method}, {name}"] = result.refused
+    skipped: names of cases, or of points of their curves ("NAME, 5 each"), that are not run. Raises
+    FormatError for an unknown method, and for a skipped case that does not exist.
+    """
+    methods.find(names)
+    _require_known(study, skipped)
+    cases: list[Json] = []
+    found: list[Json] = []
+    for number, (name, case) in enumerate(study.cases.items(), 1):
+        sweeps = case.load(run.data)
+        if sweeps is None:
+            run.left_out[name] = NO_DATA
+            continue
+        cases.append(_about(name, case, sweeps))
+        for each, point in _points(name, case):
+            if point in skipped or name in skipped:
+                run.left_out[point] = f"skipped in the run of {', '.join(names)}"
             else:
-                by_method.setdefault(result.method, []).append(
-                    result.json() | {"seed": result.seed}
+                plan = Plan(
+                    names, (case.protocol,), run.seeds, case.means_removed, run.effort, each
                 )
-        for method, results in by_method.items():
-            yield {"case": name, "each": each, "method": method} | _entry(results)
+                progress = f"{number}/{len(study.cases)} {point}"
+                found += _evaluated(name, sweeps, plan, run, progress)
+    known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
+    return {
+        "methods": list(names),
+        "runs": [known | score.provenance()],
+        "cases": cases,
+        "results": found,
+        "left_out": run.left_out,
+    } | ({"quick": True} if run.quick else {})
+
+
+def _require_known(study: Study, names: Sequence[str]) -> None:
+    known = [point for name, case in study.cases.items() for _, point in _points(name, case)]
+    for name in names:
+        if name not in known:
+            raise FormatError(f"{name!r} is not a case; leave out some of {'; '.join(known)}")
+
+
+def _evaluated(
+    name: str, sweeps: Dataset, plan: Plan, run: StudyRun, progress: str
+) -> Iterator[Json]:
+    """Yield one entry for each method that accepts the set, over all seeds that were found."""
+    by_method: dict[str, list[Json]] = {}
+
+    def log(line: str) -> None:
+        run.log(f"{progress}: {line}")
+
+    for result in evaluate.evaluate(sweeps, plan, run.where, log):
+        if result.refused:
+            run.left_out[f"{result.method}, {name}"] = result.refused
+        else:
+            by_method.setdefault(result.method, []).append(result.json() | {"seed": result.seed})
+    for method, several in by_method.items():
+        yield {"case": name, "each": plan.each, "method": method} | _entry(several)
 
 
 def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:

@@ -328,7 +328,7 @@ def test_the_whole_of_it_and_again_from_what_was_kept(tmp_path: Path):
     found = []
     for one in (where, replace(where, kept=True)):
         run = StudyRun(one, lambda line: None, quick=True)
-        found.append(chart_experiment.Chart(study, run).dots())
+        found.append(chart_experiment.results(study, run))
         assert run.left_out.keys() == {"nobody", "force"}
     ((first,), (again,)) = found
     assert first["accuracy"] == again["accuracy"]

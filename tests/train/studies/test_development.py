@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,7 @@ from train.studies import (
     scatter,
 )
 from train.studies.command import main
-from train.studies.development_experiment import Development
-from train.studies.study import StudyCase, StudyRun, save
+from train.studies.study import Study, StudyCase, StudyRun, save
 
 
 def test_the_page_shows_every_figure():
@@ -183,7 +182,21 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
     assert not (tmp_path / "pages").exists()
 
 
-def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: Any) -> Development:
+@dataclass
+class Experiment:
+    """One run of a small study."""
+
+    study: Study
+    run: StudyRun
+    names: Sequence[str]
+    skipped: Sequence[str]
+
+    def results(self) -> dict[str, Any]:
+        """Run it."""
+        return development_experiment.results(self.study, self.run, self.names, self.skipped)
+
+
+def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: Any) -> Experiment:
     """Two cases on tones from a file of real sweeps in `folder`. The first case has a learning
     curve.
     """
@@ -204,7 +217,7 @@ def experiment(folder: Path, *names: str, skipped: Sequence[str] = (), **given: 
     }
     where = Where(jobs=1, cache=folder / "cache")
     settings = {"where": where, "log": lambda line: None, "data": folder} | given
-    return Development(cases, names, StudyRun(**settings), skipped)
+    return Experiment(Study("tones", cases, names), StudyRun(**settings), names, skipped)
 
 
 @pytest.mark.slow
@@ -261,7 +274,7 @@ def test_what_is_not_wanted_is_not_run_and_named(tmp_path: Path):
     why = "skipped in the run of L-gauss"
     assert run.run.left_out == dict.fromkeys(["tones, 5 each", "tones, 10 each", "short"], why)
     with pytest.raises(
-        FormatError, match="'tone' is no case; leave out some of tones; tones, 5 each"
+        FormatError, match="'tone' is not a case; leave out some of tones; tones, 5 each"
     ):
         experiment(tmp_path, "L-gauss", skipped=["tone"]).results()
 
@@ -583,7 +596,9 @@ def test_times_alone_are_measured_again(
         return figures()["times"] | {"format": "measured again"}
 
     monkeypatch.setattr(development_times, "measured", measured)
-    monkeypatch.setattr(Development, "results", lambda run: pytest.fail("accuracy was run"))
+    monkeypatch.setattr(
+        development_experiment, "results", lambda *run: pytest.fail("accuracy was run")
+    )
     assert main(["development", "--quick", "--out", str(file), "--times"]) == 0
     assert asked == [(figures()["methods"], 1)]
     found = json.loads(file.read_text())

@@ -168,7 +168,7 @@ def run_chart(args: argparse.Namespace) -> None:
     run = _run(args, chart_experiment.QUICK_EFFORT)
     study = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
     touch = chart_experiment.touch_shares(args.certainty)
-    dots = chart_experiment.Chart(study, run, touch).dots()
+    dots = chart_experiment.results(study, run, touch)
     if not dots:
         for name, why in run.left_out.items():
             print(f"left out: {name}: {why}")
@@ -185,9 +185,9 @@ def run_development(args: argparse.Namespace) -> None:
     if args.times:
         figures = read(args.out, *keys)
     else:
-        made = development_experiment.Development(study.cases, tuple(names), run, args.leave_out)
+        made = development_experiment.results(study, run, tuple(names), args.leave_out)
         earlier = [read(path, *keys) for path in args.join]
-        figures = development_experiment.join(made.results(), earlier)
+        figures = development_experiment.join(made, earlier)
     if args.times or not args.kept:
         timed = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
         train = timed.cases[chart_experiment.TRAIN].load()
