@@ -121,7 +121,7 @@ def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterat
     listener = Listener(link, clock)
     link.request(Request.STOP, 0)  # the board may still send for an earlier program
     yield _identity(link)
-    announced, finding = _format(link)
+    sent, finding = _format(link)
     yield finding
     silent = listener.quiet()
     link.request(Request.START, 0)
@@ -131,16 +131,16 @@ def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterat
         return
     heard = listener.listen(seconds)
     yield _crc(heard)
-    if announced is None or not heard.packets:
+    if sent is None or not heard.packets:
         yield PartResult(
             "packets",
             "unknown",
             "nothing more can be judged without FORMAT and whole packets; mend these first",
         )
         return
-    yield from _stream(heard, announced)
+    yield from _stream(heard, sent)
     yield _requests(listener)
-    yield _overflow(listener, announced, heard, port=port)
+    yield _overflow(listener, sent, heard, port=port)
     yield _stop(listener)
 
 
@@ -166,42 +166,32 @@ def _identity(link: SkinLink) -> PartResult:
 def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
     """The format and its result; None for a format that cannot be used."""
     try:
-        announced = packets.unpack_format(link.request(Request.FORMAT, 64))
-        format = _sweep_format(announced)
+        sent = packets.unpack_format(link.request(Request.FORMAT, 64))
+        format = _sweep_format(sent)
     except (SensorMismatch, FormatError) as e:
         return None, PartResult("format", "FAIL", f"{e}; PROTOCOL.md, FORMAT, has its 16 bytes")
-    size = (
-        announced.packet_frames
-        * announced.rows
-        * announced.cols
-        * announced.axes
-        * format.numpy_type.itemsize
-    )
+    size = sent.packet_frames * sent.rows * sent.cols * sent.axes * format.numpy_type.itemsize
     fifo_s, packet_s = (
-        announced.fifo_frames / announced.rate_hz,
-        announced.packet_frames / announced.rate_hz,
+        sent.fifo_frames / sent.rate_hz,
+        sent.packet_frames / sent.rate_hz,
     )
     text = (
-        f"{announced.rows}x{announced.cols} {announced.dtype} at {announced.rate_hz:g} Hz,"
-        f" FIFO {fifo_s:.2f} s, {announced.packet_frames} a packet"
+        f"{sent.rows}x{sent.cols} {sent.dtype} at {sent.rate_hz:g} Hz,"
+        f" FIFO {fifo_s:.2f} s, {sent.packet_frames} a packet"
     )
-    if not (1 <= announced.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):
-        return announced, PartResult(
+    if not (1 <= sent.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):
+        return sent, PartResult(
             "format", "FAIL", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}"
         )
     if fifo_s < LEAST_FIFO_S:
-        return announced, PartResult(
-            "format", "FAIL", f"{text}; the FIFO must hold {LEAST_FIFO_S} s"
-        )
-    if packet_s > LONGEST_PACKET_S and announced.packet_frames > 1:
+        return sent, PartResult("format", "FAIL", f"{text}; the FIFO must hold {LEAST_FIFO_S} s")
+    if packet_s > LONGEST_PACKET_S and sent.packet_frames > 1:
         text += f"; {packet_s * 1000:.0f} ms a packet delay the answer, 2 to 8 ms are better"
-    return announced, PartResult("format", "ok", text)
+    return sent, PartResult("format", "ok", text)
 
 
-def _sweep_format(announced: SkinFormat) -> SweepFormat:
-    return SweepFormat(
-        announced.rows, announced.cols, announced.rate_hz, 1, announced.dtype, announced.axes
-    )
+def _sweep_format(sent: SkinFormat) -> SweepFormat:
+    return SweepFormat(sent.rows, sent.cols, sent.rate_hz, 1, sent.dtype, sent.axes)
 
 
 def _start(silent: bool, first: Reception, listener: Listener) -> PartResult:
@@ -276,9 +266,9 @@ def _crc_fault(sample: bytes) -> str:
     return ""
 
 
-def _stream(heard: Reception, announced: SkinFormat) -> Iterator[PartResult]:
+def _stream(heard: Reception, sent: SkinFormat) -> Iterator[PartResult]:
     """Results for packets, sequence, loss, rate and clock."""
-    yield _packets(heard, announced)
+    yield _packets(heard, sent)
     fresh, lost, stale, restarts = heard.followed()
     yield _sequence(heard, stale, restarts)
     if lost:
@@ -292,41 +282,38 @@ def _stream(heard: Reception, announced: SkinFormat) -> Iterator[PartResult]:
         yield PartResult("loss", "FAIL", detail)
     else:
         yield PartResult("loss", "ok", f"none of {heard.frames} frames is missing")
-    period_ns, device = 1e9 / announced.rate_hz, DeviceClock()
+    period_ns, device = 1e9 / sent.rate_hz, DeviceClock()
     by_count = [(round(number * period_ns), arrival) for arrival, number, _ in fresh]
     by_clock = [(device.unwrap(p.t_us) * 1000, arrival) for arrival, _, p in fresh]
     rate = _compared(
         "rate",
         by_count,
         RATE_TOLERANCE,
-        f"FORMAT says {announced.rate_hz:g} Hz",
+        f"FORMAT says {sent.rate_hz:g} Hz",
         "announce the real rate",
     )
     yield rate
     clock = _compared("clock", by_clock, CLOCK_TOLERANCE, "bytes 16 to 19", "count microseconds")
-    trouble = _refused(heard, announced) if rate.verdict == "ok" and clock.verdict != "FAIL" else ""
+    trouble = _refused(heard, sent) if rate.verdict == "ok" and clock.verdict != "FAIL" else ""
     yield PartResult("clock", "FAIL", trouble) if trouble else clock
 
 
-def _packets(heard: Reception, announced: SkinFormat) -> PartResult:
+def _packets(heard: Reception, sent: SkinFormat) -> PartResult:
     """Whether the packets agree with FORMAT."""
     for _, p in heard.packets:
-        if (
-            p.taxels.shape[1:] != announced.shape
-            or p.taxels.dtype != _sweep_format(announced).numpy_type
-        ):
-            sent = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
+        if p.taxels.shape[1:] != sent.shape or p.taxels.dtype != _sweep_format(sent).numpy_type:
+            found = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
             return PartResult(
                 "packets",
                 "FAIL",
-                f"it sends {sent}, FORMAT announces another format; correct one of them",
+                f"it sends {found}, FORMAT announces another format; correct one of them",
             )
     sizes = [len(p.taxels) for _, p in heard.packets]
-    if max(sizes) > announced.packet_frames:
+    if max(sizes) > sent.packet_frames:
         return PartResult(
             "packets",
             "FAIL",
-            f"{max(sizes)} frames in a packet, FORMAT says {announced.packet_frames}; correct it",
+            f"{max(sizes)} frames in a packet, FORMAT says {sent.packet_frames}; correct it",
         )
     return PartResult("packets", "ok", f"{len(sizes)} packets of {median(sizes):g} frames")
 
@@ -390,10 +377,10 @@ def _compared(
     return PartResult(part, "ok", text)
 
 
-def _refused(heard: Reception, announced: SkinFormat) -> str:
+def _refused(heard: Reception, sent: SkinFormat) -> str:
     """Why the box would restart this board, whose clock disagrees with its frame count; ""
     otherwise."""
-    stream = Stream(_sweep_format(announced), SensorCounters())
+    stream = Stream(_sweep_format(sent), SensorCounters())
     stream.restart()
     try:
         for t_ns, data in heard.transfers:
@@ -427,9 +414,7 @@ def _requests(listener: Listener) -> PartResult:
     )
 
 
-def _overflow(
-    listener: Listener, announced: SkinFormat, before: Reception, *, port: bool
-) -> PartResult:
+def _overflow(listener: Listener, sent: SkinFormat, before: Reception, *, port: bool) -> PartResult:
     """Let the FIFO run over, then look for the gap and its flag."""
     if any(map(_flagged, before.packets)) and not before.followed()[1]:
         return PartResult(
@@ -437,7 +422,7 @@ def _overflow(
             "FAIL",
             "bit 1 of byte 6 is set while no frame is missing; clear it after one packet",
         )
-    fifo_s = announced.fifo_frames / announced.rate_hz
+    fifo_s = sent.fifo_frames / sent.rate_hz
     rate = before.size / max(1e-9, (before.transfers[-1][0] - before.transfers[0][0]) / 1e9)
     pause_s = 1.5 * fifo_s + (PORT_BYTES / rate if port else 0.1)
     if pause_s > LONGEST_PAUSE_S:

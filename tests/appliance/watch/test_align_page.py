@@ -95,7 +95,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     assert seen.page.is_visible("#way")
     seen.state("no-contact")
     assert seen.page.locator("#centre").evaluate("e => getComputedStyle(e).visibility") == "hidden"
-    assert set(seen.page.locator(".count").all_text_contents()) <= {"0", "1"}
+    until(lambda: set(seen.page.locator(".count").all_text_contents()) <= {"0", "1"})
     seen.state("off")
     assert seen.errors == []
     run.send_signal(signal.SIGINT)
