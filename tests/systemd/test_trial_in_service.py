@@ -180,7 +180,7 @@ def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     assert starts == [f"bundle {new[:8]} is on trial, start {i} of 3" for i in (1, 2, 3)]
     assert LEFT in left
     assert left.endswith("it was started 3 times without being committed")
-    assert "it was started 3 times without being committed" in store.do("bundles")
+    assert "it was started 3 times without being committed" in store.do("list")
 
 
 def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
@@ -297,7 +297,7 @@ def test_a_candidate_classifies_beside_and_becomes_the_one(
     machine.get("systemctl", "restart", "palpate")  # the counts go on
     wait_for(lambda: "on 2 of 2 sweeps" in service.status().get("shadow", ""), service)
     machine.get("systemctl", "stop", "palpate")
-    assert f"candidate {new[:8]} agrees with {store.a[:8]} on " in store.do("bundles")
+    assert f"candidate {new[:8]} agrees with {store.a[:8]} on " in store.do("list")
     store.do("promote")
     service.start(RUN)
     serves(service, new)
