@@ -26,6 +26,7 @@ def five() -> list[list[str]]:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole way to a bundle
 def test_the_five_commands_of_the_page_make_a_bundle(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -113,6 +113,7 @@ def test_the_counts_are_those_of_the_logits():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # starts processes for each run
 def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
     """The number of processes does not change the result."""
     one, two = (

@@ -77,6 +77,7 @@ def exported(source: Path, out: Path) -> bundle.Bundle:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole way to a bundle
 def test_the_whole_way(
     rigged: Callable[..., Rigged], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

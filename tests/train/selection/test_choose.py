@@ -486,6 +486,7 @@ def test_all_trainings_have_one_count(fakes):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole choice
 def test_the_command_packs_what_it_chose_and_says_why(tmp_path: Path, capsys):
     """With real methods and a real bundle, L-features suffice and are packed; the page loads
     nothing from elsewhere."""
