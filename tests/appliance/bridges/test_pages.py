@@ -265,6 +265,7 @@ def test_every_page_is_linked_and_every_link_leads_somewhere():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
 def test_the_manuals_client_without_hardware(tmp_path: Path):
     """Its three commands, with another path and a free port: the program names the bundle and
     prints three answers."""
@@ -307,6 +308,7 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
 def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
     """The real program behind a bridge is killed in the middle of a sweep: the client's wait ends,
     the restart is counted, and the same client sweeps on."""

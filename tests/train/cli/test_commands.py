@@ -129,6 +129,7 @@ def test_an_error_of_the_project_is_one_line(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # starts a process for each command
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
     """`palpate-train evaluate --list | head -1` gives exit code 1 and nothing on the error
     stream."""

@@ -92,6 +92,7 @@ def test_from_a_set_to_the_answers_of_the_box(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # a whole demo
 def test_the_demo_slides_a_skin_that_feels_shear(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

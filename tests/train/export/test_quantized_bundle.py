@@ -276,6 +276,7 @@ def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
     return replace(other, weights=fitted.weights | {"int8.weight": weight, "int8.bias": bias})
 
 
+@pytest.mark.thorough  # a fit of its own
 def test_a_range_for_one_outlier_is_refused(tight: Fit):
     """Ranges reach from the smallest to the largest value, and one sweep is a thousandfold: too
     little is left for all others."""
