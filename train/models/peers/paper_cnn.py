@@ -22,6 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from appliance.core.types import SweepFormat
 from train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from train.models.networks import Network, layer_constants
+from train.models.peers import fourier_convolution
 from train.models.recipe.augment import texture_scale
 from train.models.training import MIN_STEPS, Build, TrainingRecipe, network_method, scale_steps
 from train.onnx_tools.graph_builder import GraphBuilder, centred
@@ -77,6 +78,8 @@ class ImageLayers:
     dense: int
 
 
+FEW_CHANNELS = 8
+"""With fewer, the Fourier transform of a convolution costs more than it saves."""
 KERNEL = (15, 5)
 """Kernel of the paper's convolutions, frames by taxels (table I)."""
 PAPER = ImageLayers(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
@@ -134,8 +137,24 @@ class ImageNetwork(Network):
         """[B, R * C, T] -> activations of the dense layer [B, layers.dense]."""
         x = prepared.transpose(1, 2)[:, None]
         for conv, norm in self._convolutions():
-            x = functional.max_pool2d(norm(conv(x)), (self.layers.pool, 1), ceil_mode=True).relu()
+            y = norm(self._convolved(conv, x))
+            x = functional.max_pool2d(y, (self.layers.pool, 1), ceil_mode=True).relu()
         return torch.relu(self.dense(x.flatten(1)))
+
+    def _convolved(self, conv: nn.Conv2d, x: Tensor) -> Tensor:
+        """The convolution of `x`, in training on a processor by the quicker way."""
+        plain = conv.stride == (1, 1) and conv.in_channels >= FEW_CHANNELS
+        if (
+            plain
+            and self.training
+            and x.device.type == "cpu"
+            and not torch.is_autocast_enabled("cpu")
+        ):
+            bias = conv.bias
+            assert bias is not None
+            return fourier_convolution.convolve(x, conv.weight) + bias[:, None, None]
+        convolved: Tensor = conv(x)
+        return convolved
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
