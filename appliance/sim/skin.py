@@ -60,6 +60,15 @@ class Material:
 
 
 TUBES = (
+    Material("metal", 0.00, 0.0122, 9.0, 1.2, 0.0536, 159.0, 0.49),
+    Material("wood", 0.15, 0.0380, 5.2, 1.0, 0.0800, 109.5, 0.52),
+    Material("paper", 0.60, 0.3179, 5.2, 0.8, 0.0876, 86.0, 0.50),
+    Material("plastic rough", 0.20, 0.4070, 3.4, 0.4, 0.1266, 54.5, 0.70),
+    Material("plastic smooth", 0.30, 0.0304, 7.5, 1.2, 0.0544, 143.5, 0.88),
+    Material("foam", 1.20, 0.2572, 4.5, 1.0, 0.0634, 20.3, 0.60),
+)
+MATERIALS = tuple(tube.name for tube in TUBES)
+LEVEL_BLIND_TUBES = (
     Material("metal", 0.00, 0.0083, 9.0, 1.2, 0.0268, 159.0, 0.49),
     Material("wood", 0.00, 0.0167, 5.2, 1.0, 0.0400, 109.5, 0.52),
     Material("paper", 0.03, 0.0835, 5.2, 0.8, 0.0438, 86.0, 0.50),
@@ -67,7 +76,6 @@ TUBES = (
     Material("plastic smooth", 0.00, 0.0102, 7.5, 1.2, 0.0272, 143.5, 0.88),
     Material("foam", 0.20, 0.0668, 4.5, 1.0, 0.0317, 20.3, 0.60),
 )
-MATERIALS = tuple(tube.name for tube in TUBES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +84,8 @@ class World:
     EFFECTS to omit.
 
     A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were
-    fitted as described in docs/decisions/0003. Raises ConfigError if `off` names an unknown effect.
+    fitted as described in docs/decisions/0003 and 0010. Raises ConfigError if `off` names an
+    unknown effect.
     """
 
     off: frozenset[str] = frozenset()
@@ -91,16 +100,19 @@ class World:
     force_n: float = 1.0
     force_spread: float = 0.10  # share of the force; half of the precision stated in the paper
     pad_kpa_per_mm: float = 4.0
-    pad_half_mm: float = 8.5  # along the tube; further out the pad bends away
+    pad_half_mm: float = 14.0  # along the tube; further out the pad bends away,
+    pad_edge: float = 10.0  # and the higher this power, the flatter it is before
     counts_per_kpa: float = 15.0
-    noise_counts: float = 0.36
-    gain_spread: float = 0.17  # per attachment, one draw for all taxels and one for each
+    noise_counts: float = 0.88
+    gain_spread: float = 0.03  # per attachment, one draw for all taxels and one for each
     bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
     # of the transmission of vibrations by tape and glove, per attachment and octave
     colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
-    damping_octaves_per_mm: float = -0.60  # which is lower the closer the skin is to the fingertip;
-    relief_per_mm: float = 0.12  # there it follows the relief more, as the logarithm of the height
+    damping_octaves_per_mm: float = (
+        -0.585
+    )  # which is lower the closer the skin is to the fingertip;
+    relief_per_mm: float = 0.14  # there it follows the relief more, as the logarithm of the height
     spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
     spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
@@ -131,6 +143,20 @@ class World:
 
 
 WORLD = World()
+"""The simulated laboratory: it agrees with every number that the paper prints."""
+LEVEL_BLIND = World(
+    tubes=LEVEL_BLIND_TUBES,
+    pad_half_mm=8.5,
+    pad_edge=6.0,
+    noise_counts=0.36,
+    gain_spread=0.17,
+    damping_octaves_per_mm=-0.60,
+    relief_per_mm=0.12,
+)
+"""A harder question with the same spectra: each attachment draws the gains anew, so that the level
+of a taxel says nothing about the tube."""
+WORLDS = {"": WORLD, "level-blind": LEVEL_BLIND}
+"""Worlds by the name that follows the name of a set after a slash."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +319,7 @@ def noise(n: int, rng: Generator, world: World) -> Array:
 def gap(x: Array, y: Array | float, world: World) -> Array:
     """Distance in mm between the unloaded pad and a tube that it just touches: the tube's curvature
     across, the pad's end along."""
-    return np.square(y) / (2 * TUBE_RADIUS_MM) + (x / world.pad_half_mm) ** 6
+    return np.square(y) / (2 * TUBE_RADIUS_MM) + np.abs(x / world.pad_half_mm) ** world.pad_edge
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:

@@ -24,8 +24,10 @@ from appliance.sim import skin
 from train.data import published, readers
 
 SIMULATED = re.compile(
-    r"sim:(?P<name>[^:]+?)(?P<shear>x3)?(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?"
+    r"sim:(?P<name>[^:/]+?)(?P<shear>x3)?(/(?P<world>[^:]+))?"
+    r"(:(?P<seed>\d+)(-(?P<last>\d+))?)?(:(?P<each>[1-9]\d*))?"
 )
+SIMULATED_FORM = "sim:NAME[x3][/WORLD][:SEED[-LAST][:SWEEPS]]"
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
 OWN_NUMBERS = ("recording", "position", "session", "object")
 """Groups whose numbers only have a meaning within their set."""
@@ -197,11 +199,12 @@ class Dataset(sweep_set.SweepSet):
 
 def load(spec: str, seed: int = 0) -> Dataset:
     """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings,
-    sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME.
+    sim:NAME[x3][/WORLD][:SEED[-LAST][:SWEEPS]] or aeon:NAME.
 
-    x3: a skin with three axes. SWEEPS: number of sweeps for each material and position. SEED-LAST:
-    several simulated scenes joined, each with positions of its own. seed: for a simulated set whose
-    name holds none. Raises FormatError if the set is missing, broken or unknown.
+    x3: a skin with three axes. WORLD: of skin.WORLDS. SWEEPS: number of sweeps for each material
+    and position. SEED-LAST: several simulated scenes joined, each with positions of its own. seed:
+    for a simulated set whose name holds none. Raises FormatError if the set is missing, broken or
+    unknown.
     """
     if spec.startswith("sim:"):
         return _simulated(spec, seed)
@@ -268,17 +271,25 @@ def _unloaded(sets: Sequence[Dataset]) -> Array | None:
     return known
 
 
+def simulated_world(found: re.Match[str]) -> skin.World:
+    """The world of a name that SIMULATED matches. Raises FormatError for an unknown one."""
+    name = found["world"] or ""
+    if name not in skin.WORLDS:
+        named = ", ".join(world for world in skin.WORLDS if world)
+        raise FormatError(f"set {found[0]!r} is of an unknown world, {name!r}; use {named} or none")
+    return replace(skin.WORLDS[name], shear=bool(found["shear"]))
+
+
 def _simulated(spec: str, seed: int) -> Dataset:
     found, known = SIMULATED.fullmatch(spec), get_args(skin.SetName)
     if not found or found["name"] not in known:
         raise FormatError(
-            f"set {spec!r} is unknown; use sim:NAME[x3][:SEED[-LAST][:SWEEPS]], "
-            f"NAME one of {', '.join(known)}"
+            f"set {spec!r} is unknown; use {SIMULATED_FORM}, NAME one of {', '.join(known)}"
         )
     name: skin.SetName = found["name"]  # type: ignore[assignment]  # was just checked
     first = int(found["seed"] or seed)
     each = int(found["each"]) if found["each"] else None
-    physics, scenes = skin.World(shear=bool(found["shear"])), []
+    physics, scenes = simulated_world(found), []
     for world in range(first, int(found["last"] or first) + 1):
         samples, labels, position = skin.sweep_set(name, world, each, physics)
         groups = {"position": position, "world": np.full(len(labels), world)}

@@ -87,8 +87,7 @@ class EvaluationSweeps:
 
     @classmethod
     def simulated(cls, spec: str, seed: int = 0) -> EvaluationSweeps:
-        """Sweeps as in the set "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]" (see sets.load), with a rest
-        before and after each.
+        """Sweeps as in a simulated set (see sets.load), with a rest before and after each.
 
         They have the placements of that set and other noise. Raises FormatError as `sets.load`
         does.
@@ -105,7 +104,7 @@ class EvaluationSweeps:
         worlds = range(first, int(found["last"] or first) + 1)
         all_places = [(world, place) for world in worlds for place in skin.placements(name, world)]
         own, places = zip(*(all_places[i] for i in base.group("position")), strict=True)
-        physics = skin.World(shear=bool(found["shear"]))
+        physics = sets.simulated_world(found)
         scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own, physics)
         return cls(replace(base, samples=scene.draw()), scene)
 
