@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from sklearn.metrics import log_loss
 
+from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import softmax
 from appliance.sim import skin
@@ -38,15 +39,17 @@ from train.models.training import (
 )
 
 Array = NDArray[Any]
-PRINTED = {"new": 0.923, "hard": 0.917}
-"""Figs. 5, 7 and 10: leave one position out, and T-HARD."""
+PRINTED = {"left": 0.923, "new": 0.923, "hard": 0.917}
+"""Figs. 5, 7 and 10: leave one position out, twice, and T-HARD."""
+TESTED = {"left": "position left out", "new": "new positions", "hard": "T-HARD"}
 APART = 1000
-"""T-REAL of the seed + APART stands for the positions that were left out. It is like the ninth
-position, with more sweeps."""
-ATTACHMENTS = 20
+"""The set "new" is T-REAL of the seed + APART. It is like the position that was left out, with more
+sweeps."""
+ATTACHMENTS = 36
 FIRST_MARK = 25
 EACH = {"train": 10, "new": 3, "hard": 3}
-"""Sweeps of each material at each position."""
+"""Sweeps of each material at each position; those of the position left out are as many as those of
+"train"."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,11 @@ SIZES = {
 }
 
 
-def draw(seed: int, world: skin.World, window: int, each: dict[str, int]) -> dict[str, Dataset]:
+def draw(
+    seed: int, world: skin.World, window: int, each: dict[str, int], left: int | None = None
+) -> dict[str, Dataset]:
     """The sets "train", "new" and "hard" of a simulated world, the first `window` frames of each
-    sweep."""
+    sweep. left: number of a position of "train" that becomes the set "left"."""
     hard = range(ATTACHMENTS * (seed - 1) + 1, ATTACHMENTS * seed + 1)
     named: dict[str, list[tuple[skin.SetName, int]]] = {
         "train": [("T-REAL", seed)],
@@ -89,6 +94,12 @@ def draw(seed: int, world: skin.World, window: int, each: dict[str, int]) -> dic
                 )
             )
         drawn[key] = sets.join(parts)
+    if left is not None:
+        out = drawn["train"].group("position") == left
+        if not out.any():
+            last = int(drawn["train"].group("position").max())
+            raise FormatError(f"position {left} of T-REAL is unknown; use 0 to {last}")
+        drawn |= {"left": drawn["train"].take(out), "train": drawn["train"].take(~out)}
     return drawn
 
 
@@ -101,15 +112,16 @@ def follow(
     steps: int | None = None,
     log: Callable[[str], None] = lambda line: None,
     each: dict[str, int] | None = None,
+    left: int | None = None,
 ) -> dict[str, Any]:
     """Train, and write a point of the curve into `out` at each of `marks`; the content of the file
     at the end.
 
-    centred: a first layer subtracts each taxel's mean. steps: None for those of the size. Computed
-    in bfloat16 if the processor can. Raises OSError if `out` cannot be written.
+    centred: a first layer subtracts each taxel's mean. left: see draw. Computed in bfloat16 if the
+    processor can. Raises OSError if `out` cannot be written, FormatError if `left` is no position.
     """
     form, each = SIZES[size], each or EACH
-    about = [size, seed, centred, repr(world), steps, each]
+    about = [size, seed, centred, repr(world), steps, each, left]
     recipe = replace(form.recipe, steps=form.recipe.steps if steps is None else steps)
     unfinished, result = out.with_suffix(".pt"), _kept(out, about)
     if result is None:
@@ -124,14 +136,15 @@ def follow(
         _write(out, result)
     if any(point["step"] == recipe.steps for point in result["points"]):
         return result
-    given, at = draw(seed, world, form.window, each), set(marks(recipe.steps))
+    given, at = draw(seed, world, form.window, each, left), set(marks(recipe.steps))
 
     def watch(step: int, network: Network) -> None:
         if step in at:
             logits = {name: _logits(network, sweeps.samples) for name, sweeps in given.items()}
             earlier = [point for point in result["points"] if point["step"] < step]
             result["points"] = [*earlier, {"step": step} | _point(logits, given)]
-            result["newest"] = {name: _given(logits[name], given[name]) for name in PRINTED}
+            tested = {name: sweeps for name, sweeps in given.items() if name in PRINTED}
+            result["newest"] = {name: _given(logits[name], s) for name, s in tested.items()}
             _write(out, result)
 
     with deterministic_device(seed) as device:
@@ -206,12 +219,16 @@ def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any
 def table(result: dict[str, Any]) -> str:
     """A line for each point, for a person."""
     size, seed, centred = result["about"][:3]
+    tested = [name for name in TESTED if name in result["points"][-1]]
+    heads = "".join(f"{TESTED[name]:<24} " for name in tested)
     lines = [
         f"{size}{', means removed' * centred}, seed {seed}; "
         f"printed {PRINTED['new']} and {PRINTED['hard']}",
-        f"{'iteration':>9}  {'training':<9} {'new positions':<24} T-HARD",
+        f"{'iteration':>9}  {'training':<9} {heads}".rstrip(),
     ]
     for point in result["points"]:
-        new, hard = ("{:.3f} [{:.3f}, {:.3f}]".format(*point[name]) for name in ("new", "hard"))
-        lines.append(f"{point['step']:>9}  {point['train'][0]:<9.3f} {new:<24} {hard}")
+        shares = "".join(
+            f"{'{:.3f} [{:.3f}, {:.3f}]'.format(*point[name]):<24} " for name in tested
+        )
+        lines.append(f"{point['step']:>9}  {point['train'][0]:<9.3f} {shares}".rstrip())
     return "\n".join(lines)

@@ -86,6 +86,12 @@ def _add_cnn_curve(add: Add) -> None:
         "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
     )
     follow.add_argument(
+        "--left",
+        type=numbers.whole("--left", 0),
+        metavar="P",
+        help="position of T-REAL to leave out and to test on, 0 to 8 (none)",
+    )
+    follow.add_argument(
         "--steps",
         type=numbers.whole("--steps", 1),
         metavar="N",
@@ -263,7 +269,13 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
     print(
         cnn_curve.table(
             cnn_curve.follow(
-                args.out, args.size, args.seed, args.remove_means, steps=args.steps, log=log
+                args.out,
+                args.size,
+                args.seed,
+                args.remove_means,
+                steps=args.steps,
+                log=log,
+                left=args.left,
             )
         )
     )
