@@ -13,6 +13,7 @@ from typing import Any
 
 from appliance.core.errors import FormatError
 from train.arguments import numbers
+from train.calibration import level_check
 from train.data import labels, sets
 from train.data.progress import ProgressLine
 from train.data.summary import warnings_of
@@ -20,7 +21,7 @@ from train.evaluation import evaluate
 from train.models import methods
 
 SET = (
-    "FILE (.npz, .h5), a folder of recordings, sim:NAME[x3][:SEED[-LAST][:SWEEPS]] or aeon:NAME; "
+    f"FILE (.npz, .h5), a folder of recordings, {sets.SIMULATED_FORM} or aeon:NAME; "
     "several are joined"
 )
 LOG_EVERY_S = 30
@@ -132,14 +133,15 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated
     sets without one.
 
-    Warns of materials without sweeps, which are left out, and of taxels that never change.
+    Warns of materials without sweeps, which are left out, of taxels that never change, and of a
+    mean level that shows a session or another group rather than the material.
     """
     pairs = labels.parse_renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_renames(pairs, (name for sweeps in loaded for name in sweeps.materials))
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
-    for line in warnings_of(part if args.only else whole):
+    for line in [*warnings_of(part if args.only else whole), *level_check.warnings_of(part)]:
         print(f"palpate-train: {line}", file=sys.stderr)
     return part
 

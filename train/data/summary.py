@@ -6,7 +6,7 @@ reason why the folder cannot be trained on yet.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,21 +22,23 @@ from train.data.sets import Dataset, shortened
 
 Names = Mapping[str, Mapping[int, str]]
 """The names of each group's numbers."""
+Check = Callable[[Dataset], Sequence[str]]
+"""A check of a set that can be trained on; its warnings."""
 MAX_COLUMNS = 12
 """Largest number of columns of a table. A group with more values has only its line."""
 UNNAMED = "(none)"
 
 
-def describe(spec: str) -> str:
-    """The contents of the set that `spec` names, as lines. Raises FormatError if the set is
-    missing, broken or unknown."""
+def describe(spec: str, check: Check = lambda _: ()) -> str:
+    """The contents of the set that `spec` names, as lines. check: a further check. Raises
+    FormatError if the set is missing, broken or unknown."""
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
         return "\n".join(
             [
                 *description(whole, {}),
-                *(f"  {line}" for line in warnings_of(whole)),
+                *(f"  {line}" for line in [*warnings_of(whole), *check(whole)]),
                 *_unsendable(whole.materials),
             ]
         )
@@ -52,7 +54,8 @@ def describe(spec: str) -> str:
             "filled in from their neighbours"
         )
     try:
-        readers.from_recorded(recorded, folder, Dataset).require_materials()
+        trainable = readers.from_recorded(recorded, folder, Dataset).require_materials()
+        lines += [f"  {line}" for line in check(trainable)]
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
     return "\n".join(
@@ -198,8 +201,8 @@ def known() -> str:
         ".npy files",
         "FOLDER                 recordings of palpate record or palpate-train pull, in all "
         "folders below",
-        "sim:NAME[x3][:SEED[-LAST][:SWEEPS]]  simulated; x3: three axes, SWEEPS of a tube at "
-        "each position, SEED to LAST joined",
+        f"{sets.SIMULATED_FORM}  simulated; x3: three axes, SWEEPS of a tube at each position, "
+        "SEED to LAST joined",
     ]
     for name, (positions, each) in skin.SETS.items():
         total = positions * each * tubes
@@ -210,6 +213,10 @@ def known() -> str:
     lines.append(
         f"  sim:{'T-HARD:1-20':<12}{20 * total:>5} sweeps, twenty simulated scenes joined, "
         "for narrow intervals"
+    )
+    lines.append(
+        "  sim:NAME/level-blind   the same in a world where the level of a taxel says nothing "
+        "about the tube"
     )
     lines.append(
         f"{published.PREFIX}NAME              published series that aeon ships, taken to have "
