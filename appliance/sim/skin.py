@@ -62,10 +62,10 @@ class Material:
 TUBES = (
     Material("metal", 0.00, 0.0122, 9.0, 1.2, 0.0536, 159.0, 0.49),
     Material("wood", 0.15, 0.0380, 5.2, 1.0, 0.0800, 109.5, 0.52),
-    Material("paper", 0.60, 0.3179, 5.2, 0.8, 0.0876, 86.0, 0.50),
-    Material("plastic rough", 0.20, 0.4070, 3.4, 0.4, 0.1266, 54.5, 0.70),
+    Material("paper", 0.60, 0.3173, 5.2, 0.8, 0.0876, 86.0, 0.50),
+    Material("plastic rough", 0.20, 0.4067, 3.4, 0.4, 0.1266, 54.5, 0.70),
     Material("plastic smooth", 0.30, 0.0304, 7.5, 1.2, 0.0544, 143.5, 0.88),
-    Material("foam", 1.20, 0.2572, 4.5, 1.0, 0.0634, 20.3, 0.60),
+    Material("foam", 1.20, 0.2554, 4.5, 1.0, 0.0634, 20.3, 0.60),
 )
 MATERIALS = tuple(tube.name for tube in TUBES)
 LEVEL_BLIND_TUBES = (
@@ -104,17 +104,15 @@ class World:
     pad_edge: float = 10.0  # and the higher this power, the flatter it is before
     counts_per_kpa: float = 15.0
     noise_counts: float = 0.88
-    gain_spread: float = 0.03  # per attachment, one draw for all taxels and one for each
-    bedding_mm: float = 0.05  # spread of the height of tape and pad under a taxel, per attachment
+    gain_spread: float = 0.02  # per attachment, one draw for all taxels and one for each
+    bedding_mm: float = 0.03  # spread of the height of tape and pad under a taxel, per attachment
     # of the transmission of vibrations by tape and glove, per attachment and octave
     colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
-    damping_octaves_per_mm: float = (
-        -0.585
-    )  # which is lower the closer the skin is to the fingertip;
-    relief_per_mm: float = 0.14  # there it follows the relief more, as the logarithm of the height
-    spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
+    damping_octaves_per_mm: float = -0.55  # which is lower the closer the skin is to the fingertip;
+    relief_per_mm: float = 0.145  # there it follows the relief more, as the logarithm of the height
+    spot_spread: float = 0.215  # of height and vibration from one spot of a tube to another
+    spot_octaves: float = 0.12  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
     friction: float = 0.4  # shear over pressure, of all tubes: the paper names no coefficient
 
@@ -150,8 +148,11 @@ LEVEL_BLIND = World(
     pad_edge=6.0,
     noise_counts=0.36,
     gain_spread=0.17,
+    bedding_mm=0.05,
     damping_octaves_per_mm=-0.60,
     relief_per_mm=0.12,
+    spot_spread=0.23,
+    spot_octaves=0.125,
 )
 """A harder question with the same spectra: each attachment draws the gains anew, so that the level
 of a taxel says nothing about the tube."""
