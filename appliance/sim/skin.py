@@ -103,16 +103,16 @@ class World:
     pad_half_mm: float = 14.0  # along the tube; further out the pad bends away,
     pad_edge: float = 10.0  # and the higher this power, the flatter it is before
     counts_per_kpa: float = 15.0
-    noise_counts: float = 0.88
+    noise_counts: float = 0.82
     gain_spread: float = 0.02  # per attachment, one draw for all taxels and one for each
     bedding_mm: float = 0.03  # spread of the height of tape and pad under a taxel, per attachment
     # of the transmission of vibrations by tape and glove, per attachment and octave
     colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
-    damping_octaves_per_mm: float = -0.55  # which is lower the closer the skin is to the fingertip;
-    relief_per_mm: float = 0.145  # there it follows the relief more, as the logarithm of the height
-    spot_spread: float = 0.215  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.12  # spread of pitch and vibration frequency likewise
+    damping_octaves_per_mm: float = -0.54  # which is lower the closer the skin is to the fingertip;
+    relief_per_mm: float = 0.135  # there it follows the relief more, as the logarithm of the height
+    spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
+    spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
     friction: float = 0.4  # shear over pressure, of all tubes: the paper names no coefficient
 
@@ -151,8 +151,6 @@ LEVEL_BLIND = World(
     bedding_mm=0.05,
     damping_octaves_per_mm=-0.60,
     relief_per_mm=0.12,
-    spot_spread=0.23,
-    spot_octaves=0.125,
 )
 """A harder question with the same spectra: each attachment draws the gains anew, so that the level
 of a taxel says nothing about the tube."""
