@@ -110,7 +110,7 @@ class World:
     colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
     damping_octaves_per_mm: float = -0.54  # which is lower the closer the skin is to the fingertip;
-    relief_per_mm: float = 0.135  # there it follows the relief more, as the logarithm of the height
+    relief_per_mm: float = 0.14  # there it follows the relief more, as the logarithm of the height
     spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
     spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
