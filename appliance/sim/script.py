@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -82,7 +83,7 @@ def named(
             raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
         _, world, by = fits[0]
         acts = (
-            rests(seed, world, by)
+            rests(seed, replace(skin.LEVEL_BLIND, shear=world.shear), by)
             if name == "rest"
             else tubes(seed, world=world, seen=by, only=only)
         )
@@ -173,9 +174,9 @@ def _tubes(
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
-def rests(seed: int, world: skin.World = skin.WORLD, seen: SeenTubes = skin) -> Iterator[Act]:
+def rests(seed: int, world: skin.World = skin.LEVEL_BLIND, seen: SeenTubes = skin) -> Iterator[Act]:
     """A finger that is lifted and put on the wooden tube again, without end. The skin is shifted
-    between the touches."""
+    between the touches. A pad whose end is near shows shifts in both directions."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):

@@ -60,12 +60,12 @@ class Material:
 
 
 TUBES = (
-    Material("metal", 0.00, 0.0122, 9.0, 1.2, 0.0536, 159.0, 0.49),
-    Material("wood", 0.15, 0.0380, 5.2, 1.0, 0.0800, 109.5, 0.52),
-    Material("paper", 0.60, 0.3173, 5.2, 0.8, 0.0876, 86.0, 0.50),
-    Material("plastic rough", 0.20, 0.4067, 3.4, 0.4, 0.1266, 54.5, 0.70),
-    Material("plastic smooth", 0.30, 0.0304, 7.5, 1.2, 0.0544, 143.5, 0.88),
-    Material("foam", 1.20, 0.2554, 4.5, 1.0, 0.0634, 20.3, 0.60),
+    Material("metal", 0.00, 0.0122, 9.0, 1.2, 0.0697, 159.0, 0.49),
+    Material("wood", 0.15, 0.0380, 5.2, 1.0, 0.1040, 109.5, 0.52),
+    Material("paper", 0.60, 0.3173, 5.2, 0.8, 0.1139, 86.0, 0.50),
+    Material("plastic rough", 0.20, 0.4067, 3.4, 0.4, 0.1646, 54.5, 0.70),
+    Material("plastic smooth", 0.30, 0.0304, 7.5, 1.2, 0.0707, 143.5, 0.88),
+    Material("foam", 1.20, 0.2554, 4.5, 1.0, 0.0824, 20.3, 0.60),
 )
 MATERIALS = tuple(tube.name for tube in TUBES)
 LEVEL_BLIND_TUBES = (
@@ -109,10 +109,10 @@ class World:
     # of the transmission of vibrations by tape and glove, per attachment and octave
     colour_spread: float = 0.49
     damping_hz: float = 114.0  # the pad damps vibrations above this frequency,
-    damping_octaves_per_mm: float = -0.54  # which is lower the closer the skin is to the fingertip;
-    relief_per_mm: float = 0.14  # there it follows the relief more, as the logarithm of the height
-    spot_spread: float = 0.23  # of height and vibration from one spot of a tube to another
-    spot_octaves: float = 0.125  # spread of pitch and vibration frequency likewise
+    damping_octaves_per_mm: float = -0.59  # which is lower the closer the skin is to the fingertip;
+    relief_per_mm: float = 0.125  # there it follows the relief more, as the logarithm of the height
+    spot_spread: float = 0.265  # of height and vibration from one spot of a tube to another
+    spot_octaves: float = 0.145  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
     friction: float = 0.4  # shear over pressure, of all tubes: the paper names no coefficient
 
@@ -149,6 +149,8 @@ LEVEL_BLIND = World(
     noise_counts=0.36,
     gain_spread=0.17,
     bedding_mm=0.05,
+    spot_spread=0.23,
+    spot_octaves=0.125,
     damping_octaves_per_mm=-0.60,
     relief_per_mm=0.12,
 )

@@ -128,6 +128,8 @@ def follow(
         unfinished.unlink(missing_ok=True)  # of another training
         start: dict[str, Any] = {
             "about": about,
+            "world": next((name for name, one in skin.WORLDS.items() if one == world), "other"),
+            "left": left,
             "printed": PRINTED,
             "steps": recipe.steps,
             "points": [],

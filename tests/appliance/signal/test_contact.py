@@ -122,12 +122,15 @@ def test_the_rim_of_a_contact_is_not_filled_in():
     [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
 )
 def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: tuple[str, str]):
-    """The further forward the skin is, the further back is the centre; the advice names the right
-    end."""
+    """The further forward the skin is, the further back is the centre, if the end of the pad is
+    near; the advice names the right end."""
     found = []
     for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
         window = skin.window(
-            "wood", skin.Placement(**{along: mm}, seed=3), np.random.default_rng(0)
+            "wood",
+            skin.Placement(**{along: mm}, seed=3),
+            np.random.default_rng(0),
+            skin.LEVEL_BLIND,
         )[:200]
         found.append(centre(window, TARE, 5.4)[axis])
         text = displacement(window, TARE, 5.4, MIDDLE)

@@ -148,6 +148,21 @@ def test_simulated_sets_have_their_worlds():
     )
 
 
+def test_a_named_world_is_drawn_in_its_physics() -> None:
+    """Equal seeds have equal positions in all worlds. An unknown world is refused with those that
+    exist."""
+    blind, usual = sets.load("sim:T-HARD/level-blind:6:1"), sets.load("sim:T-HARD:6:1")
+    drawn = skin.sweep_set("T-HARD", 6, 1, skin.LEVEL_BLIND)[0]
+    np.testing.assert_array_equal(blind.samples, drawn)
+    assert not np.array_equal(blind.samples, usual.samples)
+    np.testing.assert_array_equal(blind.labels, usual.labels)
+    assert blind.source == "sim:T-HARD/level-blind:6:1"
+    shear = sets.load("sim:T-LABx3/level-blind:6-7:1")
+    assert shear.format == skin.SHEAR_FORMAT
+    with pytest.raises(FormatError, match="unknown world, 'flat'; use level-blind or none"):
+        sets.load("sim:T-REAL/flat:1")
+
+
 @pytest.mark.parametrize(
     "spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"]
 )

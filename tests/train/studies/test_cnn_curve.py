@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from appliance.core.errors import FormatError
 from appliance.sim import skin
 from train.models import checkpoint
 from train.models.peers import paper_cnn
@@ -63,6 +64,19 @@ def test_it_is_tested_on_positions_and_attachments_that_it_never_saw() -> None:
     third = skin.sweep_set("T-HARD", 3, 1)[0][:, :60]
     assert np.array_equal(drawn["hard"].samples[:6], third)
     assert not np.array_equal(drawn["train"].samples, drawn["new"].samples)
+
+
+def test_a_position_is_left_out_of_the_training_alone() -> None:
+    """Its sweeps are tested; the others, and the other test sets, stay as they are. A position that
+    T-REAL does not have is refused with those that it has."""
+    whole = cnn_curve.draw(2, skin.LEVEL_BLIND, 60, FEW)
+    drawn = cnn_curve.draw(2, skin.LEVEL_BLIND, 60, FEW, left=4)
+    of = whole["train"].group("position")
+    assert np.array_equal(drawn["left"].samples, whole["train"].samples[of == 4])
+    assert np.array_equal(drawn["train"].samples, whole["train"].samples[of != 4])
+    assert np.array_equal(drawn["hard"].samples, whole["hard"].samples)
+    with pytest.raises(FormatError, match="position 9 of T-REAL is unknown; use 0 to 8"):
+        cnn_curve.draw(2, skin.WORLD, 60, FEW, left=9)
 
 
 def test_points_are_doubled_and_the_last_iteration_is_one() -> None:
@@ -136,5 +150,11 @@ def test_the_command_prints_the_curve(tmp_path: Path, capsys: pytest.CaptureFixt
     assert lines[0] == "small, seed 3; printed 0.923 and 0.917"
     assert lines[2].split()[0] == "2"
     assert len(lines) == 3
+    chosen = ["--world", "level-blind", "--left", "0"]
+    assert main(["cnn-curve", "--seed", "3", "--steps", "2", *chosen, "--out", str(out)]) == 0
+    assert "position left out" in capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert (result["world"], result["left"]) == ("level-blind", 0)
+    assert set(result["newest"]) == {"left", "new", "hard"}
     assert main(["cnn-curve", "--steps", "0", "--out", str(out)]) != 0
     assert "--steps 0 is out of range; use a whole number from 1 on" in capsys.readouterr().err

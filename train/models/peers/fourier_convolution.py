@@ -28,14 +28,15 @@ class _Convolution(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
-        size, margin = x.shape[2:], [n // 2 for n in weight.shape[2:]]
-        circle = [next_fast_len(n + m, real=True) for n, m in zip(size, margin, strict=True)]
-        ctx.size, ctx.margin, ctx.circle, ctx.kernel = size, margin, circle, weight.shape[2:]
+        size, kernel = x.shape[2:], weight.shape[2:]
+        margin = [n // 2 for n in kernel]
+        whole = (max(n + m, k) for n, m, k in zip(size, margin, kernel, strict=True))
+        circle = [next_fast_len(n, real=True) for n in whole]
+        ctx.size, ctx.margin, ctx.circle, ctx.kernel = size, margin, circle, kernel
         swept = _spectra(x, circle)
         kernels = _spectra(weight.flip(2, 3), circle).transpose(1, 2).contiguous()
         ctx.save_for_backward(swept, kernels)
-        whole = _images(torch.bmm(swept, kernels), circle)
-        return _part(whole, margin, size)
+        return _part(_images(torch.bmm(swept, kernels), circle), margin, size)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,14 +1,15 @@
 """The choice of heads by held-out groups of the training sweeps.
 
-Candidates differ in the filters and their features, in the spectrum, and in whether heads see
-augmented copies. Each is scored by the cross entropy of sweeps whose group its heads did not see,
-at its best temperature; every group counts the same.
+Candidates differ in the filters and their features, in the spectrum, in the loads of taxels, and in
+whether heads see augmented copies. Each is scored by the cross entropy of sweeps whose group its
+heads did not see, at its best temperature; every group counts the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,8 @@ class HeldOutScores:
     known: the data that heads are fitted to, for each part the same sweeps in the same order; their
     features may differ, if a trunk was trained without the part. copied: score augmented copies of
     the held-out sweeps as well, which then count as much as these. labels, clusters: of everything
-    that is scored [n]; a cluster is the number of a part. own: bool [n], True for a sweep and False
-    for a copy.
+    that is scored [n]; a cluster is the number of a part. groups: text [n], what the part leaves
+    out. own: bool [n], True for a sweep and False for a copy.
     """
 
     def __init__(
@@ -68,9 +69,8 @@ class HeldOutScores:
         sizes = [(int(parts[i].out.sum()), int(self._copies[i].sum())) for i in numbers]
         self.own = np.concatenate([np.repeat([True, False], pair) for pair in sizes])
         self.clusters = np.repeat(numbers, [sum(pair) for pair in sizes])
-        kind = np.array([part.group for part in parts])[self.clusters] + np.where(
-            self.own, "", "\n"
-        )
+        self.groups = np.array([part.group for part in parts])[self.clusters]
+        kind = self.groups + np.where(self.own, "", "\n")
         _, member, counts = np.unique(kind, return_inverse=True, return_counts=True)
         self.weights = 1 / counts[member] / len(counts)
         self._logits: dict[tuple[Columns, bool], Array] = {}
@@ -109,6 +109,29 @@ class HeldOutScores:
         by_part = np.bincount(self.clusters, gain)
         return self.loss(one) < self.loss(other) and bool(
             gain.sum() > ERRORS * max(map(_error, (gain, by_part)))
+        )
+
+    def worse(self, one: ScoredPlan, other: ScoredPlan) -> bool:
+        """Whether `one` is less accurate than `other` by more than chance: one standard error of
+        the paired difference over sweeps. Something that joins has to show less than something that
+        replaces, but it must not harm, not even in a single part."""
+        lost = self._lost(one, other)
+        return bool(lost.sum() > max(_error(lost), TINY))
+
+    def helps(self, one: ScoredPlan, other: ScoredPlan) -> bool:
+        """Whether `one` has a lower loss than `other` by more than ERRORS standard errors of the
+        paired difference, no group of the sweeps shows the opposite, and the accuracy is not worse.
+
+        Here the loss decides, because a level shows in margins long before it shows in labels: the
+        held-out sweeps may all be right without it, and those of a new condition not.
+        """
+        gain = self.weights * (other.losses - one.losses)
+        by_part = np.bincount(self.clusters, gain)
+        groups = [gain[self.groups == name] for name in np.unique(self.groups)]
+        return (
+            bool(gain.sum() > ERRORS * max(map(_error, (gain, by_part))))
+            and all(part.sum() >= -_error(part) for part in groups)
+            and not self.worse(one, other)
         )
 
     def holds(self, one: ScoredPlan, other: ScoredPlan) -> bool:
@@ -165,28 +188,30 @@ class FeatureColumns:
     """Numbers of the features of a trunk, by their source.
 
     magnitudes, shares: int [n], the two features of each filter. kinds: the filters of each kind,
-    zero-sum ones first. levels, bands: of the distribution and of the spectrum; may be empty.
+    zero-sum ones first. levels, loads, bands: of the distribution, the loads and the spectrum; may
+    be empty.
     """
 
     magnitudes: Array
     shares: Array
     kinds: tuple[Array, ...]
     levels: Array
+    loads: Array
     bands: Array
 
     @classmethod
     def of(cls, layout: Mapping[str, slice], free: Array) -> FeatureColumns:
         """The columns of a trunk with this graph.layout; free: bool [n], of its filters."""
-        magnitudes, shares, levels, bands = (
+        magnitudes, shares, levels, loads, bands = (
             np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
-            for name in ("magnitudes", "shares", "levels", "bands")
+            for name in ("magnitudes", "shares", "levels", "loads", "bands")
         )
         kinds = tuple(np.flatnonzero(free == kind) for kind in np.unique(free))
-        return cls(magnitudes, shares, kinds, levels, bands)
+        return cls(magnitudes, shares, kinds, levels, loads, bands)
 
     def filters(self) -> Array:
         """The filter [F] of each feature, -1 if it is not of a filter."""
-        every = (self.magnitudes, self.shares, self.levels, self.bands)
+        every = (self.magnitudes, self.shares, self.levels, self.loads, self.bands)
         filters = np.full(1 + max(int(part.max(initial=-1)) for part in every), -1)
         for part in (self.magnitudes, self.shares):
             filters[part] = np.arange(len(part))
@@ -198,14 +223,16 @@ Heads = tuple[HeadPart, ...]
 
 @dataclass(frozen=True)
 class Candidates:
-    """The heads to choose from. copies: whether all discriminants see augmented copies, because
-    held-out sweeps cannot show the use of these.
+    """The heads to choose from. copies: whether all discriminants see augmented copies at first,
+    because the skin will be put back. loads: whether held-out groups can show what loads are good
+    for; the level of one session names its materials.
 
     Sweeps are too few to distinguish more candidates than these.
     """
 
     columns: FeatureColumns
     copies: bool = False
+    loads: bool = False
 
     def plain(self) -> dict[str, Heads]:
         """The usual candidate, and magnitudes alone.
@@ -236,6 +263,25 @@ class Candidates:
             if (name, copies) != (kept, self.copies)
         }
 
+    def reduced(self) -> dict[str, Callable[[Heads], Heads]]:
+        """What the usual candidate may lack: each changes heads to heads without it."""
+        views = {"distribution": self.columns.levels, "spectrum": self.columns.bands}
+        without = {
+            f"without {name}": partial(_without, columns=columns)
+            for name, columns in views.items()
+            if len(columns)
+        }
+        plain = {"without copies": _without_copies} if self.copies else {}
+        return without | plain
+
+    def loaded(self, best: Heads) -> dict[str, Heads]:
+        """The best candidate with the loads, in a discriminant of their own and in each."""
+        loads = self.columns.loads
+        if not (self.loads and len(loads)):
+            return {}
+        alone = HeadPart(tuple(loads.tolist()), best[0].copies)
+        return {"with loads beside": (*best, alone), "with loads in each": _with(best, loads)}
+
     def by_kind(self, shares: bool) -> Heads:
         """A discriminant of each kind of filters, zero-sum ones first: of their magnitudes, or of
         magnitudes and shares."""
@@ -247,18 +293,37 @@ class Candidates:
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
     """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them."""
+    latter. Plain candidates are compared first, then extensions of the best of them; loads join
+    last, where they help."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():
             log(f"choosing: {name}")
             yield scores.score(parts)
 
-    plain = list(scored(candidates.plain()))
-    best = min(plain, key=scores.loss)
+    usual, *others = scored(candidates.plain())
+    for name, lessen in candidates.reduced().items():
+        (less,) = scored({name: lessen(usual.plan.parts)})
+        usual = less if scores.worse(usual, less) else usual
+    best = min([usual, *others], key=scores.loss)
     extended = list(scored(candidates.extended(best.plan.parts)))
-    best = min([*plain, *extended], key=scores.loss)
-    return best if scores.better(best, plain[0]) else plain[0]
+    best = min([usual, *others, *extended], key=scores.loss)
+    chosen = best if scores.better(best, usual) else usual
+    loaded = list(scored(candidates.loaded(chosen.plan.parts)))
+    if loaded and scores.helps(best := min(loaded, key=scores.loss), chosen):
+        return best
+    return chosen
+
+
+def _without(parts: Heads, columns: Array) -> Heads:
+    """`parts` without these features; of parts that then see the same, one."""
+    dropped = set(columns.tolist())
+    left = (replace(p, columns=tuple(c for c in p.columns if c not in dropped)) for p in parts)
+    return tuple(dict.fromkeys(replace(p, factor=1.0) for p in left if p.columns))
+
+
+def _without_copies(parts: Heads) -> Heads:
+    return tuple(replace(p, copies=False) for p in parts)
 
 
 def _with(parts: Heads, more: Array) -> Heads:

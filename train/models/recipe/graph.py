@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from appliance.core.types import SweepFormat
-from train.models.recipe import bank, distribution, spectrum
+from train.models.recipe import bank, distribution, loads, spectrum
 from train.models.recipe.architectures import FLOOR, NOISE_LIMIT, PREFIXES, Architecture, each_frame
 from train.onnx_tools import graph_builder
 from train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
@@ -82,6 +82,7 @@ def trunk_graph(
     parts += nodes.bank(weights) if architecture.pools else []
     parts += nodes.distribution(weights) if architecture.distribution else []
     parts += nodes.means() if keep_means else []
+    parts += nodes.loads() if architecture.loads else []
     parts += nodes.spectrum() if architecture.spectrum else []
     size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
     g = nodes.g
@@ -99,7 +100,7 @@ def layout(
     keep_means: bool = False,
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
-    bank, `levels` of the distribution, `means`, `bands`."""
+    bank, `levels` of the distribution, `means`, `loads`, `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
@@ -107,6 +108,7 @@ def layout(
         "shares": filters * (architecture.pools > 1),
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "means": keep_means * format.channels,
+        "loads": architecture.loads * loads.count(format),
         "bands": architecture.spectrum * spectrum.count(format),
     }
     ends = np.cumsum(list(counts.values())).tolist()
@@ -195,6 +197,11 @@ class _TrunkNodes:
         counts = each_frame(window).known_steps(window, self._prefixes)
         levels = self._levels(g("Cast", self.raw, to=FLOAT), counts)
         return [g("Mul", levels, g.constant(self._scale))]
+
+    def loads(self) -> list[str]:
+        """See loads.nodes."""
+        counts = self.g("Cast", self.raw, to=FLOAT)
+        return [loads.nodes(self.g, counts, self._format, self._scale, self._prefixes)]
 
     def spectrum(self) -> list[str]:
         """See spectrum.nodes."""

@@ -1,13 +1,14 @@
 """The default recipe: from the sweeps of a training set to a finished model.
 
     training sweeps, and augmented copies of them
-       |   features:    filters, distribution and spectrum, in closed form
+       |   features:    filters, distribution, spectrum and loads, in closed form
        v
     candidates:         sums of discriminants, each of some of the features
        |   judged:      by groups that their heads did not see; then fewer filters
        v
-    stages:             trained convolutions beside them, if there are many sweeps
-       |                and too many of the held-out ones are named wrongly
+    stages:             trained convolutions beside them, if there are many sweeps of
+       |                each material, too many of the held-out ones are named
+       |                wrongly, and stages do not make that worse
        v
     pruned:             a trunk with only the features that a discriminant sees
        |   finished:    heads in float and int8, calibration, contact positions
@@ -54,8 +55,9 @@ from train.onnx_tools.quantize import calibration_sweeps
 Array = NDArray[Any]
 STAGES = ARCHITECTURES["50k"]
 """The architecture of trained stages."""
-LEAST_SWEEPS = 200
-"""Smallest number of sweeps for training stages, which overfit to a few batches."""
+LEAST_EACH, LEAST_SWEEPS = 25, 100
+"""Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
+few sweeps of a material and to a few batches."""
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on stages improve too little for their share of the
 bundle's size and time."""
@@ -144,10 +146,16 @@ class Setup:
         return self.sweeps.take(~self.out), self.sweeps.take(self.out)
 
     @cached_property
+    def parts(self) -> list[InnerPart]:
+        """The parts by which candidates are judged."""
+        return inner_parts(self.sweeps)
+
+    @cached_property
     def may_train(self) -> bool:
         """Whether stages can be trained."""
-        enough = len(self.sweeps) >= LEAST_SWEEPS and self.by != "nothing"
-        return bool(self.settings.steps and enough and find_spec("torch"))
+        each = np.unique(self.sweeps.labels, return_counts=True)[1]
+        enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
+        return bool(self.settings.steps and enough and self.by != "nothing" and find_spec("torch"))
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
@@ -223,13 +231,15 @@ def features(setup: Setup) -> FixedFeatures:
 
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
-    return Candidates(fixed.columns, setup.settings.choose and setup.settings.reattached)
+    copies = setup.settings.choose and setup.settings.reattached
+    groups = any(part.group != "recording" for part in setup.parts)
+    return Candidates(fixed.columns, copies, groups)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
     """Step 3: the best candidate by held-out groups, with as few filters as suffice. Without a
     choice, one discriminant of all zero-sum filters."""
-    scores = setup.scores(fixed.data, inner_parts(setup.sweeps))
+    scores = setup.scores(fixed.data, setup.parts)
     if not setup.settings.choose:
         return HeadChoice(scores, scores.score(heads.by_kind(shares=True)[:1]))
     chosen = choice.choose(scores, heads, setup.part(2))
@@ -244,7 +254,8 @@ def with_stages(
 
     If the skin will be reattached, stages and the spectrum suffice, unless held-out sweeps and
     their copies show that more is better: a displaced contact changes the responses of filters
-    more. Sweeps of the recorded positions alone could not show it.
+    more. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
+    that they were not trained on are named worse than without them.
     """
     if not setup.may_train or judged.scores.accuracy(judged.chosen) >= ENOUGH:
         return None, judged
@@ -253,32 +264,38 @@ def with_stages(
     scores = setup.scores(
         _side_by_side(setup.data(stages), fixed.data), [InnerPart(setup.by, setup.out)]
     )
-    full = scores.score(_beside_stages(plan))
+    beside = _beside_stages(plan)
+    joined = full = scores.score(beside)
     if not setup.settings.choose:
         return stages, HeadChoice(scores, full)
     if setup.settings.reattached:
         log("choosing: stages and the spectrum alone")
-        lean = scores.score(_stages_alone(fixed.columns.bands))
-        if not scores.better(full, lean):
-            return stages, HeadChoice(scores, lean)
-    filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
-    return stages, HeadChoice(scores, fewer_filters(scores, full, filters, log))
+        lean = scores.score(_stages_alone(_lean_columns(fixed.columns, plan)))
+        joined = full if scores.better(full, lean) else lean
+    log("choosing: without stages")
+    if scores.worse(joined, scores.score(beside[1:])):
+        return None, judged
+    if joined is full:
+        filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
+        joined = fewer_filters(scores, full, filters, log)
+    return stages, HeadChoice(scores, joined)
 
 
 def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
     """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
     it."""
     size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
-    filters, shares, levels, bands = (
+    filters, shares, levels, loads, bands = (
         used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
         for part in (
-            layout.get(k, slice(0, 0)) for k in ("magnitudes", "shares", "levels", "bands")
+            layout.get(k, slice(0, 0)) for k in ("magnitudes", "shares", "levels", "loads", "bands")
         )
     )
     architecture = replace(
         stages.architecture if stages else fixed.architecture,
         pools=(len(filters) > 0) + (len(shares) > 0),
         distribution=len(levels) > 0,
+        loads=len(loads) > 0,
         spectrum=len(bands) > 0,
     )
     weights = dict(stages.weights) if stages else {}
@@ -335,7 +352,12 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         )
     scale = texture_scale(sweeps.samples)
     architecture = replace(
-        FIXED, spectrum=spectrum.count(format) > 0, pools=2, distribution=True, mains_hz=mains_hz
+        FIXED,
+        spectrum=spectrum.count(format) > 0,
+        pools=2,
+        distribution=True,
+        loads=True,
+        mains_hz=mains_hz,
     )
     kinds = (False,) if architecture.zero_sum(format.window) else (False, True)
     drawn = bank.draw(format, rng, kinds)
@@ -384,19 +406,25 @@ def _beside_stages(plan: HeadPlan) -> list[HeadPart]:
     copies, as stages do.
 
     Stages and fixed features are so different that they err on different sweeps. Together they name
-    sweeps of a new condition better than either alone, which no held-out part can show. Therefore
-    stages are added without a comparison.
+    sweeps of a new condition better than either alone, which held-out parts hardly show. Therefore
+    stages are added unless they are worse.
     """
     size = sum(STAGES.channels)
     fixed = [replace(p, columns=tuple(np.add(p.columns, size).tolist())) for p in plan.parts]
     return [HeadPart(tuple(range(size)), True), *fixed]
 
 
-def _stages_alone(bands: Array) -> list[HeadPart]:
-    """A discriminant of each stage and the spectrum, whose features `bands` come after those of
-    stages; all see copies."""
+def _lean_columns(columns: FeatureColumns, plan: HeadPlan) -> Array:
+    """The spectrum, and the loads if `plan` has them."""
+    loads = np.intersect1d(columns.loads, plan.columns())
+    return np.append(loads, columns.bands)
+
+
+def _stages_alone(fixed: Array) -> list[HeadPart]:
+    """A discriminant of each stage and the features `fixed`, which come after those of stages; all
+    see copies."""
     ends = np.cumsum(STAGES.channels).tolist()
-    spectrum = (ends[-1] + bands).tolist()
+    spectrum = (ends[-1] + fixed).tolist()
     return [
         HeadPart((*range(end - channels, end), *spectrum), True)
         for channels, end in zip(STAGES.channels, ends, strict=True)
@@ -414,6 +442,7 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
     ]
     words += ["magnitudes and shares" if pools > 1 else "magnitudes"] * (len(filters) > 0)
     words += ["distribution"] * trunk.architecture.distribution
+    words += ["loads"] * trunk.architecture.loads
     words += ["spectrum"] * trunk.architecture.spectrum
     words += [f"stages of {', '.join(map(str, channels))} channels"] * (len(channels) > 0)
     copied = sum(part.copies for part in plan.parts)

@@ -15,6 +15,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
+from appliance.sim import skin
 from train.arguments import numbers, options
 from train.arguments.types import Add
 from train.data import sets
@@ -84,6 +85,11 @@ def _add_cnn_curve(add: Add) -> None:
     )
     follow.add_argument(
         "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+    )
+    follow.add_argument(
+        "--world",
+        choices=tuple(name for name in skin.WORLDS if name),
+        help="simulated world (the laboratory)",
     )
     follow.add_argument(
         "--left",
@@ -276,6 +282,7 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
                 steps=args.steps,
                 log=log,
                 left=args.left,
+                world=skin.WORLDS[args.world or ""],
             )
         )
     )

@@ -40,11 +40,13 @@ def candidates(
     levels: Sequence[int] = (),
     bands: Sequence[int] = (),
     copies: bool = False,
+    loads: Sequence[int] = (),
+    grouped: bool = True,
 ) -> Candidates:
     """The candidates of a trunk with these features."""
-    parts = [np.array(part, int) for part in (magnitudes, shares, levels, bands)]
+    parts = [np.array(part, int) for part in (magnitudes, shares, levels, loads, bands)]
     columns = FeatureColumns(*parts[:2], tuple(map(np.array, kinds)), *parts[2:])
-    return Candidates(columns, copies)
+    return Candidates(columns, copies, grouped)
 
 
 def scores() -> HeldOutScores:
@@ -230,12 +232,16 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """They are the usual one and magnitudes alone; then the best with copies, with the spectrum,
-    and the spectrum alone."""
+    """They are the usual one and magnitudes alone; the usual one without the spectrum; then the
+    best with copies, with the spectrum, and the spectrum alone."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
-    assert len(tried) == len(set(tried)) == 2 + 5
-    assert tried[:2] == ["choosing: magnitudes, shares, distribution", "choosing: magnitudes"]
+    assert len(tried) == len(set(tried)) == 2 + 1 + 5
+    assert tried[:3] == [
+        "choosing: magnitudes, shares, distribution",
+        "choosing: magnitudes",
+        "choosing: without spectrum",
+    ]
     assert tried[-1] == "choosing: the spectrum alone, with copies"
     tried.clear()
     chosen = choice.choose(scores(), candidates([[0]], [0, 1], [2, 3]), tried.append)
@@ -244,12 +250,14 @@ def test_candidates_are_what_the_features_allow():
 
 
 def test_every_discriminant_sees_copies_where_these_are_wanted():
-    """There are fewer candidates, because all of them see copies."""
+    """There are fewer candidates, because all of them see copies. One without copies shows that
+    they do no harm."""
     tried: list[str] = []
     heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
     chosen = choice.choose(scores(), heads, tried.append)
     assert all(part.copies for part in chosen.plan.parts)
-    assert len(tried) == len(set(tried)) == 2 + 2
+    assert "choosing: without copies" in tried
+    assert len(tried) == len(set(tried)) == 2 + 2 + 2
 
 
 def test_the_usual_one_sees_each_kind_three_times():
@@ -271,3 +279,91 @@ def test_the_usual_one_sees_each_kind_three_times():
         (kind, *range(4, 12)) for kind in (0, 1)
     ]
     assert [part.columns for part in chosen.plan.parts] == wanted
+
+
+def spoiled(*noise: int) -> HeldOutScores:
+    """The scores of sweeps whose features `noise` name the material in two groups, and another one
+    in the first."""
+    given, parts = known()
+    rng = np.random.default_rng(1)
+    x = given.features.copy()
+    group = np.arange(len(x)) // (len(x) // 3)
+    for column in noise:
+        x[:, column] = (given.labels + (group == 0)) % 3 + 0.01 * rng.standard_normal(len(x))
+    copied = x + 0.1 * rng.standard_normal(x.shape).astype(np.float32)
+    return HeldOutScores([replace(given, features=x, copied=copied)] * 3, parts, 3)
+
+
+def test_a_view_stays_away_where_it_harms():
+    """A distribution that names materials within a group alone makes the usual candidate worse on
+    the other groups, so no discriminant sees it; a harmless one stays."""
+    heads = candidates([[0, 1]], [0, 1], [0, 1], levels=[2, 3])
+    harmed = choice.choose(spoiled(2, 3), heads, print)
+    assert not {2, 3} & set(harmed.plan.columns().tolist())
+    kept = choice.choose(scores(), candidates([[0]], [0], [0], levels=[1]), print)
+    assert 1 in kept.plan.columns()
+
+
+def test_copies_stay_away_where_they_harm():
+    """Copies that are named by another feature than the sweeps spoil the heads that see them."""
+    given, parts = known()
+    rng = np.random.default_rng(2)
+    mixed = given.features[rng.permutation(len(given.features))] * 3
+    at = HeldOutScores([replace(given, copied=mixed)] * 3, parts, 3)
+    heads = candidates([[0, 1]], [0, 1], [0, 1], copies=True)
+    assert not any(part.copies for part in choice.choose(at, heads, print).plan.parts)
+
+
+def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
+    """Scores of sweeps with one weak filter (0) and loads (1, 2) that name the material in all
+    groups."""
+    given, parts = known(seed=seed)
+    x = given.features[:, [3, 0, 1]].copy()
+    x[:, 0] += 0.4 * given.features[:, 0]
+    own = replace(given, features=x, copied=x)
+    columns = candidates([[0]], [0], [0], loads=[1, 2]).columns
+    return HeldOutScores([own] * 3, parts, 3), columns
+
+
+def test_loads_join_where_held_out_groups_show_it():
+    """Loads that name the material in all groups join; in one session they may not."""
+    at, columns = with_loads()
+    joined = choice.choose(at, Candidates(columns, False, True), print)
+    assert {1, 2} <= set(joined.plan.columns().tolist())
+    alone = choice.choose(at, Candidates(columns, False, False), print)
+    assert not {1, 2} & set(alone.plan.columns().tolist())
+
+
+def test_loads_that_mislead_in_another_group_stay_away():
+    """The level of a session names its materials and misleads in the next."""
+    heads = candidates([[0, 1]], [0, 1], [0, 1], loads=[2, 4])
+    chosen = choice.choose(spoiled(2), heads, print)
+    assert not {2, 4} & set(chosen.plan.columns().tolist())
+
+
+def test_one_group_that_shows_the_opposite_suffices_against_loads():
+    """Loads that help by force and harm by speed stay away, even if the sum is a gain."""
+    given, parts = known()
+    halves = [InnerPart("speed", np.arange(240) % 2 == half) for half in (0, 1)]
+    at = HeldOutScores([given] * 5, [*parts, *halves], 3)
+    one = at.score([HeadPart(GOOD, False)])
+    better = replace(one, losses=one.losses - np.where(at.groups == "speed", -0.05, 0.4))
+    assert not at.helps(better, one)
+    assert at.helps(replace(one, losses=one.losses - np.where(at.groups == "speed", 0, 0.4)), one)
+
+
+def test_worse_is_more_than_chance():
+    """A few wrong answers more are chance; many are not; none is not."""
+    at = scores()
+    one = at.score([HeadPart(GOOD, False)])
+    wrong = np.roll(one.logits, 1, axis=1)
+
+    def spoiled_by(n: int) -> choice.ScoredPlan:
+        logits = one.logits.copy()
+        right = np.flatnonzero(one.logits.argmax(axis=1) == at.labels)
+        logits[right[:: len(right) // n][:n]] = wrong[right[:: len(right) // n][:n]]
+        return replace(one, logits=logits)
+
+    assert at.worse(spoiled_by(40), one)
+    assert not at.worse(one, one)
+    assert not at.worse(one, spoiled_by(40))
