@@ -53,7 +53,7 @@ types: $(TOOLS) ## check types: mypy --strict
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
-	$(BIN)/palpate-train fit --set sim:T-REAL:1-6 --seed 1 --reattached --steps 1200 \
+	$(BIN)/palpate-train fit --set sim:T-REAL/level-blind:1-6 --seed 1 --reattached --steps 1200 \
 	  --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default \
 	  --version 3

@@ -20,6 +20,9 @@ from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from appliance.sim.rig import Act
 
+PLAYED = skin.LEVEL_BLIND
+"""The world that is played. The packaged bundle is fitted to it, and the end of its pad is so near
+that the contact shows a displacement in both directions."""
 SETS = "replay:"
 PAUSE_S = 0.1, 0.14
 """Time for which the finger is off the tube before and after a sweep. It is drawn for each sweep,
@@ -69,10 +72,10 @@ def named(
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
         able: list[tuple[SweepFormat, skin.World, SeenTubes]] = [
-            (world.format, world, skin) for world in (skin.WORLD, skin.World(shear=True))
+            (world.format, world, skin) for world in (PLAYED, replace(PLAYED, shear=True))
         ]
         if seen:
-            able = [(seen.FORMAT, skin.WORLD, seen)]
+            able = [(seen.FORMAT, PLAYED, seen)]
         format = format or able[0][0]
         fits = [
             one for one in able if (one[0].skin, one[0].rate_hz) == (format.skin, format.rate_hz)
@@ -83,7 +86,7 @@ def named(
             raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
         _, world, by = fits[0]
         acts = (
-            rests(seed, replace(skin.LEVEL_BLIND, shear=world.shear), by)
+            rests(seed, world, by)
             if name == "rest"
             else tubes(seed, world=world, seen=by, only=only)
         )
@@ -132,7 +135,7 @@ def tubes(
     seed: int,
     sweeps: int | None = None,
     places: Sequence[skin.Placement] = (),
-    world: skin.World = skin.WORLD,
+    world: skin.World = PLAYED,
     seen: SeenTubes = skin,
     only: str = "",
 ) -> Iterator[Act]:
@@ -174,9 +177,9 @@ def _tubes(
         yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
-def rests(seed: int, world: skin.World = skin.LEVEL_BLIND, seen: SeenTubes = skin) -> Iterator[Act]:
+def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
     """A finger that is lifted and put on the wooden tube again, without end. The skin is shifted
-    between the touches. A pad whose end is near shows shifts in both directions."""
+    between the touches."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):

@@ -40,7 +40,7 @@ SEVEN = ("direction=0", "force<=180")
 TRAIN, STRESS = "train", "stress"
 """Cases without a protocol: the sweeps that bundles and stressed methods are trained on, and those
 that are corrupted."""
-TRAINING = StudyCase(("sim:T-REAL:1",))
+TRAINING = StudyCase(("sim:T-REAL/level-blind:1",))
 OURS = ("default", "filter-bank", "compact", *(f"compact-{size}" for size in ARCHITECTURES))
 PEERS = (
     "L-gauss",
@@ -61,12 +61,14 @@ PEERS = (
 STUDY = Study(
     "chart",
     {
-        "hard": StudyCase(("sim:T-REAL:1", "sim:T-HARD:1-20"), "split:set=0->1"),
-        "lopo": StudyCase(("sim:T-REAL:1",), "leave:position"),
+        "hard": StudyCase(
+            ("sim:T-REAL/level-blind:1", "sim:T-HARD/level-blind:1-20"), "split:set=0->1"
+        ),
+        "lopo": StudyCase(("sim:T-REAL/level-blind:1",), "leave:position"),
         "force": StudyCase((FABRICS,), "leave:force", SEVEN, real=True, means_removed=True),
         "speed": StudyCase((FABRICS,), "leave:speed", SEVEN, real=True, means_removed=True),
         TRAIN: TRAINING,
-        STRESS: StudyCase(("sim:T-REAL:2:2",)),
+        STRESS: StudyCase(("sim:T-REAL/level-blind:2:2",)),
     },
     (*OURS, *PEERS),
     ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm", "st-hmp", "recurrent"),
@@ -75,10 +77,14 @@ NEAR = ("position<=2",)
 QUICK = Study(
     "chart",
     {
-        "hard": StudyCase(("sim:T-REAL:1001:3", "sim:T-HARD:1001-1002:2"), "split:set=0->1", NEAR),
-        "lopo": StudyCase(("sim:T-REAL:1001:3",), "leave:position", NEAR),
-        TRAIN: StudyCase(("sim:T-REAL:1001:3",), only=NEAR),
-        STRESS: StudyCase(("sim:T-LAB:1002:1",)),
+        "hard": StudyCase(
+            ("sim:T-REAL/level-blind:1001:3", "sim:T-HARD/level-blind:1001-1002:2"),
+            "split:set=0->1",
+            NEAR,
+        ),
+        "lopo": StudyCase(("sim:T-REAL/level-blind:1001:3",), "leave:position", NEAR),
+        TRAIN: StudyCase(("sim:T-REAL/level-blind:1001:3",), only=NEAR),
+        STRESS: StudyCase(("sim:T-LAB/level-blind:1002:1",)),
     },
     ("compact-1k", "compact", "L-gauss", "H-svm", "minirocket"),
 )

@@ -60,7 +60,7 @@ CASES = {
     "BasicMotions, published split": _published("BasicMotions", (5,)),
     "ArrowHead, published split": _published("ArrowHead", (5, 10)),
     "GunPoint, published split": _published("GunPoint", EACH),
-    TUBES: StudyCase(("sim:T-REAL:1",), "leave:position", curve=EACH),
+    TUBES: StudyCase(("sim:T-REAL/level-blind:1",), "leave:position", curve=EACH),
 }
 """In the order of the page."""
 STUDY = Study("development", CASES, (*OURS, *PEERS))
@@ -68,7 +68,9 @@ QUICK = Study(
     "development",
     {
         "GunPoint, published split": _published("GunPoint"),
-        TUBES: StudyCase(("sim:T-REAL:1001:3",), "leave:position", ("position<=2",), curve=EACH),
+        TUBES: StudyCase(
+            ("sim:T-REAL/level-blind:1001:3",), "leave:position", ("position<=2",), curve=EACH
+        ),
     },
     ("compact-50k", "edge-spectral", "L-gauss"),
 )

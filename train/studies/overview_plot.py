@@ -43,7 +43,7 @@ def draw(material: str, seed: int = SEED) -> str:
     The sweep is simulated, from a skin position that the bundle was not trained on. Raises
     FormatError for a material that is not simulated.
     """
-    sweeps = sets.load(f"sim:T-REAL:{seed}")
+    sweeps = sets.load(f"sim:T-REAL/level-blind:{seed}")
     if material not in sweeps.materials:
         raise FormatError(
             f"material {material!r} is not simulated; use one of {', '.join(sweeps.materials)}"

@@ -73,10 +73,12 @@ class Step:
 
 ALL = ("lopo", "hard", "lab", "random")
 FULL = {
-    "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position", folds=9),
-    "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}"), "split:set=0->1", folds=1),
-    "lab": StudyCase(("sim:T-LAB:{w}",), "random:10", folds=10),
-    "random": StudyCase(("sim:T-REAL:{w}",), "random:9", folds=9),
+    "lopo": StudyCase(("sim:T-REAL/level-blind:{w}",), "leave:position", folds=9),
+    "hard": StudyCase(
+        ("sim:T-REAL/level-blind:{w}", "sim:T-HARD/level-blind:{a}-{b}"), "split:set=0->1", folds=1
+    ),
+    "lab": StudyCase(("sim:T-LAB/level-blind:{w}",), "random:10", folds=10),
+    "random": StudyCase(("sim:T-REAL/level-blind:{w}",), "random:9", folds=9),
 }
 HARD, EASY = ("hard", "lopo"), ("lab", "random")
 FULL_STEPS = (
@@ -96,10 +98,15 @@ FULL_STEPS = (
 """Hard cases come first: an interrupted run then has the most important results."""
 NEAR = ("position<=2",)
 QUICK = {
-    "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
-    "hard": StudyCase(("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", NEAR, folds=1),
-    "lab": StudyCase(("sim:T-LAB:{w}:10",), "random:3", folds=3),
-    "random": StudyCase(("sim:T-REAL:{w}:4",), "random:3", NEAR, folds=3),
+    "lopo": StudyCase(("sim:T-REAL/level-blind:{w}:4",), "leave:position", NEAR, folds=3),
+    "hard": StudyCase(
+        ("sim:T-REAL/level-blind:{w}:4", "sim:T-HARD/level-blind:1-3:4"),
+        "split:set=0->1",
+        NEAR,
+        folds=1,
+    ),
+    "lab": StudyCase(("sim:T-LAB/level-blind:{w}:10",), "random:3", folds=3),
+    "random": StudyCase(("sim:T-REAL/level-blind:{w}:4",), "random:3", NEAR, folds=3),
 }
 QUICK_STEPS = (
     Step(BASELINES, ALL, (1, 2), 0.3),

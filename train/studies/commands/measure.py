@@ -28,7 +28,7 @@ from train.models import methods
 from train.studies import alignment, certainty, references, sim_calibration
 from train.studies.study import results_file, save
 
-STRESSED = "sim:T-REAL:101-104:1"
+STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
 STRESSED_METHODS = "default-reattached,default,minirocket,minirocket-augmented,H-svm,compact"
 """First the recipe of the packaged bundle."""
@@ -83,20 +83,7 @@ def _add_cnn_curve(add: Add) -> None:
         metavar="N",
         help="of the simulated world and the training (1)",
     )
-    follow.add_argument(
-        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
-    )
-    follow.add_argument(
-        "--world",
-        choices=tuple(name for name in skin.WORLDS if name),
-        help="simulated world (the laboratory)",
-    )
-    follow.add_argument(
-        "--left",
-        type=numbers.whole("--left", 0),
-        metavar="P",
-        help="position of T-REAL to leave out and to test on, 0 to 8 (none)",
-    )
+    _add_curve_sweeps(follow)
     follow.add_argument(
         "--steps",
         type=numbers.whole("--steps", 1),
@@ -112,26 +99,50 @@ def _add_cnn_curve(add: Add) -> None:
     )
 
 
+def _add_curve_sweeps(follow: argparse.ArgumentParser) -> None:
+    """The sweeps that the network is trained on and tested with."""
+    follow.add_argument(
+        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+    )
+    follow.add_argument(
+        "--world",
+        choices=tuple(name for name in skin.WORLDS if name),
+        help="simulated world (the laboratory)",
+    )
+    follow.add_argument(
+        "--left",
+        type=numbers.whole("--left", 0),
+        metavar="P",
+        help="position of T-REAL to leave out and to test on, 0 to 8 (none)",
+    )
+
+
 def _add_alignment(add: Add) -> None:
     command = add("alignment", run_alignment)
     command.add_argument(
         "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
     )
     command.add_argument(
-        "--seen", default="sim:T-REAL:1-6:2", metavar="SET", help="what it was trained on"
+        "--seen",
+        default="sim:T-REAL/level-blind:1-6:2",
+        metavar="SET",
+        help="what it was trained on",
     )
     command.add_argument(
-        "--unseen", default="sim:T-REAL:101-104:2", metavar="SET", help="moved from these places"
+        "--unseen",
+        default="sim:T-REAL/level-blind:101-104:2",
+        metavar="SET",
+        help="moved from these places",
     )
     command.add_argument(
-        "--hard", default="sim:T-HARD:101-136:2", metavar="SET", help="a row ahead"
+        "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
     )
     _add_out(command, "alignment")
 
 
 def _add_stress(add: Add) -> None:
     command = add("stress", run_stress)
-    options.add_set(command, "sim:T-REAL:1")
+    options.add_set(command, "sim:T-REAL/level-blind:1")
     command.add_argument(
         "--test",
         default=STRESSED,

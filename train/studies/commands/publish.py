@@ -126,7 +126,8 @@ def run_matrix(args: argparse.Namespace) -> None:
 def run_overview(args: argparse.Namespace) -> None:
     """Write the plot and print its path."""
     about = provenance.of(
-        score.provenance() | {"set": f"sim:T-REAL:{overview_plot.SEED}", "seed": overview_plot.SEED}
+        score.provenance()
+        | {"set": f"sim:T-REAL/level-blind:{overview_plot.SEED}", "seed": overview_plot.SEED}
     )
     put(
         args.out, provenance.in_svg(overview_plot.draw(args.material), about).encode(), parents=True
