@@ -19,7 +19,7 @@ from torch.nn import functional
 def convolve(x: Tensor, weight: Tensor) -> Tensor:
     """As conv2d with zero padding that keeps sizes: [B, I, H, W] and odd kernels [O, I, h, w] ->
     [B, O, H, W], float32. Differs from the direct sum by rounding alone."""
-    return _Convolution.apply(x, weight)  # type: ignore[no-any-return]  # PyTorch's has no types
+    return _Convolution.apply(x, weight)  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _Convolution(torch.autograd.Function):
@@ -53,13 +53,15 @@ class _Convolution(torch.autograd.Function):
 
 def _spectra(images: Tensor, circle: list[int]) -> Tensor:
     """[N, C, H, W] -> [frequencies, N, C]."""
-    return rfft2(images.contiguous(), circle).flatten(2).permute(2, 0, 1).contiguous()
+    spectra: Tensor = rfft2(images.contiguous(), circle)
+    return spectra.flatten(2).permute(2, 0, 1).contiguous()
 
 
 def _images(spectra: Tensor, circle: list[int]) -> Tensor:
     """[frequencies, N, C] -> [N, C, *circle]."""
     rows, cols = circle
-    return irfft2(spectra.permute(1, 2, 0).unflatten(2, (rows, cols // 2 + 1)), circle)
+    images: Tensor = irfft2(spectra.permute(1, 2, 0).unflatten(2, (rows, cols // 2 + 1)), circle)
+    return images
 
 
 def _part(whole: Tensor, start: Any, size: Any) -> Tensor:

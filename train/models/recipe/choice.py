@@ -266,13 +266,12 @@ class Candidates:
     def reduced(self) -> dict[str, Callable[[Heads], Heads]]:
         """What the usual candidate may lack: each changes heads to heads without it."""
         views = {"distribution": self.columns.levels, "spectrum": self.columns.bands}
-        without = {
+        without: dict[str, Callable[[Heads], Heads]] = {
             f"without {name}": partial(_without, columns=columns)
             for name, columns in views.items()
             if len(columns)
         }
-        plain = {"without copies": _without_copies} if self.copies else {}
-        return without | plain
+        return without | ({"without copies": _without_copies} if self.copies else {})
 
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
