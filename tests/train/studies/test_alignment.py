@@ -34,9 +34,9 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     )
     figures = alignment.measure(
         Classifier(wide, SystemClock()),
-        "sim:T-LAB:3:2",
-        "sim:T-LAB:1:1",
-        "sim:T-HARD:1:1",
+        "sim:T-LAB/level-blind:3:2",
+        "sim:T-LAB/level-blind:1:1",
+        "sim:T-HARD/level-blind:1:1",
         lambda line: None,
     )
     assert figures["other positions"]["moved"][0] == 0

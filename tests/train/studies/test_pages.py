@@ -54,7 +54,7 @@ def paper_facts(summary: Any) -> Facts:
     yield f"{len(summary['results'])} evaluations"
     yield from summary["methods"].values()
     yield from (
-        "sim:T-REAL:W, sim:T-HARD:A-B",
+        "sim:T-REAL/level-blind:W, sim:T-HARD/level-blind:A-B",
         "20 seeds of world W",
         "paper-cnn, centred",
         "55 of them",
