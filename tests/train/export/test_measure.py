@@ -152,7 +152,7 @@ def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
 
     monkeypatch.setattr(measure, "measure_all", recorded)
     (tmp_path / "scene.toml").write_text(
-        'sets = ["sim:T-REAL:1001:3"]\nonly = ["position<=2"]\nvaries = ["position"]\n'
+        'sets = ["sim:T-REAL/level-blind:1001:3"]\nonly = ["position<=2"]\nvaries = ["position"]\n'
         'methods = ["L-gauss"]\nreduce = []\n'
     )
     where = ["--jobs", "1", "--cache", str(tmp_path / "cache")]
