@@ -145,8 +145,8 @@ def follow(
             logits = {name: _logits(network, sweeps.samples) for name, sweeps in given.items()}
             earlier = [point for point in result["points"] if point["step"] < step]
             result["points"] = [*earlier, {"step": step} | _point(logits, given)]
-            tested = {name: sweeps for name, sweeps in given.items() if name in PRINTED}
-            result["newest"] = {name: _given(logits[name], s) for name, s in tested.items()}
+            tested = [name for name in given if name in TESTED]
+            result["newest"] = {name: _given(logits[name], given[name]) for name in tested}
             _write(out, result)
 
     with deterministic_device(seed) as device:

@@ -30,7 +30,7 @@ from train.onnx_tools.graph_builder import GraphBuilder, centred
 Array = NDArray[Any]
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
 """Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, because a
-core needs about a second and a half for each."""
+core needs about a second for each."""
 PAPER_RECIPE = TrainingRecipe(
     batch=50,
     peak_rate=1e-4,
