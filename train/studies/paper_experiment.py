@@ -6,6 +6,7 @@ evaluate caches folds, so an interrupted run goes on where it was.
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,7 @@ from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort
 from train.models.peers import prior_work
 from train.studies import paper_values
+from train.studies.paper_values import CNN
 from train.studies.study import Study, StudyCase, StudyRun
 
 Array = NDArray[Any]
@@ -34,106 +36,122 @@ Json = dict[str, Any]
 BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
-OWN = ("default", "default-reattached")
+OWN = ("default-reattached", "default")
 BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
-"""Tables of the results by method."""
-CURVE_CASES = {"lopo": "new", "hard": "hard"}
+"""Tables of the results by method; all but the last are of the case "lopo"."""
+CURVE_CASES = {"lopo": ("left", "new"), "hard": ("hard",)}
 """The sets of cnn_curve by the case that they stand for."""
 SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
-ATTACHMENTS = 20
-"""Seeds of T-HARD for each simulated world, 60 sweeps each."""
+ATTACHMENTS = 36
+"""Seeds of T-HARD for each seed of a case, 18 sweeps each."""
 COST_POINTS = 160
+PLACES = 10_000
+"""More than a seed has attachments."""
+LISTS = ("table", "results")
+"""Tables of the results that are lists."""
 
 
-def load(case: StudyCase, world: int) -> Dataset:
-    """The sweeps of a case in one simulated world: {w} in its sets stands for the world, {a} and
-    {b} for the world's first and last seed of T-HARD."""
-    last = ATTACHMENTS * world
-    sweeps = case.load(w=world, a=last - ATTACHMENTS + 1, b=last)
+def load(case: StudyCase, seed: int) -> Dataset:
+    """The sweeps of a case of one seed, which stands for {w} in the names of its sets; {a} and {b}
+    are its first and last seed of T-HARD."""
+    last = ATTACHMENTS * seed
+    sweeps = case.load(w=seed, a=last - ATTACHMENTS + 1, b=last)
     assert sweeps is not None  # all are simulated
     return sweeps
 
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same cases (`parts`) and worlds.
+    """Methods that are trained and tested in the same cases (`parts`) and with the same seeds.
 
-    fold_s: seconds of a fold on one core, to estimate the time left. means_removed: each taxel's
-    mean is subtracted in each sweep; the names of the methods then end in paper_values.CENTRED.
+    fold_s: seconds of a fold on one core, to estimate the time left.
     """
 
     methods: tuple[str, ...]
     parts: tuple[str, ...]
-    worlds: tuple[int, ...]
+    seeds: tuple[int, ...]
     fold_s: float
-    means_removed: bool = False
 
 
-ALL = ("lopo", "hard", "lab", "random")
-FULL = {
-    "lopo": StudyCase(("sim:T-REAL/level-blind:{w}",), "leave:position", folds=9),
-    "hard": StudyCase(
-        ("sim:T-REAL/level-blind:{w}", "sim:T-HARD/level-blind:{a}-{b}"), "split:set=0->1", folds=1
-    ),
-    "lab": StudyCase(("sim:T-LAB/level-blind:{w}",), "random:10", folds=10),
-    "random": StudyCase(("sim:T-REAL/level-blind:{w}",), "random:9", folds=9),
-}
-HARD, EASY = ("hard", "lopo"), ("lab", "random")
-FULL_STEPS = (
-    Step(BASELINES, ALL, (1, 2, 3, 4, 5), 1),
-    Step(NEIGHBOURS, ALL, (1, 2, 3), 1),
-    Step(("minirocket", "filter-bank", "st-hmp"), HARD, (1,), 12),
-    Step(OWN, ("hard",), (1,), 90),
-    Step(OWN, ("lopo",), (1,), 90),
-    Step(NETWORKS, HARD, (1,), 30),
-    Step(("paper-cnn",), HARD, (1,), 170, means_removed=True),
-    Step(("paper-cnn",), ("hard",), (1,), 170),
-    Step(("minirocket", "filter-bank", "st-hmp"), EASY, (1,), 12),
-    Step(OWN, EASY, (1,), 90),
-    Step(NETWORKS, EASY, (1,), 30),
-    Step(("paper-cnn",), ("lopo",), (1,), 170),
+HARD, EASY = ("lopo", "hard"), ("lab", "random")
+BLIND = "/level-blind"
+"""End of the name of a case in the level-blind world."""
+HARD_BLIND = tuple(part + BLIND for part in HARD)
+
+
+def in_both_worlds(laboratory: Mapping[str, StudyCase]) -> dict[str, StudyCase]:
+    """The cases of the laboratory, and its HARD ones in the level-blind world too."""
+    return {
+        **laboratory,
+        **{
+            part + BLIND: replace(
+                laboratory[part],
+                sets=tuple(
+                    re.sub(r"^sim:[^:]*", rf"\g<0>{BLIND}", name) for name in laboratory[part].sets
+                ),
+            )
+            for part in HARD
+        },
+    }
+
+
+FULL = in_both_worlds(
+    {
+        "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position", folds=9),
+        "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}:3"), "split:set=0->1", folds=1),
+        "lab": StudyCase(("sim:T-LAB:{w}",), "random:10", folds=10),
+        "random": StudyCase(("sim:T-REAL:{w}",), "random:9", folds=9),
+    }
 )
-"""Hard cases come first: an interrupted run then has the most important results."""
+FULL_STEPS = (
+    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3), 1),
+    Step(NEIGHBOURS, (*HARD, *HARD_BLIND), (1, 2, 3), 1),
+    Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3), 90),
+    Step(OWN[:1], ("lopo",), (1, 2, 3), 60),
+    Step(OWN[:1], ("lopo" + BLIND,), (1,), 130),
+    Step(("minirocket", "filter-bank", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
+    Step(NETWORKS, (*HARD, *HARD_BLIND), (1,), 60),
+    Step(("paper-cnn-centred",), ("hard", "hard" + BLIND), (1,), 250),
+)
+"""The paper's CNN is not among them: cnn_curve trains it, and `with_curves` takes its results."""
 NEAR = ("position<=2",)
-QUICK = {
-    "lopo": StudyCase(("sim:T-REAL/level-blind:{w}:4",), "leave:position", NEAR, folds=3),
-    "hard": StudyCase(
-        ("sim:T-REAL/level-blind:{w}:4", "sim:T-HARD/level-blind:1-3:4"),
-        "split:set=0->1",
-        NEAR,
-        folds=1,
-    ),
-    "lab": StudyCase(("sim:T-LAB/level-blind:{w}:10",), "random:3", folds=3),
-    "random": StudyCase(("sim:T-REAL/level-blind:{w}:4",), "random:3", NEAR, folds=3),
-}
+QUICK = in_both_worlds(
+    {
+        "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
+        "hard": StudyCase(
+            ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", NEAR, folds=1
+        ),
+        "lab": StudyCase(("sim:T-LAB:{w}:10",), "random:3", folds=3),
+        "random": StudyCase(("sim:T-REAL:{w}:4",), "random:3", NEAR, folds=3),
+    }
+)
 QUICK_STEPS = (
-    Step(BASELINES, ALL, (1, 2), 0.3),
+    Step(BASELINES, tuple(QUICK), (1, 2), 0.3),
     Step(
         (*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS),
-        ("lopo", "hard"),
+        (*HARD, *HARD_BLIND),
         (1,),
         1,
     ),
-    Step(("paper-cnn",), ("hard", "lopo"), (1,), 15, means_removed=True),
-    Step(("paper-cnn",), ("hard",), (1,), 15),
+    Step((CNN,), HARD, (1,), 15),
 )
 QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a method in a case of a simulated world: labels [n] and logits [n, K] of the
-    tested sweeps.
+    """The result of a method in a case with one seed: labels [n] and logits [n, K] of the tested
+    sweeps.
 
-    place: int [n], the attachment of the skin, unique over worlds. costs: of each fold that has
+    place: int [n], the attachment of the skin, unique over seeds. costs: of each fold that has
     them, [iterations, 2]. about: its entry in the results.
     """
 
     part: str
     method: str
-    world: int
+    seed: int
     labels: Array
     logits: Array
     place: Array
@@ -141,19 +159,46 @@ class Outcome:
     about: dict[str, Any] = field(repr=False)
 
     @classmethod
-    def of(cls, part: str, world: int, result: Result) -> Outcome:
+    def of(cls, part: str, seed: int, result: Result) -> Outcome:
         """From a result of evaluate."""
         test, sweeps = result.test, result.sweeps
-        place = sweeps.group("position")[test] + 10_000 * world
+        place = sweeps.group("position")[test] + PLACES * seed
         costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
-        method = result.method + result.means_removed * paper_values.CENTRED
-        about = result.json() | {"part": part, "world": world}
-        return cls(part, method, world, sweeps.labels[test], result.logits, place, costs, about)
+        about = result.json() | {"part": part}
+        return cls(
+            part, result.method, seed, sweeps.labels[test], result.logits, place, costs, about
+        )
+
+    @classmethod
+    def of_curve(cls, part: str, curve: Json) -> Outcome:
+        """From the newest point of cnn_curve, for "lopo" or "hard" of its world."""
+        seed, point = curve["about"][1], curve["points"][-1]
+        newest = [curve["newest"][key] for key in CURVE_CASES[part] if key in curve["newest"]]
+        labels, logits = (
+            np.concatenate([np.array(each[key]) for each in newest]) for key in ("labels", "logits")
+        )
+        places = [np.array(each["position"]) + PLACES * i for i, each in enumerate(newest)]
+        place = np.concatenate(places) + 2 * PLACES * seed
+        costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])]
+        confusion = np.zeros((len(skin.MATERIALS),) * 2, int)
+        np.add.at(confusion, (labels, logits.argmax(1)), 1)
+        about = {
+            "part": part + (BLIND if curve["world"] else ""),
+            "method": CNN,
+            "seed": seed,
+            "ran": f"{point['step']} of {curve['steps']} iterations of 50",
+            "confusion": confusion.tolist(),
+            **dict.fromkeys(("fit_s", "ms_p50", "agreement")),
+            "materials": list(skin.MATERIALS),
+            "commit": curve["commit"],
+            "machine": curve["machine"],
+        }
+        return cls(about["part"], CNN, seed, labels, logits, place, costs, about)
 
     @cached_property
     def explorations(self) -> Array:
         """The explorations that `objects` draws of these sweeps."""
-        return objects(self.labels, self.place, self.world)
+        return objects(self.labels, self.place, self.seed)
 
     @property
     def right(self) -> Array:
@@ -192,19 +237,10 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
 
 def planned(found: Json, steps: Sequence[Step]) -> Json:
     """`found` without methods that are not in the plan any more."""
-    known = {m for step in steps for m in step.methods}
-    lists = {
-        key: [
-            one for one in found[key] if one["method"].removesuffix(paper_values.CENTRED) in known
-        ]
-        for key in ("table", "results")
-    }
+    known = {CNN, *(m for step in steps for m in step.methods)}
+    lists = {key: [one for one in found[key] if one["method"] in known] for key in LISTS}
     tables = {
-        key: {
-            name: value
-            for name, value in found[key].items()
-            if name.removesuffix(paper_values.CENTRED) in known
-        }
+        key: {name: value for name, value in found[key].items() if name in known}
         for key in BY_METHOD
     }
     return found | lists | tables
@@ -222,68 +258,45 @@ def joined(found: Json, earlier: Json) -> Json:
             *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
             *found[key],
         ]
-        for key in ("table", "results")
+        for key in LISTS
     }
     tables = {k: earlier[k] | found[k] for k in BY_METHOD}
     return earlier | found | tables | lists
 
 
 def _at(one: dict[str, Any]) -> tuple[Any, ...]:
-    """Key of an entry: part, method, means removed, world."""
-    return one["part"], one["method"], one.get("means_removed"), one.get("world")
+    """Key of an entry: part, method, seed."""
+    return one["part"], one["method"], one.get("seed")
 
 
-def with_curve(found: Json, curve: Json) -> Json:
-    """Results with the newest point of cnn_curve for the paper's CNN. Raises FormatError for the
-    curve of another training."""
-    if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
-        raise FormatError(
-            "this curve is not of the CNN as printed; run python -m train.studies cnn-curve "
-            "--size whole"
-        )
-    return joined(as_printed(curve, FULL) | {"quick": found["quick"]}, found)
-
-
-def as_printed(curve: Json, cases: Mapping[str, StudyCase]) -> Json:
-    """A summary of the paper's CNN at the newest point of its curve."""
-    point, ran = (
-        curve["points"][-1],
-        f"{curve['points'][-1]['step']} of {curve['steps']} iterations of 50",
-    )
-    outcomes = []
-    for part, name in CURVE_CASES.items():
-        newest = {k: np.array(v) for k, v in curve["newest"][name].items()}
-        about = {
-            "part": part,
-            "method": paper_values.CNNS[0],
-            "world": curve["about"][1],
-            "means_removed": False,
-            "ran": ran,
-            "confusion": point[f"{name} confusion"],
-            "fit_s": None,
-            "ms_p50": None,
-            "agreement": None,
-            "materials": list(skin.MATERIALS),
-            "commit": curve["commit"],
-            "machine": curve["machine"],
-        }
-        costs = (
-            [np.array([[p["step"], p["cost"]] for p in curve["points"]])] if part == "lopo" else []
-        )
-        outcomes.append(
-            Outcome(
-                part,
-                paper_values.CNNS[0],
-                curve["about"][1],
-                newest["labels"],
-                newest["logits"],
-                newest["position"],
-                costs,
-                about,
+def with_curves(found: Json, curves: Sequence[Json]) -> Json:
+    """Results with the newest points of all files of cnn_curve for the paper's CNN. Raises
+    FormatError for the curve of another training."""
+    for curve in curves:
+        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
+            raise FormatError(
+                "this curve is not of the CNN as printed; run python -m train.studies cnn-curve "
+                "--size whole"
             )
-        )
-    reached = {"step": point["step"], "steps": curve["steps"], "commit": curve["commit"]}
-    return summary(outcomes, cases, Effort(paper_steps=curve["steps"])) | {"curve": reached}
+    outcomes = [Outcome.of_curve(part, curve) for curve in curves for part in CURVE_CASES]
+    taken = summary(outcomes, FULL) | {"curves": [_reached(curve) for curve in curves]}
+    return joined(taken | {"quick": found["quick"]}, found)
+
+
+def _reached(curve: Json) -> Json:
+    """How far a training has come, and its result at the position that it left out."""
+    reached = {
+        "seed": curve["about"][1],
+        "world": curve["world"],
+        "step": curve["points"][-1]["step"],
+        "steps": curve["steps"],
+        "commit": curve["commit"],
+    }
+    if curve["left"] is None:
+        return reached
+    out = curve["newest"]["left"]
+    right = np.array(out["logits"]).argmax(1) == np.array(out["labels"])
+    return reached | {"left": curve["left"], "right": int(right.sum()), "total": len(right)}
 
 
 def _outcomes(
@@ -291,23 +304,23 @@ def _outcomes(
 ) -> Iterator[Outcome]:
     """Run step by step. After each fold `log` gets the progress and an estimate of the time
     left."""
-    todo = [(step, part, world) for step in steps for part in step.parts for world in step.worlds]
+    todo = [(step, part, seed) for step in steps for part in step.parts for seed in step.seeds]
     expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
     pace = 1 / (os.cpu_count() or 1)
-    for i, (step, part, world) in enumerate(todo):
+    for i, (step, part, seed) in enumerate(todo):
         start, done, folds = time.monotonic(), 0, len(step.methods) * cases[part].folds
 
         def count(line: str) -> None:
             nonlocal done
             done += 1
             left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
-            where_now = f"{i + 1}/{len(todo)} {part}, world {world}"  # noqa: B023
+            where_now = f"{i + 1}/{len(todo)} {part}, seed {seed}"  # noqa: B023
             how.log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
 
         protocols = (cases[part].protocol,)
-        plan = Plan(step.methods, protocols, (world,), step.means_removed, how.effort)
-        for result in evaluate(load(cases[part], world), plan, how.where, count):
-            yield Outcome.of(part, world, result)
+        plan = Plan(step.methods, protocols, (seed,), effort=how.effort)
+        for result in evaluate(load(cases[part], seed), plan, how.where, count):
+            yield Outcome.of(part, seed, result)
         took = time.monotonic() - start
         if took > expected[i] * pace / 10:  # else it came from the cache
             pace = took / expected[i]
@@ -328,9 +341,7 @@ def summary(
         },
         "table": [_row(*key, those) for key, those in groups.items()],
         "costs": {
-            m: [cost.tolist() for o in lopo[m] for cost in o.costs]
-            for m in paper_values.CNNS
-            if m in lopo
+            m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in (CNN,) if m in lopo
         },
         "confusion": {
             m: np.sum([o.about["confusion"] for o in those], 0).tolist()
@@ -357,11 +368,11 @@ def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
     return {
         "part": part,
         "method": method,
-        "worlds": [o.world for o in those],
+        "seeds": [o.seed for o in those],
         "right": int(right.sum()),
         "total": len(right),
         "share": estimate(right, place),
-        "printed": paper_values.ACCURACY[part].get(method),
+        "printed": paper_values.ACCURACY[part.removesuffix(BLIND)].get(method),
         "attachments": [len(each), round(min(each), 4), round(max(each), 4)],
         "ran": those[0].about["ran"],
         **{k: _median([o.about[k] for o in those]) for k in ("fit_s", "ms_p50")},

@@ -6,46 +6,46 @@ is true of each run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from train.reports import confusion_plot, html, provenance
-from train.reports.formatting import estimate, exact_percent, seconds
-from train.studies import TEMPLATES, plots
-from train.studies.paper_values import (
-    CNNS,
-    CONFUSION,
-    COST,
-    FIGURES,
-    SEVERAL,
-    display_name,
-    short_name,
+from train.reports.formatting import estimate, exact_percent, points, seconds
+from train.studies import TEMPLATES, differences, plots
+from train.studies.paper_experiment import ATTACHMENTS, BLIND, HARD, HARD_BLIND, OWN
+from train.studies.paper_stamps import (
+    BEST,
+    COST_FACTOR,
+    FIVE,
+    LEAST_CORRELATION,
+    NEAR,
+    NEAR_SEVERAL,
+    SUBJECTS,
+    stamps,
 )
+from train.studies.paper_values import CNN, CONFUSION, COST, FIGURES, SEVERAL, short_name
 
 TITLES = {
     "lopo": "T-REAL, leave one position out",
     "hard": "trained on T-REAL, tested on T-HARD",
+    "lopo" + BLIND: "level-blind T-REAL, leave one position out",
+    "hard" + BLIND: "trained on level-blind T-REAL, tested on T-HARD",
     "lab": "T-LAB, random folds",
     "random": "T-REAL, random folds",
 }
 """Hard protocols first."""
-HARD = ("lopo", "hard")
-"""The protocols that the paper is about."""
 COLUMNS = {
-    "lopo": "T-REAL\nleave position",
+    "lopo": "leave\nposition",
     "hard": "T-HARD",
-    "lab": "T-LAB\nrandom",
-    "random": "T-REAL\nrandom",
+    "lopo" + BLIND: "level-blind\nleave position",
+    "hard" + BLIND: "level-blind\nT-HARD",
 }
-FIVE = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
-BEST = "H-svm"
-OWN = ("default-reattached", "default")
-"""Our methods, the packaged recipe first."""
-NEAR, NEAR_ON_AVERAGE = 0.06, 0.03
-"""Targets of the calibration."""
+"""Columns of the picture of all methods."""
+NEAR_ON_AVERAGE = 0.02
+"""Target of the calibration for the mean."""
 Row = Mapping[str, Any]
 Key = tuple[str, str]
 """Part and method."""
@@ -80,65 +80,43 @@ class PaperReport:
     def __init__(self, summary: Mapping[str, Any]) -> None:
         self.summary = summary
         self.rows: dict[Key, Row] = {(row["part"], row["method"]): row for row in summary["table"]}
-        self.cnns = [method for method in CNNS if ("lopo", method) in self.rows]
-        self.own = [
-            method
-            for method in OWN
-            if ("hard", method) in self.rows or ("lopo", method) in self.rows
-        ]
+        self.stamps = stamps(summary)
+        self.cnn = ("lopo", CNN) in self.rows
+        self.own = [method for method in OWN if ("hard", method) in self.rows]
 
     def pictures(self) -> dict[str, str]:
         """All pictures by name."""
         drawn = {f"figure-{number}": self._bars(number, part) for part, number in FIGURES.items()}
-        if self.cnns:
-            groups = {
-                TITLES[part]: [self._bar(at) for at in self._compared() if at[0] == part]
-                for part in HARD
-            }
-            names, confusion = self.summary["results"][0]["materials"], self.summary["confusion"]
+        names, confusion = self.summary["results"][0]["materials"], self.summary["confusion"]
+        if self.cnn:
+            groups = {TITLES[part]: [self._bar(at) for at in self._compared(part)] for part in HARD}
             drawn |= {
                 "figure-9": plots.curve(self._costs(), COST, "Fig. 9: cost in training"),
-                "figure-10": plots.bars(
-                    {k: v for k, v in groups.items() if v}, "Fig. 10: H-svm, the CNN and ours"
-                ),
+                "figure-10": plots.bars(groups, "Fig. 10: H-svm, the CNN and ours"),
                 "figure-11": confusion_plot.draw(
-                    np.array(confusion[self.cnns[0]]),
-                    names,
-                    "Fig. 11: confusion of the CNN",
-                    CONFUSION,
-                ),
-                "figure-12": confusion_plot.draw(
-                    np.array(confusion[BEST]), names, "Fig. 12: confusion of H-svm"
+                    np.array(confusion[CNN]), names, "Fig. 11: confusion of the CNN", CONFUSION
                 ),
             }
+        drawn["figure-12"] = confusion_plot.draw(
+            np.array(confusion[BEST]), names, "Fig. 12: confusion of H-svm"
+        )
         several = self.summary["several"]
-        shown = {
-            short_name(m): several[m] for m in (BEST, *self.cnns[:1], *self.own[:1]) if m in several
-        }
+        shown = {short_name(m): several[m] for m in (BEST, CNN, *self.own[:1]) if m in several}
         printed = {short_name(m): values for m, values in SEVERAL.items()}
         cells: dict[Key, plots.Estimate] = {
-            (display_name(method).replace("paper-cnn,", "cnn,"), COLUMNS[part]): tuple(row["share"])
-            for part in TITLES
+            (method, COLUMNS[part]): tuple(row["share"])
+            for part in COLUMNS
             for (its_part, method), row in self.rows.items()
             if its_part == part
         }
         return drawn | {
             "figure-13": plots.sweeps(shown, printed, "Fig. 13: one, two and three sweeps"),
-            "methods": plots.grid({"": cells}, "all methods on all protocols"),
+            "methods": plots.grid({"": cells}, "all methods, new positions, in both worlds"),
         }
 
     def run(self) -> dict[str, Any]:
         """Methods, sets and commits of the run, and the results in short."""
         summary, table = self.summary, self.summary["table"]
-        sets = [
-            [
-                TITLES[k],
-                ", ".join(map(_readable, part["sets"]))
-                + (f" ({', '.join(part['only'])})" if part["only"] else ""),
-                part["protocol"],
-            ]
-            for k, part in self._ordered(summary["parts"])
-        ]
         trained = {row["method"]: row for row in table if row["ran"] and row["method"] not in OWN}
         return {
             "quick": summary["quick"],
@@ -146,23 +124,27 @@ class PaperReport:
             "machine": summary["results"][0]["machine"],
             "evaluations": len(summary["results"]),
             "method_count": len({method for _, method in self.rows}),
-            "world_count": len({world for row in table for world in row["worlds"]}),
-            "sets": sets,
+            "sets": self._sets(),
             "own_seeds": any(
                 "{a}" in name for part in summary["parts"].values() for name in part["sets"]
             ),
+            "attachments_each": ATTACHMENTS,
             "reference": BEST,
-            "short": [TITLES[part] for part in HARD],
+            "stamps": self.stamps,
+            "subjects": SUBJECTS,
+            "rules": {
+                "cost": f"{COST_FACTOR:g}",
+                "correlation": LEAST_CORRELATION,
+                "several": NEAR_SEVERAL,
+            },
+            "short": [TITLES[part] for part in (*HARD, *HARD_BLIND)],
             "trainings": [
-                [
-                    display_name(m),
-                    row["ran"],
-                    "–" if row["fit_s"] is None else seconds(row["fit_s"]),
-                ]
+                [m, row["ran"], "–" if row["fit_s"] is None else seconds(row["fit_s"])]
                 for m, row in trained.items()
             ],
             "methods": summary["methods"],
-            "overview": [self._overview(method) for method in (BEST, *self._shown())],
+            "overview": [self._overview(method) for method in (BEST, CNN, *self.own)],
+            "ahead": self._ahead(),
             "match": self._match(),
         }
 
@@ -184,7 +166,7 @@ class PaperReport:
             "attachments": {"count": count, "low": low, "high": high},
             "several": [
                 [
-                    display_name(m),
+                    m,
                     *(estimate(rules["product"][n], 0) for n in range(3)),
                     estimate(rules["vote"][2], 0),
                 ]
@@ -193,7 +175,7 @@ class PaperReport:
             "probabilities": [exact_percent(e["sure"]) for e in next(iter(explored.values()))],
             "explored": [
                 [
-                    display_name(m),
+                    m,
                     *(f"{estimate(e['share'], 0)} in {e['sweeps']:.1f}" for e in those),
                 ]
                 for m, those in sorted(explored.items(), key=lambda item: -item[1][-1]["share"][0])
@@ -205,33 +187,40 @@ class PaperReport:
         }
 
     def network(self) -> dict[str, Any]:
-        """Figs. 9 to 12; `network` is empty if the paper's CNN was not run."""
-        if not self.cnns:
-            return {"network": "", "curve": None, "own": [short_name(m) for m in self.own]}
-        names, confusion, costs = (
-            self.summary["results"][0]["materials"],
-            self.summary["confusion"],
-            self._costs(),
-        )
-        steps = {row["ran"] for (_, m), row in self.rows.items() if m == self.cnns[0]}
-        return {
-            "network": display_name(self.cnns[0]),
-            "centred": self.cnns[0] != CNNS[0],
-            "curve": self.summary.get("curve"),
+        """Figs. 9 to 12; `curves` is None if the paper's CNN was not run."""
+        names, confusion = self.summary["results"][0]["materials"], self.summary["confusion"]
+        common = {
             "own": [short_name(m) for m in self.own],
-            "final_cost": float(np.median([cost[-1, 1] for cost in costs])) if costs else None,
-            "folds": len(costs),
-            "iterations": sorted(steps),
-            "compared": self._numbers(self._compared()),
-            "confusions": {
-                "network": _worst(np.array(confusion[self.cnns[0]]), names),
-                "reference": _worst(np.array(confusion[BEST]), names),
-            },
+            "reference_confused": _worst(np.array(confusion[BEST]), names),
+        }
+        if not self.cnn:
+            return common | {"curves": None}
+        return common | {
+            "curves": self.summary.get("curves", []),
+            "trained": [
+                [
+                    f"{c['seed']}{', level-blind' if c['world'] else ''}",
+                    c.get("left", "none"),
+                    f"{c['right']} / {c['total']}" if "left" in c else "–",
+                    f"{c['step']} of {c['steps']}",
+                    c["commit"],
+                ]
+                for c in self.summary.get("curves", [])
+            ],
+            "final_cost": float(np.median([cost[-1, 1] for cost in self._costs()])),
+            "compared": self._numbers([at for part in HARD for at in self._compared(part)]),
+            "cnn_confused": _worst(np.array(confusion[CNN]), names),
         }
 
-    def _shown(self) -> list[str]:
-        """The paper's network, or the variant that was run, and ours."""
-        return [*self.cnns[:1], *self.own]
+    def _ahead(self) -> list[list[str]]:
+        """Our first method less H-svm and less the CNN, in points, for each of the hard parts."""
+        lines = []
+        for part in (*HARD, *HARD_BLIND):
+            ours = self.rows.get((part, self.own[0])) if self.own else None
+            if ours:
+                others = [self.rows.get((part, m)) for m in (BEST, CNN)]
+                lines.append([TITLES[part], *(_gap(ours, other) for other in others)])
+        return lines
 
     def _commits(self) -> list[list[str]]:
         """Each commit with the methods of its results. The commit with most results comes last."""
@@ -245,12 +234,9 @@ class PaperReport:
 
     def _overview(self, method: str) -> dict[str, Any]:
         """One line of the summary at the top: its result in each of HARD, None if there is none."""
-        rows = [self.rows.get((part, method)) for part in HARD]
-        return {
-            "name": display_name(method),
-            "rows": rows,
-            "ran": next((row["ran"] for row in rows if row and method in CNNS), ""),
-        }
+        rows = [self.rows.get((part, method)) for part in (*HARD, *HARD_BLIND)]
+        ran = next((row["ran"] for row in rows if row and method == CNN), "")
+        return {"name": method, "rows": rows, "ran": ran}
 
     def _match(self) -> dict[str, Any]:
         """Differences between the simulator and the printed accuracies of the five classical
@@ -290,14 +276,12 @@ class PaperReport:
         row = self.rows[at]
         return plots.Bar(short_name(row["method"]), tuple(row["share"]), row["printed"])
 
-    def _compared(self) -> list[Key]:
-        """The bars of Fig. 10."""
-        return [
-            (part, m) for part in HARD for m in (BEST, *self._shown()) if (part, m) in self.rows
-        ]
+    def _compared(self, part: str) -> list[Key]:
+        """The bars of Fig. 10 of a part."""
+        return [(part, m) for m in (BEST, CNN, *self.own) if (part, m) in self.rows]
 
     def _costs(self) -> list[NDArray[Any]]:
-        return [np.array(cost) for cost in self.summary["costs"][self.cnns[0]]]
+        return [np.array(cost) for cost in self.summary["costs"][CNN]]
 
     def _numbers(self, those: Sequence[Key]) -> list[Row]:
         """Lines of a table of numbers, each with a name. If there are several parts, the name has
@@ -306,20 +290,39 @@ class PaperReport:
         return [
             {
                 **self.rows[part, m],
-                "name": f"{display_name(m)}, {TITLES[part]}" if several_parts else display_name(m),
+                "name": f"{m}, {TITLES[part]}" if several_parts else m,
             }
             for part, m in those
             if (part, m) in self.rows
         ]
 
-    @staticmethod
-    def _ordered(parts: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
-        return ((part, parts[part]) for part in TITLES if part in parts)
+    def _sets(self) -> list[list[str]]:
+        """Title, sets and protocol of each part."""
+        parts = self.summary["parts"]
+        return [
+            [
+                title,
+                ", ".join(map(_readable, parts[part]["sets"]))
+                + (f" ({', '.join(parts[part]['only'])})" if parts[part]["only"] else ""),
+                parts[part]["protocol"],
+            ]
+            for part, title in TITLES.items()
+            if part in parts
+        ]
 
 
 def _readable(name: str) -> str:
     """A set's name with letters for numbers that differ between worlds."""
     return name.format(w="W", a="A", b="B")
+
+
+def _gap(ours: Row, other: Row | None) -> str:
+    """The difference of two accuracies in points with its 95 % interval; "–" without the other."""
+    if other is None:
+        return "–"
+    one, two = (tuple(row["share"]) for row in (ours, other))
+    gap, low, high = (points(value, sign=True) for value in differences.difference(one, two))
+    return f"{gap} [{low}, {high}]"
 
 
 def _worst(matrix: NDArray[Any], names: Sequence[str]) -> list[dict[str, Any]]:

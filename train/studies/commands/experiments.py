@@ -31,9 +31,11 @@ def register(add: Add) -> None:
     paper.add_argument(
         "--curve",
         type=Path,
+        action="append",
+        default=[],
         metavar="FILE",
-        help="run nothing: take the CNN's newest point from the results of cnn-curve --size whole"
-        " into those in --out",
+        help="run nothing: take the CNN's newest point from results of cnn-curve --size whole into"
+        " those in --out; name all trainings",
     )
     chart = add("chart", run_chart)
     _add_seeds(chart)
@@ -143,11 +145,12 @@ def _done(run: StudyRun, path: Path) -> None:
 
 
 def run_paper(args: argparse.Namespace) -> None:
-    """Run the experiment and write its results. With --curve only add the CNN's newest point."""
+    """Run the experiment and write its results. With --curve only add the CNN's trainings."""
     run = _run(args)
     keys = PAGES["paper"].keys
     if args.curve:
-        found = paper_experiment.with_curve(read(args.out, *keys), read(args.curve, "points"))
+        curves = [read(path, "points", "world") for path in args.curve]
+        found = paper_experiment.with_curves(read(args.out, *keys), curves)
     else:
         only = args.method.split(",") if args.method else ()
         earlier = read(args.out, *keys) if only else None
