@@ -23,7 +23,8 @@ from train.studies.paper_stamps import (
     LEAST_CORRELATION,
     NEAR,
     NEAR_SEVERAL,
-    SUBJECTS,
+    VERDICTS,
+    by_subject,
     stamps,
 )
 from train.studies.paper_values import CNN, CONFUSION, COST, FIGURES, SEVERAL, short_name
@@ -131,7 +132,9 @@ class PaperReport:
             "attachments_each": ATTACHMENTS,
             "reference": BEST,
             "stamps": self.stamps,
-            "subjects": SUBJECTS,
+            "verdicts": [
+                (word, by_subject(self.stamps, result)) for result, word in VERDICTS.items()
+            ],
             "rules": {
                 "cost": f"{COST_FACTOR:g}",
                 "correlation": LEAST_CORRELATION,

@@ -28,16 +28,15 @@ COST_FACTOR = 3.0
 """Greatest ratio of a training cost to the printed one, either way."""
 LEAST_CORRELATION = 0.5
 """Least rank correlation of our confusions with those that are printed."""
+VERDICTS = {True: "reproduced", False: "not reproduced", None: "no result"}
+"""The word of a stamp by `Stamp.reproduced`."""
 SUBJECTS = {
-    4: "spectral features on T-LAB",
-    5: "spectral features at a position left out",
-    6: "spectral features in random folds",
-    7: "spectral features on T-HARD",
+    **dict.fromkeys(FIGURES.values(), "the accuracy of spectral features"),
     9: "the cost of the CNN’s training",
     10: "the accuracy of the CNN and its lead",
-    11: "the confusions of the CNN",
-    12: "the confusions of H-svm",
-    13: "several sweeps",
+    11: "what the CNN takes for what",
+    12: "what H-svm recognises least",
+    13: "the gain by several sweeps",
 }
 LEAST_RECOGNISED = ("metal", "wood", "paper")
 """Fig. 12, as the text of the paper describes it."""
@@ -51,6 +50,11 @@ class Stamp:
     figure: int
     reproduced: bool | None
     why: str
+
+    @property
+    def word(self) -> str:
+        """The text of the stamp."""
+        return VERDICTS[self.reproduced]
 
 
 def stamps(summary: Mapping[str, Any]) -> dict[int, Stamp]:
@@ -66,6 +70,18 @@ def stamps(summary: Mapping[str, Any]) -> dict[int, Stamp]:
         ]
     made += [_least(np.array(summary["confusion"][BEST]), names), _several(summary["several"])]
     return {stamp.figure: stamp for stamp in sorted(made, key=lambda stamp: stamp.figure)}
+
+
+def by_subject(made: Mapping[int, Stamp], reproduced: bool | None) -> list[tuple[str, str]]:
+    """The subjects with this result, each with its figures: ("Figs. 4, 5", subject)."""
+    numbers: dict[str, list[int]] = {}
+    for stamp in made.values():
+        if stamp.reproduced is reproduced:
+            numbers.setdefault(SUBJECTS[stamp.figure], []).append(stamp.figure)
+    return [
+        (f"Fig{'s' * (len(those) > 1)}. {', '.join(map(str, those))}", subject)
+        for subject, those in numbers.items()
+    ]
 
 
 def _bars(number: int, part: str, shares: Mapping[tuple[str, str], float]) -> Stamp:
