@@ -172,11 +172,14 @@ class Edge:
 
     LOST has the time of the edge at which the loss or the storm was detected. Edges reported before
     it are certain. No edge follows it until every line has been quiet for `glitch_us`; the levels
-    are then read again, without an edge.
+    are then read again, without an edge. speed_mm_s, force_n: of the slide, as sent with
+    the command START; None if not sent, and for each edge of a GPIO line.
     """
 
     kind: EdgeKind
     t_ns: int
+    speed_mm_s: float | None = None
+    force_n: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +193,8 @@ class Sweep:
     stop edge the last frame). lost: frames of the window that never arrived; if `status` is ok they
     were interpolated. complete_ns: arrival of the last stop edge or frame that was needed. object:
     number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused. material,
-    position, session: labels given while recording, "" for none.
+    position, session: labels given while recording, "" for none. speed_mm_s, force_n: as in the
+    start edge.
     """
 
     id: int
@@ -205,6 +209,8 @@ class Sweep:
     position: str = ""
     session: str = ""
     share: float = 1.0
+    speed_mm_s: float | None = None
+    force_n: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +224,7 @@ class Verdict:
     share of the window that was used, less than 1 in an early answer. own: float64 [K]
     probabilities of this sweep alone; empty if nothing was classified. displacement: distance of
     the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
-    in place, or if the bundle does not have the positions.
+    in place, or if the bundle does not have the positions. speed_mm_s, force_n: as in Sweep.
     """
 
     sweep: int
@@ -236,14 +242,17 @@ class Verdict:
     share: float = 1.0
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     displacement: str = ""
+    speed_mm_s: float | None = None
+    force_n: float | None = None
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
-        """All fields by name, for JSON, which keeps numbers bit for bit. arrays: include `scores`
-        and `own`, as lists."""
+        """All fields by name, for JSON, which keeps numbers bit for bit; without a speed or force
+        that is None. arrays: include `scores` and `own`, as lists."""
         # sidecars, the feed and the status file call the displacement `moved`
         values = {
-            "moved" if name == "displacement" else name: getattr(self, name)
+            "moved" if name == "displacement" else name: value
             for name in Verdict.__slots__
+            if (value := getattr(self, name)) is not None
         }
         lists = {
             name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
@@ -265,9 +274,10 @@ def save(
     """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it,
     completely or not at all.
 
-    The sidecar gets its name first, so that an .npy always has one. about: further content of the
-    sidecar, under names that Sweep does not use. Raises OSError if writing fails, and then leaves
-    nothing behind.
+    The sidecar gets its name first, so that an .npy always has one. A field that is None is left
+    out, so that a sweep without it has the same bytes as in earlier versions. about: further
+    content of the sidecar, under names that Sweep does not use. Raises OSError if writing fails,
+    and then leaves nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(format))
     table["t_ns"], table["seq"], table["taxels"] = (
@@ -275,7 +285,11 @@ def save(
         sweep.frames.seq,
         sweep.frames.taxels,
     )
-    own = {k: getattr(sweep, k) for k in Sweep.__slots__ if k != "frames"}
+    own = {
+        name: value
+        for name in Sweep.__slots__
+        if name != "frames" and (value := getattr(sweep, name)) is not None
+    }
     # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     packed = io.BytesIO()
     np.save(packed, table, allow_pickle=False)

@@ -320,4 +320,6 @@ class Classifier:
             share=sweep.share,
             own=own,
             displacement=displacement,
+            speed_mm_s=sweep.speed_mm_s,
+            force_n=sweep.force_n,
         )

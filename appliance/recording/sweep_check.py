@@ -64,6 +64,8 @@ class SweepCheck(Observer):
             bundle=self.model,
             detail=finding.detail,
             share=sweep.share,
+            speed_mm_s=sweep.speed_mm_s,
+            force_n=sweep.force_n,
         )
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:

@@ -26,17 +26,46 @@ MAX_GAP = 2
 class _Open:
     """A sweep between its edges.
 
-    answered: it was answered already, and only its stop edge is still expected. first: number of
-    the first frame for early answers, None until that frame has arrived. step: number of steps that
-    `so_far` has returned.
+    start: its start edge, or the edge that was answered without one. answered: it was answered
+    already, and only its stop edge is still expected. first: number of the first frame for early
+    answers, None until that frame has arrived. step: number of steps that `so_far` has returned.
     """
 
     id: int
     object: int
-    start_ns: int
+    start: Edge
     answered: bool = False
     first: int | None = None
     step: int = 0
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the start edge, host monotonic."""
+        return self.start.t_ns
+
+    def sweep(
+        self,
+        stop_ns: int,
+        status: Status,
+        frames: Frames,
+        lost: int,
+        now_ns: int,
+        share: float = 1.0,
+    ) -> Sweep:
+        """The Sweep that the answer is about, complete at `now_ns`."""
+        return Sweep(
+            self.id,
+            self.start_ns,
+            stop_ns,
+            status,
+            frames,
+            lost,
+            now_ns,
+            self.object,
+            share=share,
+            speed_mm_s=self.start.speed_mm_s,
+            force_n=self.start.force_n,
+        )
 
 
 class SweepCutter:
@@ -93,14 +122,14 @@ class SweepCutter:
         before = self._count
         for edge in edges:
             if edge.kind is EdgeKind.START:
-                self._start(edge.t_ns, ready, now_ns)
+                self._start(edge, ready, now_ns)
             elif edge.kind is EdgeKind.STOP:
-                self._stop(edge.t_ns, now_ns)
+                self._stop(edge, now_ns)
             elif edge.kind is EdgeKind.NEW_OBJECT:
                 self.new_object()
             elif not self.interrupt(Status.EDGES_LOST, now_ns) and self._count == before:
                 # else a sweep of this turn was answered, and the robot expects one answer for it
-                self._answer(self._begin(edge.t_ns), edge.t_ns, Status.EDGES_LOST, now_ns)
+                self._answer(self._begin(edge), edge.t_ns, Status.EDGES_LOST, now_ns)
 
     def new_object(self) -> None:
         """Sweeps that start from now on belong to another object."""
@@ -158,15 +187,12 @@ class SweepCutter:
             sweep.step += 1
             frames, lost = self._window(sweep.first, n)
             if len(frames):
-                yield Sweep(
-                    sweep.id,
-                    sweep.start_ns,
+                yield sweep.sweep(
                     int(frames.t_ns[-1]),
                     Status.OK,
                     frames,
                     lost,
                     now_ns,
-                    sweep.object,
                     share=sweep.step / (steps + 1),
                 )
 
@@ -186,21 +212,22 @@ class SweepCutter:
             else None
         )
 
-    def _begin(self, t_ns: int) -> _Open:
+    def _begin(self, edge: Edge) -> _Open:
         self._count += 1
-        return _Open(self._count, self._object, t_ns)
+        return _Open(self._count, self._object, edge)
 
-    def _start(self, t_ns: int, ready: bool, now_ns: int) -> None:
+    def _start(self, edge: Edge, ready: bool, now_ns: int) -> None:
         if self._open and not self._open.answered:
-            self._answer(self._open, t_ns, Status.NO_STOP, now_ns)
-        self._open = self._begin(t_ns)
+            self._answer(self._open, edge.t_ns, Status.NO_STOP, now_ns)
+        self._open = self._begin(edge)
         if not ready:
-            self._answer(self._open, t_ns, Status.NOT_READY, now_ns)
+            self._answer(self._open, edge.t_ns, Status.NOT_READY, now_ns)
 
-    def _stop(self, t_ns: int, now_ns: int) -> None:
+    def _stop(self, edge: Edge, now_ns: int) -> None:
         sweep, self._open = self._open, None
+        t_ns = edge.t_ns
         if sweep is None:
-            self._answer(self._begin(t_ns), t_ns, Status.NO_START, now_ns)
+            self._answer(self._begin(edge), t_ns, Status.NO_START, now_ns)
         elif not sweep.answered:
             length_ns = t_ns - sweep.start_ns
             if length_ns < self._format.window * self._format.period_ns:
@@ -213,10 +240,7 @@ class SweepCutter:
     def _answer(self, sweep: _Open, stop_ns: int, status: Status, now_ns: int) -> None:
         """Finish a sweep with a status and without frames."""
         sweep.answered = True
-        none = Frames.empty(self._format)
-        self._done.append(
-            Sweep(sweep.id, sweep.start_ns, stop_ns, status, none, 0, now_ns, sweep.object)
-        )
+        self._done.append(sweep.sweep(stop_ns, status, Frames.empty(self._format), 0, now_ns))
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while its frames may still arrive."""
@@ -227,7 +251,7 @@ class SweepCutter:
             return None
         frames, lost = self._window(first, window)
         status = Status.OK if len(frames) else Status.GAP
-        return Sweep(sweep.id, sweep.start_ns, stop_ns, status, frames, lost, now_ns, sweep.object)
+        return sweep.sweep(stop_ns, status, frames, lost, now_ns)
 
     def _window(self, first: int, n: int) -> tuple[Frames, int]:
         """Frames `first` to `first + n` with missing frames interpolated, and the number of missing

@@ -46,10 +46,10 @@ class Bench:
         self.now = max(self.now, int(some.t_ns[-1]) + 200_000)
         self.recorder.put(some, self.now)
 
-    def edge(self, kind: EdgeKind, frame: float, ready: bool = True) -> None:
+    def edge(self, kind: EdgeKind, frame: float, ready: bool = True, **slide: float) -> None:
         """An edge at a frame's time."""
         self.now = max(self.now, t_ns(frame))
-        self.recorder.trigger([Edge(kind, t_ns(frame))], ready, self.now)
+        self.recorder.trigger([Edge(kind, t_ns(frame), **slide)], ready, self.now)
 
     def done(self, after_s: float = 0) -> list[Sweep]:
         """The answers that are due some time later."""
@@ -375,6 +375,28 @@ def test_an_open_sweep_so_far(packet: int):
     bench.put(frames(2600, 400))
     assert steps_of(bench) == []
     assert one(bench) is Status.OK
+
+
+def test_a_sweep_has_the_speed_and_force_of_its_start_edge():
+    """While it is open and finished, with a window or without; the next sweep has its own."""
+    bench = Bench()
+    bench.put(frames(0, 1500))
+    bench.edge(EdgeKind.START, 500, speed_mm_s=30.0)
+    bench.edge(EdgeKind.START, 600, speed_mm_s=60.0, force_n=1.5)
+    (early, *_) = steps_of(bench)
+    bench.put(frames(1500, 1500))
+    bench.edge(EdgeKind.STOP, 2750)
+    bench.edge(EdgeKind.START, 2760)
+    bench.edge(EdgeKind.STOP, 2770)
+    bench.edge(EdgeKind.STOP, 2780)
+    found = [(s.status, s.speed_mm_s, s.force_n) for s in (early, *bench.done())]
+    assert found == [
+        (Status.OK, 60.0, 1.5),
+        (Status.NO_STOP, 30.0, None),
+        (Status.OK, 60.0, 1.5),
+        (Status.SHORT, None, None),
+        (Status.NO_START, None, None),
+    ]
 
 
 def test_steps_of_a_window_that_does_not_divide():

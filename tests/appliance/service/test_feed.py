@@ -109,6 +109,11 @@ def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None
     (line,) = peer.lines()
     assert line == {"type": "verdict", **json.loads(json.dumps(OK.as_dict()))}
     assert (line["scores"], line["moved"], line["status"]) == ([0.987, 0.013], "moved 2 mm", "ok")
+    assert not line.keys() & {"speed_mm_s", "force_n"}
+    offered.feed.answered(replace(OK, force_n=1.5))
+    offered.turns()
+    (line,) = peer.lines()
+    assert (line["force_n"], "speed_mm_s" in line) == (1.5, False)
 
 
 @pytest.mark.parametrize("hz", [0.5, 1, 5, 8, 20])

@@ -381,7 +381,7 @@ def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
         ({"material": ""}, "2.npy: has no material; write it into 2.json"),
         ({"position": "tip"}, "0.npy: has no position though others have"),
         ({"session": 3}, "2.npy: .*session = 3 is not of type str"),
-        ({"material": None}, "2.npy: .*material = None is not of type str"),
+        ({"material": 7}, "2.npy: .*material = 7 is not of type str"),
         ({"object": "cup"}, "2.npy: .*object = 'cup' is not of type int"),
         ({"frames": 7}, "2.npy: 7 frames of 2x3 int16 at 50 Hz, window 8; others have"),
         (
