@@ -8,6 +8,7 @@ All are less exact than a GPIO line, whose edges the kernel stamps.
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 import termios
@@ -18,7 +19,7 @@ from typing import Self
 
 from appliance.core.clock import Clock
 from appliance.core.config import TriggerConfig
-from appliance.core.errors import ConfigError, PortError
+from appliance.core.errors import ApplianceError, ConfigError, PortError
 from appliance.core.health import Health
 from appliance.core.observer import Observer
 from appliance.core.types import Edge, EdgeKind, Verdict
@@ -28,6 +29,15 @@ SECOND = 1_000_000_000
 COUNTDOWN = 3
 """Seconds before a timed start from which on each second is announced."""
 SPACE = ord(" ")
+SLIDE_VALUES = {
+    "speed_mm_s": ("speed", "mm/s", 10_000.0, "30.5"),
+    "force_n": ("force", "N", 1_000.0, "1.5"),
+}
+"""The values after START in their order, by the names of Edge's fields: word, unit, largest value,
+example. No robot slides as fast or as hard as the largest values; larger ones have another unit."""
+MOST_SHOWN = 12
+"""Longest excerpt of a bad value in an error message, whose advice must fit into a sentence."""
+_NUMBER = re.compile(r"[0-9]+\.?[0-9]*|\.[0-9]+")
 
 Say = Callable[[str], object]
 """Shows a message to a person."""
@@ -53,7 +63,8 @@ class LinelessTrigger:
 
 
 class CommandTrigger(LinelessTrigger):
-    """START and STOP as commands on the serial line; `commands` has their handlers."""
+    """START and STOP as commands on the serial line; `commands` has their handlers. START raises
+    ApplianceError as `slide_values` does."""
 
     def __init__(self, clock: Clock) -> None:
         super().__init__("serial", "arrival of the command")
@@ -62,9 +73,35 @@ class CommandTrigger(LinelessTrigger):
             kind.name: partial(self._take, kind) for kind in (EdgeKind.START, EdgeKind.STOP)
         }
 
-    def _take(self, kind: EdgeKind, _: str) -> list[object]:
-        self._edges.append(Edge(kind, self._clock.now_ns()))
+    def _take(self, kind: EdgeKind, text: str) -> list[object]:
+        self._edges.append(Edge(kind, self._clock.now_ns(), **slide_values(text)))
         return []
+
+
+def slide_values(text: str) -> dict[str, float]:
+    """Speed in mm/s and force in N from the text of START ("30,1.5", ",1.5", ""), by the names of
+    Edge's fields. An empty value is left out.
+
+    Raises ApplianceError for a value that is not allowed, or for too many values.
+    """
+    values = text.replace(" ", ",").split(",")  # a person may type spaces for commas
+    if len(values) > len(SLIDE_VALUES):
+        raise ApplianceError(
+            f"{len(values)} values are too many; send at most a speed in mm/s and a force in N"
+        )
+    found = {}
+    for value, name in zip(values, SLIDE_VALUES, strict=False):
+        if not value:
+            continue
+        word, unit, most, example = SLIDE_VALUES[name]
+        number = float(value) if _NUMBER.fullmatch(value) else 0.0
+        if not 0 < number <= most:
+            raise ApplianceError(
+                f"{word} '{value[:MOST_SHOWN]}' is not valid; send {unit} above 0 and up to "
+                f"{most:g} such as {example} or leave it empty"
+            )
+        found[name] = number
+    return found
 
 
 class KeyTrigger(LinelessTrigger):

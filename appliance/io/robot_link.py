@@ -39,7 +39,7 @@ COMMANDS = (
     "DISCARD",
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
-"""The commands with a text after a comma."""
+"""The commands that need a text after a comma. START may have one: speed and force of the slide."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 
@@ -82,7 +82,8 @@ class Command:
     @property
     def line(self) -> str:
         """The command as it stands in a sentence or a capture."""
-        return f"{self.name},{self.text}" if self.name in TEXT_COMMANDS else self.name
+        with_text = self.name in TEXT_COMMANDS or (self.name == "START" and self.text)
+        return f"{self.name},{self.text}" if with_text else self.name
 
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
@@ -120,6 +121,8 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
 
 def command(name: str, text: str | None = None) -> Command:
     """The command `name` with its text, or a Command with an `error`."""
+    if name == "START":  # its trigger checks the values, and its error quotes the bad one
+        return Command(name, text or "")
     if name not in COMMANDS or UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in TEXT_COMMANDS) != (text is not None):

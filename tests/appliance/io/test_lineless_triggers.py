@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from appliance.core.config import TriggerConfig
-from appliance.core.errors import ConfigError, PortError
+from appliance.core.errors import ApplianceError, ConfigError, PortError
+from appliance.core.sentences import MAX_LINE, sentence
 from appliance.core.types import Edge, EdgeKind, Status, Verdict
 from appliance.io.lineless_triggers import (
     AnswerWatch,
@@ -66,6 +67,54 @@ def test_a_command_is_an_edge_at_the_time_of_its_arrival():
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "speed_mm_s", "force_n"),
+    [
+        ("", None, None),
+        (",", None, None),
+        ("30", 30.0, None),
+        ("30.25,1.5", 30.25, 1.5),
+        (",.5", None, 0.5),
+        ("30.,", 30.0, None),
+        ("30 1.5", 30.0, 1.5),
+        ("10000,1000", 10_000.0, 1_000.0),
+    ],
+)
+def test_start_may_have_speed_and_force(text: str, speed_mm_s: float | None, force_n: float | None):
+    """They are in the start edge, each may be empty; a person may type a space for the comma."""
+    trigger = CommandTrigger(rig.VirtualClock(5))
+    trigger.commands["START"](text)
+    assert trigger.edges(20) == [Edge(START, 5, speed_mm_s, force_n)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0", "speed '0' is not valid; send mm/s above 0 and up to 10000 such as 30.5 or"),
+        ("-3,1.5", "speed '-3' is not valid"),
+        ("3O", "speed '3O' is not valid"),
+        ("1e3", "speed '1e3' is not valid"),
+        ("nan", "speed 'nan' is not valid"),
+        ("10000.1", "speed '10000.1' is not valid"),
+        ("30,inf", "force 'inf' is not valid; send N above 0 and up to 1000 such as 1.5 or leave"),
+        (",1000.1", "force '1000.1' is not valid"),
+        ("9" * 110, "speed '999999999999' is not valid"),
+        ("\\" * 110, "speed '"),
+        ("1,2,3", "3 values are too many; send at most a speed in mm/s and a force in N"),
+    ],
+)
+def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
+    """The error quotes the value, has its advice, and fits into a sentence to its end."""
+    trigger = CommandTrigger(rig.VirtualClock(5))
+    with pytest.raises(ApplianceError) as refused:
+        trigger.commands["START"](text)
+    assert str(refused.value).startswith(message)
+    assert trigger.edges(20) == []
+    line = sentence("ANS", "START", "error", refused.value)
+    assert len(line) <= MAX_LINE
+    assert b"or leave it empty*" in line or b"force in N*" in line
+
+
 def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
     """The whole box with `trigger.mode = "serial"`: START, STOP and NEW as commands; same statuses,
     no input line is used."""
@@ -94,6 +143,26 @@ def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
     assert abs(box.kept[1].start_ns - begun_ns) < 0.1 * SECOND
     assert [sweep.object for sweep in box.kept] == [0, 0, 1]
     assert box.box.circumstances()["trigger"]["mode"] == "serial"
+    assert [sweep.speed_mm_s for sweep in box.kept] == [None, None, None]
+
+
+def test_a_bad_value_is_answered_and_starts_no_sweep(rigged: Callable[..., Rigged]):
+    """The whole box: each value that cannot be used is answered by an error, and no sweep
+    begins; then a good START begins one."""
+    off = np.zeros((20 * 750, 4, 4), np.uint8)
+    simulated = devices.build(
+        skin.FORMAT, [rig.Act(off, 10**7, 10**7 + 1, "")], rig.VirtualClock(), "sim"
+    )
+    box = rigged(simulated, sets=("trigger.mode=serial",))
+    box.seconds(0.5)
+    for text, quoted in ((",-3", "speed '-3'"), (",,x~!", "force 'x"), (",1,2,3", "3 values")):
+        assert f",START,error,{quoted}" in box.ask(f"$PPLP,START{text}")
+        box.seconds(0.1)
+        assert not box.box.health.sweeping
+    assert ",STOP,error,send it as PPLP STOP" in box.ask("$PPLP,STOP,30")
+    assert ",START,ok*" in box.ask("$PPLP,START,30,1.5")
+    box.seconds(0.1)
+    assert box.box.health.sweeping
 
 
 def test_commands_of_another_trigger_are_refused(rigged: Callable[..., Rigged]):

@@ -98,6 +98,9 @@ def test_checksums_agree(text: str):
         (b"PPLP,NEW", Command("NEW")),
         (b"PPLP ID", Command("ID")),
         (b"PPLP MATERIAL plastic rough", Command("MATERIAL", "plastic rough")),
+        (b"$PPLP,START", Command("START")),
+        (b"$PPLP,START,30,1.5", Command("START", "30,1.5")),
+        (b"PPLP START ,1.5", Command("START", ",1.5")),
         (b"\0$PPLP,ID", Command("ID")),
         (b"$PPLP,TAR\xff$PPLP,ABORT", Command("ABORT")),
         (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
@@ -107,6 +110,13 @@ def test_commands_are_read(line: bytes, want: Command):
     """With checksum or without, as a program or a person sends it; bytes of a break or noise before
     the $ are ignored."""
     assert parse(line + b"\r\n") == ([want], b"")
+
+
+@pytest.mark.parametrize("line", ["START", "START,30,1.5", "STOP", "MATERIAL,", "LABEL,3"])
+def test_a_command_keeps_its_line(line: str):
+    """The line that a capture has gives the same command again."""
+    ((command,), _) = parse(f"$PPLP,{line}\r\n".encode())
+    assert command.line == line
 
 
 @pytest.mark.parametrize(
