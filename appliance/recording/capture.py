@@ -7,6 +7,7 @@ The verdicts of a replayed capture are the same, bit for bit, since they depend 
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +32,6 @@ MAGIC = b"PPLPCAP1"
 MOST_KEPT = 99
 """Largest number of captures of the same name from earlier starts."""
 _RECORD = struct.Struct("<BQI")
-_EDGE = struct.Struct("<QB")
 _KINDS = tuple(EdgeKind)
 _MOST_NS = 1 << 63
 """Times are int64."""
@@ -44,6 +44,12 @@ class RecordKind(IntEnum):
     STATE = 1
     EDGES = 2
     COMMAND = 3
+    SLIDES = 4
+
+
+_EDGES = {RecordKind.EDGES: struct.Struct("<QB"), RecordKind.SLIDES: struct.Struct("<QBdd")}
+"""Layout of an edge: time and kind; in SLIDES also speed in mm/s and force in N, 0 if START had
+none. Edges without them are still written as EDGES, which earlier versions read."""
 
 
 class CaptureWriter(Observer):
@@ -84,11 +90,10 @@ class CaptureWriter(Observer):
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Write edges that the trigger returned at `t_ns`."""
-        self._write(
-            RecordKind.EDGES,
-            t_ns,
-            b"".join(_EDGE.pack(e.t_ns, _KINDS.index(e.kind)) for e in edges),
-        )
+        rows = [(e.t_ns, _KINDS.index(e.kind), e.speed_mm_s or 0, e.force_n or 0) for e in edges]
+        kind = RecordKind.SLIDES if any(row[2:] != (0, 0) for row in rows) else RecordKind.EDGES
+        width = 4 if kind == RecordKind.SLIDES else 2
+        self._write(kind, t_ns, b"".join(_EDGES[kind].pack(*row[:width]) for row in rows))
 
     def command(self, t_ns: int, line: str) -> None:
         """Write a command that was executed, as a sentence."""
@@ -218,12 +223,12 @@ class Playback:
     def edges(self, now_ns: int) -> list[Edge]:
         """Trigger: the edges that the box received at this time."""
         edges = []
-        while (
-            self._records
-            and self._records[0][0] == RecordKind.EDGES
-            and self._records[0][1] <= now_ns
-        ):
-            edges += [Edge(_KINDS[k], t) for t, k in _EDGE.iter_unpack(self._records.popleft()[2])]
+        while self._records and self._records[0][0] in _EDGES and self._records[0][1] <= now_ns:
+            kind, _, body = self._records.popleft()
+            edges += [
+                Edge(_KINDS[k], t, *(value or None for value in slide))
+                for t, k, *slide in _EDGES[kind].iter_unpack(body)
+            ]
         return edges
 
     def commands(self) -> list[Command]:
@@ -257,9 +262,10 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
 
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
     """Whether this record can come from CaptureWriter."""
-    if kind == RecordKind.EDGES:
-        return not len(body) % _EDGE.size and all(
-            k < len(_KINDS) and t < _MOST_NS for t, k in _EDGE.iter_unpack(body)
+    if layout := _EDGES.get(RecordKind(kind)):
+        return not len(body) % layout.size and all(
+            k < len(_KINDS) and t < _MOST_NS and all(0 <= value < math.inf for value in slide)
+            for t, k, *slide in layout.iter_unpack(body)
         )
     if kind == RecordKind.COMMAND:
         return not _command(body).error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from appliance.core.types import (
 from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
-from appliance.recording.capture import MOST_KEPT, CaptureWriter, Playback
+from appliance.recording.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, rig, script, skin
@@ -230,6 +231,33 @@ def test_other_files_are_named(tmp_path: Path, content: bytes, hint: str):
 def test_a_missing_capture(tmp_path: Path):
     """No file."""
     with pytest.raises(FormatError, match="cannot be read"):
+        Playback(tmp_path / "x")
+
+
+def test_speed_and_force_are_part_of_a_capture(tmp_path: Path):
+    """Edges come back with them, and edges without them are written as before."""
+    plain, with_speed = Edge(EdgeKind.STOP, 5), Edge(EdgeKind.START, 6, 30.0)
+    capture = CaptureWriter(tmp_path / "x", skin.FORMAT)
+    capture.edges(7, [plain])
+    capture.edges(8, [plain, with_speed, Edge(EdgeKind.START, 7, 0.1, 1.5)])
+    capture.command(9, "START,30")
+    capture.close()
+    play = Playback(tmp_path / "x")
+    assert play.edges(7) == [plain]
+    assert play.edges(8) == [plain, with_speed, Edge(EdgeKind.START, 7, 0.1, 1.5)]
+    play.read()
+    assert [command.line for command in play.commands()] == ["START,30"]
+    as_before = struct.pack("<BQIQB", RecordKind.EDGES, 7, 9, 5, [*EdgeKind].index(plain.kind))
+    assert as_before in (tmp_path / "x").read_bytes()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
+def test_a_speed_that_was_never_written(tmp_path: Path, value: float):
+    """A record with a speed that the box cannot have received is refused by its place."""
+    capture = CaptureWriter(tmp_path / "x", skin.FORMAT)
+    capture.edges(7, [Edge(EdgeKind.START, 6, value)])
+    capture.close()
+    with pytest.raises(FormatError, match=r"record of kind 4 with 25 bytes at byte \d+ is unknown"):
         Playback(tmp_path / "x")
 
 

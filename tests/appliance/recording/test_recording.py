@@ -20,8 +20,10 @@ from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from appliance.recording import recording
 from appliance.recording.recording import Labels, RecordingSession, SweepFolder
+from appliance.service.feed import FeedServer
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
+from tests.factories.feeds import FeedPeer
 from tests.factories.simulated_box import Rigged
 
 WOOD, NONE = Labels("wood"), Labels()
@@ -152,6 +154,7 @@ def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: P
     assert (about["run"], about["lost"]) == (0, 0)
     assert not about.keys() & {"bundle", "tare", "rule"}
     assert (about["material"], about["position"], about["session"]) == ("wood", "3", "monday")
+    assert not about.keys() & {"speed_mm_s", "force_n"}  # the start was a GPIO line
     again, format = load(tmp_path / "sweep-000001.npy")
     assert format == skin.FORMAT
     assert again.frames.taxels.tobytes() == box.kept[0].frames.taxels.tobytes()
@@ -175,6 +178,38 @@ def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_p
     assert [made.materials[k] for k in made.labels] == ["wood", "metal"]
     assert made.groups["position"].tolist() == [1, 2]
     assert (made.samples[1] == box.kept[1].frames.taxels).all()
+
+
+def test_speed_and_force_reach_sidecar_feed_and_set(rigged: Callable[..., Rigged], tmp_path: Path):
+    """Two sweeps by command with `palpate record`: the values are in each sidecar, in the feed's
+    verdict, and are groups of the set."""
+    files = pytest.importorskip(
+        "train.data.readers", reason="the desktop's tools are not here; make test installs them"
+    )
+    from appliance.core.sweep_set import SweepSet
+
+    acts = [rig.Act(np.zeros((20 * 750, 4, 4), np.uint8), 10**7, 10**7 + 1, "")]
+    simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
+    session = RecordingSession(tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None)
+    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {}, simulated.clock)
+    box = rigged(
+        simulated, ("trigger.mode=serial",), observers=[session, feed], commands=session.commands
+    )
+    box.seconds(0.5)
+    peer = FeedPeer(tmp_path / "feed.sock")
+    for start in ("START,30.5,1.5", "START,60,0.25"):
+        assert ",START,ok*" in box.ask(f"$PPLP,{start}")
+        box.seconds(2.5)
+        box.ask("$PPLP,STOP")
+        box.seconds(0.5)
+    want = [(30.5, 1.5), (60.0, 0.25)]
+    sidecars = [sidecar(tmp_path / f"sweep-{n:06d}.npy") for n in (1, 2)]
+    assert [(about["speed_mm_s"], about["force_n"]) for about in sidecars] == want
+    verdicts = [line for line in peer.lines() if line["type"] == "verdict"]
+    assert [(line["speed_mm_s"], line["force_n"]) for line in verdicts] == want
+    groups = files.read(tmp_path, SweepSet).groups
+    assert groups["speed"].tolist() == [30_500, 60_000]
+    assert groups["force"].tolist() == [1_500, 250]
 
 
 def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
@@ -554,4 +589,6 @@ def test_numbers_in_a_verdict_come_back_bit_for_bit():
     again = json.loads(json.dumps(verdict.as_dict()))
     assert again == verdict.as_dict()
     assert np.array(again["scores"]).tobytes() == verdict.scores.tobytes()
-    assert again.keys() == {*Verdict.__slots__, "moved"} - {"displacement"}
+    absent = {"displacement", "speed_mm_s", "force_n"}
+    assert again.keys() == {*Verdict.__slots__, "moved"} - absent
+    assert replace(verdict, speed_mm_s=30.0).as_dict()["speed_mm_s"] == 30.0
