@@ -30,6 +30,8 @@ the same laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file tak
 SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
 NAMED_GROUPS = ("position", "session")
 """Names that a recording can have beside its material. Each becomes a group."""
+SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
+"""Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to windows that it does not classify."""
 FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
@@ -254,9 +256,10 @@ def read_folder(folder: Path, kind: type[Set]) -> Set:
 
     Labels are materials. Groups are position and session: a group keeps its numbers if all its
     names are whole numbers, else names are numbered in alphabetical order. A third group is the
-    object, if NEW OBJECT was ever signalled. Sweeps that we do not train on are counted in
-    `source`. Raises FormatError with the name of a file that is broken, lacks a name or has another
-    format.
+    object, if NEW OBJECT was ever signalled. Groups speed (um/s) and force (mN) exist if every
+    sweep has the value; `source` says if only some have it. Sweeps that we do not train on are
+    counted in `source`. Raises FormatError with the name of a file that is broken, lacks a name or
+    has another format.
     """
     return from_recorded(read_recorded(folder), folder, kind)
 
@@ -272,6 +275,24 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
         )
     for one in kept:
         _check(one, kept[0].format)
+    slide, partial = _slide_groups(kept)
+    groups = _groups(kept) | slide
+    materials = [one.sweep.material for one in kept]
+    samples, unloaded, remark = align_tare(
+        np.stack([one.sweep.frames.taxels for one in kept]),
+        np.stack([one.unloaded for one in kept]),
+    )
+    source += partial + remark
+    rate = np.array(kept[0].format.rate_hz)
+    about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
+    if np.isfinite(unloaded).any():
+        about["unloaded"] = unloaded
+    return build({"samples": samples} | about | groups, source, kind)
+
+
+def _groups(kept: Sequence[RecordedSweep]) -> dict[str, Array]:
+    """The groups recording, position, session and object. Raises FormatError for a recording
+    without the name that others have."""
     groups = {"group_recording": np.arange(len(kept))}
     for name in NAMED_GROUPS:
         texts = [getattr(one.sweep, name) for one in kept]
@@ -289,17 +310,21 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
                 for one in kept
             ]
         )
-    materials = [one.sweep.material for one in kept]
-    samples, unloaded, remark = align_tare(
-        np.stack([one.sweep.frames.taxels for one in kept]),
-        np.stack([one.unloaded for one in kept]),
-    )
-    source += remark
-    rate = np.array(kept[0].format.rate_hz)
-    about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
-    if np.isfinite(unloaded).any():
-        about["unloaded"] = unloaded
-    return build({"samples": samples} | about | groups, source, kind)
+    return groups
+
+
+def _slide_groups(kept: Sequence[RecordedSweep]) -> tuple[dict[str, Array], str]:
+    """The groups of SLIDE_GROUPS that every sweep has, and words for the set's source about those
+    that only some have."""
+    groups, remark = {}, ""
+    for name, member in SLIDE_GROUPS.items():
+        values = [getattr(one.sweep, member) for one in kept]
+        known = [value for value in values if value is not None]
+        if len(known) == len(kept):
+            groups[f"group_{name}"] = np.rint(1000 * np.array(known)).astype(np.int64)
+        elif known:
+            remark += f" ({len(known)} of {len(kept)} have {member}: no group {name})"
+    return groups, remark
 
 
 def align_tare(samples: Array, unloaded: Array) -> tuple[Array, Array, str]:

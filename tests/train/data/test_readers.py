@@ -368,6 +368,22 @@ def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
     assert list(sets.load(str(tmp_path)).groups["object"]) == [0, 0, 1, 2]
 
 
+def test_speed_and_force_are_groups_if_all_have_them(tmp_path: Path):
+    """In um/s and mN, rounded; a value that only some have is a remark in the source and no
+    group."""
+    for i, speed in enumerate((30, 30.5, 12.3456, 0.1)):
+        record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, speed_mm_s=speed)
+    s = sets.load(str(tmp_path))
+    assert list(s.groups) == ["recording", "speed"]
+    assert s.groups["speed"].tolist() == [30_000, 30_500, 12_346, 100]
+    assert s.source == str(tmp_path)
+    assert len(s.select(["speed<=12346"])) == 2
+    record(tmp_path / "0.npy", "a", speed_mm_s=30.0, force_n=1.5)
+    s = sets.load(str(tmp_path))
+    assert "force" not in s.groups
+    assert s.source == f"{tmp_path} (1 of 4 have force_n: no group force)"
+
+
 def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
     """Without names, the recording is the only group."""
     for i in range(4):
