@@ -102,6 +102,10 @@ ADDRESSES: Mapping[str, int] = {
     for i, register in enumerate(REGISTERS)
 } | {"label": sum(register.words for register in REGISTERS)}
 """Address of the first word of each entry; the label's text comes last."""
+SLIDE = {"speed_mm_s": 10, "force_n": 100}
+"""The registers that a peer may write, after the label's text: speed and force of the slide as the
+command START has them, and the steps of a register in one mm/s or N."""
+SLIDE_AT = ADDRESSES["label"] + LABEL_WORDS
 COUNTERS = {
     "heartbeat",
     "answers",
@@ -141,8 +145,8 @@ def inputs(view: BoxView, *, alive: bool) -> list[bool]:
 
 
 class ModbusBridge:
-    """Serves connections. writes: whether coils may be written. Only one command is sent at a
-    time."""
+    """Serves connections. writes: whether coils and registers may be written. Only one command is
+    sent at a time."""
 
     def __init__(self, source: Source, clock: Clock, *, writes: bool) -> None:
         self._source, self._clock, self._writes = source, clock, writes
@@ -150,7 +154,7 @@ class ModbusBridge:
 
     async def serve(self, peer: TcpPeer) -> None:
         """Answer the requests of one connection until it ends, hangs, or sends invalid bytes."""
-        coils = [False] * len(COILS)
+        coils, slide = [False] * len(COILS), [0] * len(SLIDE)
         rest = b""
         while data := await peer.read(REQUEST_S if rest else IDLE_S):
             try:
@@ -158,22 +162,23 @@ class ModbusBridge:
             except FormatError:
                 return
             for request in found:
-                peer.write(pdu.reply(request, await self.answer(request, coils)))
+                peer.write(pdu.reply(request, await self.answer(request, coils, slide)))
             await peer.flush(REQUEST_S)
             await asyncio.sleep(PACE_S * len(found))
 
-    async def answer(self, request: ModbusRequest, coils: list[bool]) -> bytes:
-        """The reply's function and data. coils: of this connection; they change with its writes."""
+    async def answer(self, request: ModbusRequest, coils: list[bool], slide: list[int]) -> bytes:
+        """The reply's function and data. coils, slide: the coils and the registers of SLIDE of this
+        connection; they change with its writes."""
         try:
             wanted = pdu.parse(request.pdu)
             if isinstance(wanted, Reading):
-                return pdu.read(wanted, self._values(wanted.function, coils))
-            await self._write(wanted, coils)
+                return pdu.read(wanted, self._values(wanted.function, coils, slide))
+            await self._write(wanted, coils, slide)
             return pdu.written(request.pdu)
         except RequestRefused as e:
             return pdu.refusal(request.pdu, e.fault)
 
-    def _values(self, function: int, coils: Sequence[bool]) -> Sequence[int]:
+    def _values(self, function: int, coils: Sequence[bool], slide: Sequence[int]) -> Sequence[int]:
         if function == pdu.READ_COILS:
             return coils
         view = self._source.view()
@@ -181,12 +186,18 @@ class ModbusBridge:
         return (
             inputs(view, alive=alive)
             if function == pdu.READ_INPUTS
-            else registers(view, alive=alive)
+            else [*registers(view, alive=alive), *slide]
         )
 
-    async def _write(self, wanted: Writing, coils: list[bool]) -> None:
+    async def _write(self, wanted: Writing, coils: list[bool], slide: list[int]) -> None:
         if not self._writes:
             raise RequestRefused(ExceptionCode.FUNCTION)
+        if wanted.function in (pdu.WRITE_REGISTER, pdu.WRITE_REGISTERS):
+            first = wanted.address - SLIDE_AT
+            if not 0 <= first <= len(slide) - len(wanted.values):
+                raise RequestRefused(ExceptionCode.ADDRESS)
+            slide[first : first + len(wanted.values)] = wanted.values
+            return
         end = wanted.address + len(wanted.values)
         if end > len(coils):
             raise RequestRefused(ExceptionCode.ADDRESS)
@@ -197,19 +208,23 @@ class ModbusBridge:
             if value and not coils[at]
         }
         for at, value in zip(addresses, wanted.values, strict=True):
-            coils[at] = coils[at] and value
+            coils[at] = coils[at] and bool(value)
         if not rising:
             return
         if self._commanding.locked():
             raise RequestRefused(ExceptionCode.BUSY)
         async with self._commanding:  # no other peer's command comes between those of one write
             for name in sorted(rising, key=ORDER.index):
-                await self._command(name)
+                await self._command(name, slide if name == "START" else ())
                 coils[rising[name]] = True  # only now: a refused command is sent again
 
-    async def _command(self, name: str) -> None:
+    async def _command(self, name: str, slide: Sequence[int]) -> None:
+        # 0: the peer does not know it
+        values = {
+            value: word / SLIDE[value] for value, word in zip(SLIDE, slide, strict=False) if word
+        }
         try:
-            await asyncio.to_thread(self._source.send, name)
+            await asyncio.to_thread(self._source.send, name, **values)
         except ApplianceError as e:
             log.warning(f"modbus: {name}: {e}")
             raise RequestRefused(ExceptionCode.DEVICE) from e

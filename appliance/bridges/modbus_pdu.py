@@ -14,7 +14,8 @@ HEADER = struct.Struct(">HHHB")
 """Transaction, protocol (0), number of bytes that follow, unit."""
 MOST_PDU = 253
 READ_COILS, READ_INPUTS, READ_HOLDING, READ_REGISTERS, WRITE_COIL, WRITE_COILS = 1, 2, 3, 4, 5, 15
-MOST_BITS, MOST_REGISTERS, MOST_COILS = 2000, 125, 1968
+WRITE_REGISTER, WRITE_REGISTERS = 6, 16
+MOST_BITS, MOST_REGISTERS, MOST_COILS, MOST_WRITTEN = 2000, 125, 1968, 123
 ON, OFF = 0xFF00, 0x0000
 
 
@@ -56,11 +57,11 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Writing:
-    """A request to write coils, from `address` on."""
+    """A request to write coils (0 or 1) or registers (0 to 65535), from `address` on."""
 
     function: int
     address: int
-    values: tuple[bool, ...]
+    values: tuple[int, ...]
 
 
 def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes]:
@@ -103,24 +104,30 @@ def parse(pdu: bytes) -> Reading | Writing:
         ):
             raise RequestRefused(ExceptionCode.VALUE)
         return Reading(function, address, count)
-    if function == WRITE_COIL:
+    if function in (WRITE_COIL, WRITE_REGISTER):
         address, value = _pair(data)
-        if len(data) != 4 or value not in (ON, OFF):
+        if len(data) != 4 or (function == WRITE_COIL and value not in (ON, OFF)):
             raise RequestRefused(ExceptionCode.VALUE)
-        return Writing(function, address, (value == ON,))
-    if function == WRITE_COILS:
-        address, count = _pair(data)
-        packed = data[5:]
-        if (
-            not 1 <= count <= MOST_COILS
-            or data[4:5] != bytes([len(packed)])
-            or len(packed) != -(-count // 8)
-        ):
-            raise RequestRefused(ExceptionCode.VALUE)
-        return Writing(
-            function, address, tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count))
-        )
+        return Writing(function, address, (value if function == WRITE_REGISTER else value == ON,))
+    if function in (WRITE_COILS, WRITE_REGISTERS):
+        return _several(function, data)
     raise RequestRefused(ExceptionCode.FUNCTION)
+
+
+def _several(function: int, data: bytes) -> Writing:
+    """A request to write several coils or registers. Raises RequestRefused."""
+    address, count = _pair(data)
+    packed, coils = data[5:], function == WRITE_COILS
+    if (
+        not 1 <= count <= (MOST_COILS if coils else MOST_WRITTEN)
+        or data[4:5] != bytes([len(packed)])
+        or len(packed) != (-(-count // 8) if coils else 2 * count)
+    ):
+        raise RequestRefused(ExceptionCode.VALUE)
+    if coils:
+        values = tuple(bool(packed[i // 8] >> i % 8 & 1) for i in range(count))
+        return Writing(function, address, values)
+    return Writing(function, address, struct.unpack(f">{count}H", packed))
 
 
 def _pair(data: bytes) -> tuple[int, int]:

@@ -28,7 +28,7 @@ from appliance.tools import pseudo_terminal
 
 STALE_S = 3.5
 """Without a sentence for this long the box counts as dead; it sends a state once a second."""
-COMMANDS: Mapping[str, Callable[[Palpate], str | None]] = {
+COMMANDS: Mapping[str, Callable[..., str | None]] = {
     "START": Palpate.start,
     "STOP": Palpate.stop,
     "NEW": Palpate.new_object,
@@ -80,8 +80,9 @@ class Source(Protocol):
         second."""
         ...
 
-    def send(self, command: str) -> str:
-        """Carry out one of COMMANDS; the box's reply. Raises ApplianceError."""
+    def send(self, command: str, **slide: float) -> str:
+        """Carry out one of COMMANDS; the box's reply. slide: speed_mm_s and force_n, for START
+        only. Raises ApplianceError."""
         ...
 
     def wait_ready(self, timeout_s: float) -> None:
@@ -131,9 +132,9 @@ class LineSource:
                 return
             self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
 
-    def send(self, command: str) -> str:
+    def send(self, command: str, **slide: float) -> str:
         """Carry out one of COMMANDS; the box's reply."""
-        return COMMANDS[command](self._box) or "done"
+        return COMMANDS[command](self._box, **slide) or "done"
 
     def wait_ready(self, timeout_s: float) -> None:
         self._box.wait_ready(timeout_s)
@@ -177,7 +178,7 @@ class FeedSource:
     def refresh(self) -> None:
         """Does nothing: `hello` brings the labels."""
 
-    def send(self, command: str) -> str:
+    def send(self, command: str, **slide: float) -> str:
         """Raises CommandRefused: the feed is read-only."""
         raise CommandRefused(
             f"{command}: the feed is read-only; give the bridge a serial line with --port or --link"

@@ -24,11 +24,13 @@ LONGEST_S = 3600.0
 
 
 class Terms(Protocol):
-    """Parameters of a sweep: the fields of Sweep.action."""
+    """Parameters of a sweep: the fields of Sweep.action. speed_mm_s, force_n: 0 for unknown."""
 
     new_object: bool
     slide_s: float
     timeout_s: float
+    speed_mm_s: float
+    force_n: float
 
 
 class CommandedSweep:
@@ -72,7 +74,7 @@ class CommandedSweep:
             self._source.send("NEW")
         self._forget()
         try:
-            self._source.send("START")
+            self._source.send("START", **_slide(terms))
             self._say("sliding", None)
             answer = self._answered(terms)
         except CommandRefused:  # no sweep of ours is open
@@ -151,6 +153,13 @@ class CommandedSweep:
     def _forget(self) -> None:
         while self._next(0):
             pass
+
+
+def _slide(terms: Terms) -> dict[str, float]:
+    """The values of START that are not 0."""
+    # a goal of palpate_msgs 1.0 does not have these fields
+    values = {name: getattr(terms, name, 0.0) for name in ("speed_mm_s", "force_n")}
+    return {name: value for name, value in values.items() if value}
 
 
 def check(terms: Terms) -> None:

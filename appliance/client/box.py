@@ -134,11 +134,15 @@ class Palpate:
             if self._left_s(end_ns) <= 0:
                 raise NoAnswer(f"not ready within {timeout_s:g} s: {why}")
 
-    def start(self) -> None:
+    def start(self, *, speed_mm_s: float | None = None, force_n: float | None = None) -> None:
         """Begin a sweep by command (trigger.mode = "serial"), and drop answers that `result` has
-        not returned."""
+        not returned.
+
+        speed_mm_s, force_n: of the slide, None if unknown; sent with six decimals. The box stores
+        them with the sweep. Raises CommandRefused for a value that the box refuses.
+        """
         self.forget()
-        self.ask("START")
+        self.ask("START", *_decimals(speed_mm_s, force_n))
 
     def stop(self) -> None:
         """End the sweep by command. After an early answer nothing else follows."""
@@ -319,3 +323,12 @@ class Palpate:
             self._answers.popleft()
             self.missed += 1
         self._answers.append(answer)
+
+
+def _decimals(*values: float | None) -> list[str]:
+    """The values as fields of a sentence, without exponents, since the box reads none. Empty fields
+    at the end are left out."""
+    texts = ["" if v is None else f"{v:.6f}".rstrip("0").rstrip(".") for v in values]
+    while texts and not texts[-1]:
+        texts.pop()
+    return texts

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from appliance.bridges.modbus import COILS, ModbusBridge
+from appliance.bridges.modbus import COILS, SLIDE, SLIDE_AT, ModbusBridge
 from appliance.bridges.modbus_pdu import ModbusRequest
 from appliance.bridges.source import BoxView
 from appliance.core.clock import SystemClock
@@ -19,12 +19,14 @@ START, STOP, NEW = (1 << COILS.index(name) for name in ("START", "STOP", "NEW"))
 
 
 class ScriptedSource:
-    """Carries out commands, except those in `refused`; `sent` lists the commands it was given."""
+    """Carries out commands, except those in `refused`; `sent` lists the commands it was given,
+    `slides` their values."""
 
     name = "scripted"
 
     def __init__(self) -> None:
         self.sent: list[str] = []
+        self.slides: list[dict[str, float]] = []
         self.refused: set[str] = set()
         self.error: Exception = CommandRefused("set trigger.mode to serial")
 
@@ -37,8 +39,9 @@ class ScriptedSource:
 
     def wait_ready(self, timeout_s: float) -> None: ...
 
-    def send(self, command: str) -> str:
+    def send(self, command: str, **slide: float) -> str:
         self.sent.append(command)
+        self.slides.append(slide)
         if command in self.refused:
             raise self.error
         return "done"
@@ -52,8 +55,13 @@ def source() -> ScriptedSource:
 @pytest.fixture
 def ask(source: ScriptedSource) -> Callable[[bytes], bytes]:
     """Ask a bridge that may write, over one connection."""
-    bridge, coils = ModbusBridge(source, SystemClock(), writes=True), [False] * len(COILS)
-    return lambda pdu: asyncio.run(bridge.answer(ModbusRequest(1, 1, pdu), coils))
+    return connected(ModbusBridge(source, SystemClock(), writes=True))
+
+
+def connected(bridge: ModbusBridge) -> Callable[[bytes], bytes]:
+    """Ask a bridge over another connection."""
+    coils, slide = [False] * len(COILS), [0] * len(SLIDE)
+    return lambda pdu: asyncio.run(bridge.answer(ModbusRequest(1, 1, pdu), coils, slide))
 
 
 def one(coil: int, on: bool) -> bytes:
@@ -95,7 +103,7 @@ def test_a_command_that_met_a_busy_bridge_is_carried_out_when_it_is_sent_again(w
     sends the command."""
     source = ScriptedSource()
     bridge = ModbusBridge(source, SystemClock(), writes=True)
-    mine = [False] * len(COILS)
+    mine, slide = [False] * len(COILS), [0] * len(SLIDE)
 
     async def both() -> None:
         running, go_on = asyncio.Event(), asyncio.Event()
@@ -109,16 +117,16 @@ def test_a_command_that_met_a_busy_bridge_is_carried_out_when_it_is_sent_again(w
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(asyncio, "to_thread", slow)
             tare = asyncio.create_task(
-                bridge.answer(ModbusRequest(1, 1, one(8, True)), [False] * len(COILS))
+                bridge.answer(ModbusRequest(1, 1, one(8, True)), [False] * len(COILS), slide)
             )
             await running.wait()
-            assert await bridge.answer(ModbusRequest(1, 1, write), mine) == bytes(
+            assert await bridge.answer(ModbusRequest(1, 1, write), mine, slide) == bytes(
                 [write[0] | 0x80, 6]
             )
             assert not any(mine)
             go_on.set()
             await tare
-        assert await bridge.answer(ModbusRequest(2, 1, write), mine) == write[:5]
+        assert await bridge.answer(ModbusRequest(2, 1, write), mine, slide) == write[:5]
 
     asyncio.run(both())
     assert source.sent == ["TARE", "START"]
@@ -168,10 +176,52 @@ def test_the_commands_of_one_write_have_an_order(
     assert source.sent == ["ABORT", "NEW", "TARE", "START", "STOP"]
 
 
-@pytest.mark.parametrize("pdu", ["0600000001", "1000000001020001"])
-def test_registers_are_not_written(source: ScriptedSource, ask: Callable[[bytes], bytes], pdu: str):
-    """Functions 6 and 16 are refused and change nothing."""
+@pytest.mark.parametrize(
+    ("pdu", "code"),
+    [
+        ("0600000001", 2),
+        ("0600270001", 2),
+        ("06002a0001", 2),
+        ("1000000001020001", 2),
+        ("10002900020400010002", 2),
+        ("10002800030600010002ffff", 2),
+        ("060028", 3),
+        ("060028000100", 3),
+        ("100028000000", 3),
+        ("1000280002020001", 3),
+        ("10002800010400010002", 3),
+        ("100028007cf8" + "0001" * 124, 3),
+    ],
+)
+def test_other_registers_are_not_written(
+    source: ScriptedSource, ask: Callable[[bytes], bytes], pdu: str, code: int
+):
+    """Functions 6 and 16 are refused beside the two registers, or with a wrong length, and change
+    nothing."""
     data = bytes.fromhex(pdu)
-    assert ask(data) == bytes([data[0] | 0x80, 1])
+    assert ask(data) == bytes([data[0] | 0x80, code])
     assert not source.sent
     assert levels(ask) == 0
+    assert ask(bytes.fromhex("0300280002")) == bytes.fromhex("030400000000")
+
+
+def test_start_has_the_registers_of_its_connection(
+    source: ScriptedSource, ask: Callable[[bytes], bytes]
+):
+    """Tenths of mm/s and hundredths of N, written in one request or in two, and read back; 0 is
+    left out. Other commands and other connections have none."""
+    assert SLIDE_AT == 40
+    assert ask(bytes.fromhex("10002800020401310096")) == bytes.fromhex("1000280002")
+    assert ask(bytes.fromhex("0300280002")) == bytes.fromhex("030401310096")
+    assert ask(bytes.fromhex("0400280002")) == bytes.fromhex("040401310096")
+    for bits in (NEW, START, 0, START):
+        ask(several(bits))
+    assert ask(bytes.fromhex("0600280000")) == bytes.fromhex("0600280000")
+    for bits in (0, START):
+        ask(several(bits))
+    both = {"speed_mm_s": 30.5, "force_n": 1.5}
+    assert source.sent == ["NEW", "START", "START", "START"]
+    assert source.slides == [{}, both, both, {"force_n": 1.5}]
+    other = connected(ModbusBridge(source, SystemClock(), writes=True))
+    other(several(START))
+    assert source.slides[-1] == {}

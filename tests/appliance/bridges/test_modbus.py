@@ -119,6 +119,15 @@ def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Addres
     assert [s.kind for s in box.heard if s.kind in COILS] == ["NEW", "START", "STOP"]
 
 
+def test_another_client_writes_speed_and_force(box: SpeakingBox, address: Address):
+    """pymodbus writes both registers, and START reaches the box with them."""
+    with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
+        assert not client.write_registers(modbus.SLIDE_AT, [305, 150]).isError()
+        assert client.read_holding_registers(modbus.SLIDE_AT, count=2).registers == [305, 150]
+        assert not client.write_coil(START, True).isError()
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
+
+
 def test_bytes_by_hand(raw: RawModbus):
     """Requests and replies as the specification prints them: transaction, unit, lengths, exception
     codes."""
@@ -138,8 +147,9 @@ def test_bytes_by_hand(raw: RawModbus):
         ("0f00000003020700", 3),
         ("050005ff00", 2),  # a coil that is not there
         ("0f0003000301ff", 2),
-        ("0600000001", 1),  # registers are not written
-        ("1000000001020001", 1),
+        ("0600000001", 2),  # a register that is not written
+        ("1000000001020001", 2),
+        ("10002800010100", 3),  # half a register
         ("2b0e0100", 1),
         ("00", 1),
         ("ff", 1),
@@ -164,7 +174,7 @@ def test_nothing_is_written_without_leave(box: SpeakingBox):
     """Without --allow-writes each write is an illegal function, and the box hears nothing; reading
     works."""
     with bridge("modbus", "--port", box.path) as address, RawModbus(address) as client:
-        for pdu in ("050000ff00", "0f0000000501ff"):
+        for pdu in ("050000ff00", "0f0000000501ff", "060028000a", "1000280001020001"):
             assert client.ask(bytes.fromhex(pdu)) == bytes([int(pdu[:2], 16) | 0x80, 1])
         assert client.registers(0, 1) == [1]
     assert {s.kind for s in box.heard} <= {"LABEL"}
@@ -462,6 +472,9 @@ def test_the_document_has_the_map():
     )
     assert [(int(at), name) for at, name in rows if name in ADDRESSES] == [
         (at, name) for name, at in ADDRESSES.items()
+    ]
+    assert [(int(at), name) for at, name in rows if name not in ADDRESSES] == [
+        (modbus.SLIDE_AT + i, name.partition("_")[0]) for i, name in enumerate(modbus.SLIDE)
     ]
     assert re.findall(
         r"^\| \d+ \| `([a-z]+)` \|",

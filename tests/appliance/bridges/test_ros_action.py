@@ -81,7 +81,7 @@ def silent(heard: Sentence) -> list[bytes]:
 def test_a_sweep(box: SpeakingBox, node: RosPeer):
     """START, the slide, STOP, the answer with all fields of RES; feedback announces the slide; NEW
     if it is requested."""
-    found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True)
+    found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True, speed_mm_s=30.1)
     assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
     assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (
         1,
@@ -97,6 +97,7 @@ def test_a_sweep(box: SpeakingBox, node: RosPeer):
     ]
     assert (found["bundle"], found["message"]) == ("9f3c2a1b", "use the label")
     assert commands(box) == ["NEW", "START", "STOP"]
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.1"]]
     eventually(lambda: phases(node) == ["sliding", "judging"])
     eventually(lambda: node.on("verdict") != [])
 
@@ -334,5 +335,6 @@ def test_the_definition_is_what_was_built():
     ).stdout
     assert (
         told.strip()
-        == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0)"
+        == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0, "
+        "speed_mm_s=0.0, force_n=0.0)"
     )

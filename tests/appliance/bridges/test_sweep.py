@@ -27,6 +27,16 @@ class Wanted(NamedTuple):
     new_object: bool = False
     slide_s: float = 0.05
     timeout_s: float = LONG_S
+    speed_mm_s: float = 0.0
+    force_n: float = 0.0
+
+
+class OldGoal(NamedTuple):
+    """A goal of palpate_msgs 1.0."""
+
+    new_object: bool = False
+    slide_s: float = 0.05
+    timeout_s: float = LONG_S
 
 
 class Hurried(SystemClock):
@@ -103,6 +113,16 @@ def test_start_slide_stop_answer(swept: Swept):
     assert swept.phases == ["sliding", "judging"]
     swept.run(new_object=True)
     assert swept.has_heard("START", "STOP", "NEW", "START", "STOP")
+
+
+def test_start_has_the_speed_and_force_of_the_goal(swept: Swept):
+    """0 is not sent, and a goal without these fields starts a sweep, too."""
+    swept.run(speed_mm_s=30.5)
+    swept.run(force_n=1.5)
+    swept.run()
+    swept.sweep.run(OldGoal())
+    started = [s.fields for s in swept.box.heard if s.kind == "START"]
+    assert started == [["30.5"], ["", "1.5"], [], []]
 
 
 def test_an_early_answer_ends_the_slide(swept: Swept):

@@ -41,10 +41,11 @@ def test_the_client_works_through_it(box: SpeakingBox):
         Palpate(url(address), timeout_s=LONG_S) as client,
     ):
         client.wait_ready(LONG_S)
-        client.start()
+        client.start(speed_mm_s=30.5, force_n=1.5)
         client.stop()
         assert client.result(LONG_S).label == "wood"
         assert client.labels() == LABELS
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
 
 
 def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):

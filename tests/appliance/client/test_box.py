@@ -57,6 +57,24 @@ def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
     assert all(s.summed for s in speaking.heard)
 
 
+@pytest.mark.parametrize(
+    ("values", "fields"),
+    [
+        ({}, []),
+        ({"speed_mm_s": 30}, ["30"]),
+        ({"speed_mm_s": 30.5, "force_n": 0.000025}, ["30.5", "0.000025"]),
+        ({"force_n": 1 / 3}, ["", "0.333333"]),
+    ],
+)
+def test_start_has_speed_and_force(
+    speaking: SpeakingBox, box: Palpate, values: dict[str, float], fields: list[str]
+):
+    """As decimals without an exponent; an unknown value stays empty."""
+    box.start(**values)
+    assert speaking.heard[-1].kind == "START"
+    assert speaking.heard[-1].fields == fields
+
+
 def test_a_command_is_asked_in_one_text_or_in_several(box: Palpate):
     """As it stands in a sentence, or each field by itself: the box answers with the first word."""
     assert box.ask("LABEL,1") == box.ask("LABEL", "1")
