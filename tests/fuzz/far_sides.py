@@ -84,6 +84,7 @@ def modbus_seeds() -> list[bytes]:
     """A request of each kind, two in a row, a truncated request."""
     pdus = [struct.pack(">BHH", function, 0, 8) for function in (1, 2, 3, 4)]
     pdus += [struct.pack(">BHH", 5, 0, 0xFF00), struct.pack(">BHHBB", 15, 0, 3, 1, 5)]
+    pdus += [struct.pack(">BHH", 6, 40, 305), struct.pack(">BHHBHH", 16, 40, 2, 4, 305, 150)]
     each = [HEADER.pack(i, 0, len(pdu) + 1, 1) + pdu for i, pdu in enumerate(pdus)]
     return [b"".join(each), *each, each[0] + each[1][:9]]
 

@@ -106,6 +106,7 @@ def command() -> list[bytes]:
         *written,
         b"$PPLP,ID*00\r\n",
         b"x" * 130 + b"\nPPLP,NEW\n",
+        b"PPLP START 30 1.5\n",
     ]
 
 
@@ -187,6 +188,7 @@ def capture() -> list[bytes]:
             writer.transfer(now, packets.pack(6 * i, 8000 * i, frames[6 * i : 6 * i + 6]))
             if i in (2, 4):
                 writer.edges(now + 2, [Edge((EdgeKind.START, EdgeKind.STOP)[i // 4], now + 1)])
+        writer.edges(begin + 45_000_000, [Edge(EdgeKind.START, begin + 44_000_000, 30.0, 1.5)])
         writer.command(begin + 50_000_000, "NEW")
         writer.state(begin + 60_000_000, "lost")
         writer.close()

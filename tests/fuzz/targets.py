@@ -196,10 +196,15 @@ def _is_command(line: bytes, name: str) -> bool:
     known = (
         fields[:2] == ["PPLP", name]
         and name in robot_link.COMMANDS
-        and (len(fields) == 3) == (name in robot_link.TEXT_COMMANDS)
+        and (name == "START" or (len(fields) == 3) == (name in robot_link.TEXT_COMMANDS))
     )
-    # characters that a sentence may not hold (PROTOCOL.md); a command has one field
-    known = known and "," not in "".join(fields[2:]) and not re.search(rb"[^ -~]|[!\\~^]", body)
+    # characters that a sentence may not hold (PROTOCOL.md); a command has one field, and the
+    # trigger checks those of START
+    if name == "START":
+        known = known and not re.search(rb"[^ -~]", body)
+    else:
+        known = known and "," not in "".join(fields[2:])
+        known = known and not re.search(rb"[^ -~]|[!\\~^]", body)
     sealed = not star or given.upper() == b"%02X" % reduce(xor, body, 0)
     return known and sealed and len(line) <= LINE
 
