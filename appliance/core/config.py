@@ -169,7 +169,11 @@ class ClassifierConfig:
     object are fused into one answer; "none" answers each sweep alone. early: answer while the
     finger still slides, as soon as the bundle's rule allows. min_probability: least probability for
     status ok; 0 takes the bundle's threshold. max_sweeps: after this many fused sweeps of one
-    object below `min_probability` the answer is `undecided`; 0 means no limit.
+    object below `min_probability` the answer is `undecided`, and the next sweep begins another
+    object; 0 means no limit. conflict: consequence of a sweep that contradicts the sweeps fused
+    before it: "new" begins another object, "refuse" answers `conflict`, "fuse" fuses all sweeps
+    until NEW OBJECT, also after `max_sweeps`. object_s: longest pause between two sweeps of one
+    object, in seconds; 0 means no limit.
     """
 
     bundle: str = ""
@@ -177,7 +181,9 @@ class ClassifierConfig:
     fuse: Literal["product", "vote", "none"] = "product"
     early: bool = False
     min_probability: float = number(0.0, 0.0, 1.0)
-    max_sweeps: int = number(0, 0, 1000)
+    max_sweeps: int = number(5, 0, 1000)
+    conflict: Literal["new", "refuse", "fuse"] = "new"
+    object_s: float = number(60.0, 0.0, 86_400.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ class Status(StrEnum):
     EDGES_LOST = "edges-lost"
     ABORTED = "aborted"
     RECORDED = "recorded"
+    CONFLICT = "conflict"
 
     @property
     def classified(self) -> bool:
@@ -59,6 +60,7 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.EDGES_LOST: "trigger edges were lost; check the GPIO lines of the trigger",
         Status.ABORTED: "by command, or because the box was stopping",
         Status.RECORDED: "sweeps are recorded, not classified",
+        Status.CONFLICT: "it contradicts the sweeps before it; signal NEW OBJECT for each object",
     }
 )
 """The reason why a sweep has no label, and the remedy; PROTOCOL.md has the details."""

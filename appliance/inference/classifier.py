@@ -8,6 +8,8 @@ the reason instead of a label.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.novelty import ClassDistances
+from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
 from appliance.signal.contact import displacement
@@ -61,19 +64,19 @@ def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
 class Classifier:
     """Runs one bundle in one thread.
 
-    Sweeps with the same `object` number above 0 are fused. Without NEW OBJECT each sweep is
-    answered by itself. The sweeps of an object are a sequential test: `unsure` asks for one more
-    sweep, until the probability is at least `min_probability` (ok) or `max_sweeps` were fused
-    (undecided, the final answer). If the robot continues after the final answer, further sweeps are
-    fused by the same rule, because no evidence is discarded.
+    Sweeps with the same `object` number above 0 are fused, until the object ends (ObjectRule).
+    Without NEW OBJECT each sweep is answered by itself. The sweeps of an object are a sequential
+    test: `unsure` asks for one more sweep, until the probability is at least `min_probability` (ok)
+    or `max_sweeps` were fused (undecided, the final answer).
 
     If the contact is displaced and the bundle has a rule for displacement, the rule's distances,
     limit, temperature and least probability apply. An unknown sweep is not fused: it has no
     probabilities, and one touch beside the object must not invalidate the other sweeps.
 
     fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 means the bundle's
-    thresholds.unsure. max_sweeps: 0 means no limit. Raises BundleError if onnxruntime refuses the
-    model. `bundle.load` has compared its inputs and outputs with the manifest.
+    thresholds.unsure. max_sweeps, conflict, object_s: as in ObjectRule; by default only NEW OBJECT
+    ends an object. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared
+    its inputs and outputs with the manifest.
     """
 
     def __init__(
@@ -83,12 +86,14 @@ class Classifier:
         fusion: str = "product",
         min_probability: float = 0.0,
         max_sweeps: int = 0,
+        conflict: str = "fuse",
+        object_s: float = 0.0,
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
-        self._clock, self._fusion, self._max_sweeps = clock, fusion, max_sweeps
-        self._object = 0
-        self._scores: list[NDArray[np.float64]] = []  # of the object's sweeps so far
+        self._clock, self._fusion = clock, fusion
+        self._ends = ObjectRule(max_sweeps, conflict, object_s)
+        self._sweeps = FusedSweeps()
         self.tare = bundle.manifest.tare
         known, classes = bundle.manifest.known, bundle.classes
         self._means = (
@@ -113,7 +118,7 @@ class Classifier:
         return {
             "fuse": self._fusion,
             "min_probability": self.min_probability,
-            "max_sweeps": self._max_sweeps,
+            **asdict(self._ends),
         }
 
     @property
@@ -234,26 +239,55 @@ class Classifier:
             return self._verdict(
                 sweep, Finding(Status.UNKNOWN, "the model gives no number"), displacement=displaced
             )
-        if sweep.object == 0 or sweep.object != self._object or self._fusion == "none":
-            self._object, self._scores = sweep.object, []
-        own, self._scores = scores, [*self._scores, scores]
-        fused = len(self._scores)
-        if fused > 1:
-            scores = fuse(self._scores, self._fusion)
+        earlier = self._sweeps
+        if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
+            earlier = FusedSweeps(sweep.object)
+        before = () if earlier.ended(sweep.start_ns, self._ends) else earlier.scores
+        conflict = self._conflict(scores, before)
+        if conflict and self._ends.conflict == "refuse":
+            self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
+            finding = Finding(Status.CONFLICT, conflict)
+            return self._verdict(
+                sweep, finding, own=scores, displacement=displaced, after=earlier.last
+            )
+        kept = (scores,) if conflict else (*before, scores)
+        self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
+        fused = self._fuse(kept)
         status, rule = Status.OK, self.bundle.manifest.displacement
-        if scores.max() < max(self.min_probability, rule.unsure if displaced and rule else 0):
-            status = Status.UNDECIDED if 0 < self._max_sweeps <= fused else Status.UNSURE
-        return self._verdict(sweep, Finding(status), scores, fused, own, displaced)
+        if fused.max() < max(self.min_probability, rule.unsure if displaced and rule else 0):
+            final = 0 < self._ends.max_sweeps <= len(kept)
+            status = Status.UNDECIDED if final else Status.UNSURE
+        return self._verdict(
+            sweep, Finding(status, conflict), fused, len(kept), scores, displaced, earlier.last
+        )
+
+    def forget(self) -> None:
+        """Forget the sweeps of the present object; the next sweep begins another object."""
+        self._sweeps = FusedSweeps()
 
     def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
         """The verdict of `conclude` on an unfinished sweep if its status is ok; otherwise None, and
         the sweep is not counted."""
-        before = self._object, self._scores
+        before = self._sweeps
         verdict = self.conclude(sweep, scores)
         if verdict.status is Status.OK:
             return verdict
-        self._object, self._scores = before
+        self._sweeps = before
         return None
+
+    def _fuse(self, scores: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """The probabilities float64 [K] of several sweeps; a single sweep keeps its own."""
+        return fuse(list(scores), self._fusion) if len(scores) > 1 else scores[0]
+
+    def _conflict(self, own: NDArray[np.float64], before: Sequence[NDArray[np.float64]]) -> str:
+        """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
+        them."""
+        if not before or self._ends.conflict == "fuse":
+            return ""
+        fused, labels = self._fuse(before), self.bundle.manifest.labels
+        if not contradicts(own, fused):
+            return ""
+        return f"another object: {labels[own.argmax()]} after {labels[fused.argmax()]}"
 
     def _run(self, outputs: tuple[str, ...], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
         """The named outputs of the graph for one window, without the leading axis of length 1."""
@@ -294,6 +328,7 @@ class Classifier:
         fused: int = 0,
         own: NDArray[np.float64] = _NONE,
         displacement: str = "",
+        after: int = 0,
     ) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
@@ -320,6 +355,7 @@ class Classifier:
             share=sweep.share,
             own=own,
             displacement=displacement,
+            after=after,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
         )

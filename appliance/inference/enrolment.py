@@ -221,7 +221,7 @@ class SweepCollector(Observer):
         """Collect the sweep's window if the box found no fault in it."""
         if self.enough:
             return
-        if verdict.status.classified or verdict.status is Status.UNKNOWN:
+        if verdict.status.classified or verdict.status in (Status.UNKNOWN, Status.CONFLICT):
             self._windows.append(sweep.frames.taxels)
             log.info(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
         else:

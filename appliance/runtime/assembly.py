@@ -222,7 +222,15 @@ def gpio(devices: Devices) -> Any:
 def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
     """The classifier with these settings."""
     chosen = settings.classifier
-    return Classifier(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps)
+    return Classifier(
+        bundle,
+        clock,
+        chosen.fuse,
+        chosen.min_probability,
+        chosen.max_sweeps,
+        chosen.conflict,
+        chosen.object_s,
+    )
 
 
 def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:

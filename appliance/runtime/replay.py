@@ -35,7 +35,7 @@ sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
 OLD_RULE_KEYS = {"how": "fuse", "sure": "min_probability", "most_sweeps": "max_sweeps"}
 """Keys of the rule in sidecars up to schema 2, with the present keys."""
-FUSIONS = get_args(get_type_hints(ClassifierConfig)["fuse"])
+CHOICES = {name: get_args(get_type_hints(ClassifierConfig)[name]) for name in ("fuse", "conflict")}
 
 
 class OtherBundle(FormatError):
@@ -61,18 +61,22 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys.
+    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys; older
+    sidecars have only the first three, and only NEW OBJECT ended an object.
 
-    Raises TypeError for an unknown fusion.
+    Raises TypeError for an unknown fusion or conflict.
     """
 
     fuse: str
     min_probability: float
     max_sweeps: int
+    conflict: str = "fuse"
+    object_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.fuse not in FUSIONS:
-            raise TypeError(f"fuse {self.fuse!r} is not one of {', '.join(FUSIONS)}")
+        for name, known in CHOICES.items():
+            if (value := getattr(self, name)) not in known:
+                raise TypeError(f"{name} {value!r} is not one of {', '.join(known)}")
 
     @classmethod
     def read(cls, about: Mapping[str, Any]) -> ReplayRule | None:
@@ -119,8 +123,8 @@ class KeptSweep:
             rule = ReplayRule.read(about)
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
-            if any(type(verdict.get(name, 0)) is not int for name in ("fused", "time_ns")):
-                raise TypeError("the verdict's fused and time_ns must be whole numbers")
+            if any(type(verdict.get(name, 0)) is not int for name in ("fused", "after", "time_ns")):
+                raise TypeError("the verdict's fused, after and time_ns must be whole numbers")
             return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict)
         except (TypeError, ValueError) as e:
             raise FormatError(
@@ -159,9 +163,8 @@ class SweepReplay:
         self._clock = ReplayClock()
         self._classifier: Classifier | None = None
         self._made: object = None  # folder, run and rule of the classifier
-        self._last: object = (
-            None  # (object, sweeps fused) of the last sweep with all earlier ones of its object
-        )
+        # (object, number) of the last sweep with probabilities whose earlier sweeps are all there
+        self._last: object = None
 
     def __call__(self, kept: KeptSweep) -> ReplayResult:
         """The verdict on `kept`, compared with the verdict in its sidecar. Raises FormatError for a
@@ -175,11 +178,15 @@ class SweepReplay:
         _check_length(kept.sweep, kept.format)
         was = kept.verdict
         fused = was.get("fused", 0)
-        whole = fused <= 1 or self._last == (kept.object, fused - 1)
-        if fused and whole:
-            self._last = kept.object, fused
+        # verdicts without `after` count the sweeps of an object instead
+        number, after = (kept.sweep.id, was["after"]) if "after" in was else (fused, fused - 1)
+        whole = after <= 0 or self._last == (kept.object, after)
+        if (fused or was.get("own")) and (whole or fused == 1):
+            self._last = kept.object, number
         classifier = self._prepared(kept)
-        sweep = kept.sweep if whole else replace(kept.sweep, object=0)
+        if not whole:
+            classifier.forget()
+        sweep = kept.sweep if whole or fused == 1 else replace(kept.sweep, object=0)
         verdict = classifier(sweep) if sweep.share == 1 else EarlyExit(classifier)(sweep)
         if not whole:
             own = verdict.own if verdict else EarlyExit(classifier).scores(sweep)[-1]

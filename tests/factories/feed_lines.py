@@ -107,6 +107,7 @@ def verdict(
         "share": 1.0,
         "own": [] if without else scores,
         "moved": "",
+        "after": 0,
         **other,
     }
 

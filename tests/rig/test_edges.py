@@ -34,6 +34,7 @@ busy = "CLASS-0"
 decided = "CLASS-1"
 [classifier]
 early = true
+conflict = "fuse"
 [sweep]
 max_duration_s = 4.0
 [serial]

@@ -181,7 +181,8 @@ def test_replay_of_a_sweep_set(
         rate_hz=750.0,
         group_recording=np.repeat(np.arange(2), len(default_bundle.golden)),
     )
-    assert main(["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual"]) == 0
+    fused = ["--set", "classifier.conflict=fuse"]  # the golden sweeps are of several materials
+    assert main(["run", "--sim", f"replay:{tmp_path / 'set.npz'}", "--virtual", *fused]) == 0
     results = [r.split(b",") for r in capsysbinary.readouterr().out.splitlines() if b",RES," in r]
     assert [int(r[8]) for r in results] == [*range(1, len(default_bundle.golden) + 1)] * 2
     assert all(r[12] == b"replay" for r in results)

@@ -24,9 +24,11 @@ from appliance.inference.early_exit import EarlyExit, decides
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
 from appliance.recording.sweep_window import SweepCutter
+from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, gpio, rig, script
 from appliance.tools import demo
+from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
 
 onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
@@ -542,7 +544,7 @@ def test_a_capture_gives_the_same_answers(
     first = all_of(box)
     capture.close()
     play = Playback(tmp_path / "capture")
-    classifier = Classifier(toy((0.97, 0.95, 0.93, 0.7)), play)
+    classifier = assembly.classifier(load_settings(SETS), toy((0.97, 0.95, 0.93, 0.7)), play)
     again, kept = [], []
     replayed = Box(
         Pipeline(

@@ -592,3 +592,14 @@ def test_the_collector_takes_what_it_wants(old: Bundle, logged: list[str]):
         taken.sweep(sweep, it(sweep), {})
     assert taken.windows().tolist() == counts(*FELT[:2]).tolist()
     assert logged == ["sweep 0 taken: 1 of 2", "sweep 1 taken: 2 of 2"]
+
+
+def test_the_collector_takes_a_conflict(old: Bundle):
+    """A sweep that contradicts the sweeps before it, by the old bundle, is good. A faulty sweep is
+    not."""
+    it, sweep = Classifier(old, VirtualClock()), toy_bundle.sweep(*FELT[0])
+    verdict = it(sweep)
+    for status, taken in ((Status.CONFLICT, True), (Status.NO_CONTACT, False)):
+        collector = enrolment.SweepCollector(1)
+        collector.sweep(sweep, replace(verdict, status=status), {})
+        assert collector.enough == taken

@@ -290,7 +290,7 @@ def test_class_bits_settle_before_result_valid():
     assert when["VALID"] - max(when["C0"], when["C1"]) >= 200_000
 
 
-@pytest.mark.parametrize("status", [Status.UNSURE, Status.NO_CONTACT, Status.SENSOR_LOST])
+@pytest.mark.parametrize("status", [Status.UNSURE, Status.CONFLICT, Status.NO_CONTACT])
 def test_what_is_not_ok_is_code_zero(status: Status):
     """An unsure or refused sweep raises RESULT VALID with code 0."""
     lines, chip = lines_on(2)

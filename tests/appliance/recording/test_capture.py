@@ -26,28 +26,37 @@ from appliance.core.types import (
     load,
     save,
 )
-from appliance.inference.classifier import Classifier
 from appliance.io import packets
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
 from appliance.recording.sweep_window import SweepCutter
+from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.paths import ONE_AXIS
+from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, OnSweep, Rigged
 from tests.factories.skin_wires import WiredSkin, profile
 
+UNTIL_NEW_OBJECT = (
+    "classifier.conflict=fuse",
+    "classifier.max_sweeps=0",
+    "classifier.object_s=0",
+)
+"""The settings with which only NEW OBJECT ends an object, as in versions before 0.2."""
 
-def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
+
+def played(
+    path: Path, model: Bundle, sets: tuple[str, ...] = ()
+) -> tuple[list[Verdict], list[Sweep]]:
     """Verdicts and sweeps of a capture."""
     play = Playback(path)
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
     port = StdoutPort("replay", play.commands)
-    pipeline = Pipeline(
-        play, play, SweepCutter(play.format, SweepConfig()), Classifier(model, play)
-    )
+    classifier = assembly.classifier(load_settings(sets), model, play)
+    pipeline = Pipeline(play, play, SweepCutter(play.format, SweepConfig()), classifier)
     box = Box(
         pipeline, play, port=port, observers=[OnSweep(lambda sweep, verdict: sweeps.append(sweep))]
     )
@@ -87,7 +96,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
     """With drift, spikes, lost transfers, an unplugged skin and NEW OBJECT, replay gives the same
     windows, times and scores."""
     rng = np.random.default_rng(5)
-    acts = list(script.tubes(1010, 8))
+    acts = list(script.tubes(1010, 8, only="wood"))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
     simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
     simulated.backend.board = rig.ReadoutBoard(
@@ -121,9 +130,9 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
 
 
 def test_a_capture_from_before_there_were_axes(tmp_path: Path):
-    """Its sweeps get their original verdicts."""
+    """Its sweeps get their original verdicts with the settings of then."""
     model = toy_bundle.load(tmp_path / "bundle")
-    verdicts, sweeps = played(ONE_AXIS / "capture", model)
+    verdicts, sweeps = played(ONE_AXIS / "capture", model, UNTIL_NEW_OBJECT)
     then = json.loads((ONE_AXIS / "verdicts.json").read_text())
     assert [(v.sweep, v.status, v.label, v.fused) for v in verdicts] == [
         (v["sweep"], v["status"], v["label"], v["fused"]) for v in then
@@ -140,7 +149,9 @@ def test_commands_are_part_of_a_capture(
 ):
     """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
     before."""
-    simulated = devices.build(skin.FORMAT, script.tubes(1014, 5), rig.VirtualClock(), "sim")
+    simulated = devices.build(
+        skin.FORMAT, script.tubes(1014, 5, only="wood"), rig.VirtualClock(), "sim"
+    )
     capture = CaptureWriter(tmp_path / "capture", skin.FORMAT)
     box = rigged(simulated, capture=capture)
     first = box.until(lambda: box.box.answered == 1)

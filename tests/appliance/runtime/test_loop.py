@@ -290,7 +290,8 @@ def test_a_spoiled_skin_is_seen_before_the_network_is_asked(
 def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):
     """Before NEW OBJECT sweeps are answered alone. After it they are fused, until the next NEW
     OBJECT."""
-    acts = [replace(a, new_object=i in (1, 4)) for i, a in enumerate(script.tubes(1005, 6))]
+    tubes = script.tubes(1005, 6, only="wood")
+    acts = [replace(a, new_object=i in (1, 4)) for i, a in enumerate(tubes)]
     box = rigged(simulated_devices(acts))
     verdicts = box.until(lambda: box.box.answered == 6)
     assert [v.fused for v in verdicts] == [1, 1, 2, 3, 1, 2]

@@ -45,18 +45,17 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def in_service(
     run: dict[str, Any], rigged: Callable[..., Rigged], tmp_path: Path
 ) -> tuple[Path, list[str]]:
-    """A copy of a folder of 30 sweeps, three for each object, some answered early; and the
-    sentences that were sent."""
+    """A copy of a folder of 30 sweeps, some answered early; and the sentences that were sent. Five
+    sweeps of each material, NEW OBJECT before each third sweep: some objects are of two materials,
+    and end with the first."""
     if "heard" not in run:
-        acts = [
-            replace(act, new_object=i % PER_OBJECT == 0)
-            for i, act in enumerate(script.tubes(1020, SWEEPS))
-        ]
+        in_runs = sorted(script.tubes(1020, SWEEPS), key=lambda act: act.label)
+        acts = [replace(act, new_object=i % PER_OBJECT == 0) for i, act in enumerate(in_runs)]
         simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "replay")
         black_box = BlackBox(run["folder"], skin.FORMAT, SWEEPS)
         box = rigged(
             simulated,
-            sets=("classifier.early=true", "classifier.min_probability=0.97"),
+            sets=("classifier.early=true", "classifier.min_probability=0.9999"),
             observers=[black_box],
         )
         box.until(lambda: simulated.finished(box.box.answered), limit_s=300)
@@ -92,6 +91,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle: bundl
     folder, heard = in_service
     abouts = [sidecar(path) for path in sorted(folder.glob("*.npy"))]
     assert max(about["verdict"]["fused"] for about in abouts) == PER_OBJECT
+    assert any("another object: " in about["verdict"]["detail"] for about in abouts)
     assert 3 < sum(about["share"] < 1 for about in abouts) < SWEEPS - 3
     code, sentences, outcomes = played(folder, default_bundle, OTHERWISE)
     assert code == 0
@@ -169,6 +169,56 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
     code, sentences, outcomes = played(tmp_path, model)
     assert (code, sentences) == (0, [])
     assert outcomes[-1] == "1 sweeps: 1 the same by itself"
+
+
+@pytest.mark.parametrize("conflict", ["new", "refuse", "fuse"])
+def test_objects_end_in_a_replay_as_they_did(tmp_path: Path, conflict: str):
+    """NEW OBJECT once, then sweeps that contradict, a pause, and more than max_sweeps: the same
+    verdicts. With any sweep missing, the sweeps that depended on it are compared by themselves."""
+    model = toy_bundle.load(tmp_path / "bundle")
+    it = Classifier(model, rig.VirtualClock(), max_sweeps=3, conflict=conflict, object_s=60.0)
+    folder, start_s, statuses = tmp_path / "kept", 0, []
+    folder.mkdir()
+    for n, letter in enumerate("aabbbbab aba?aab", 1):
+        start_s += 100 if letter == " " else 10
+        z = {"a": (0, 0), "b": (6, 0), " ": (0, 0), "?": (30, 30)}[letter]
+        sweep = toy_bundle.sweep(*z, number=n, object=1)
+        sweep = replace(sweep, start_ns=start_s * 10**9, stop_ns=start_s * 10**9 + 1)
+        verdict = it(sweep)
+        statuses.append(str(verdict.status))
+        about = {"rule": it.rule, "bundle": model.id, "verdict": verdict.as_dict()}
+        save(folder / f"sweep-{n:06d}.npy", sweep, toy_bundle.FORMAT, about)
+    assert statuses.count("unknown") == 1
+    assert ("conflict" in statuses) == (conflict == "refuse")
+    code, _, outcomes = played(folder, model)
+    assert (code, outcomes[-1]) == (0, "16 sweeps: 16 the same")
+    for missing in folder.glob("*.npy"):
+        rest = Path(shutil.copytree(folder, tmp_path / missing.stem))
+        (rest / missing.name).unlink()
+        code, _, outcomes = played(rest, model)
+        assert code == 0
+        last = missing.stem.endswith("16") or missing.stem.endswith("13")
+        assert ("the same by itself" in outcomes[-1]) != last
+        if (conflict, missing.stem) == ("new", "sweep-000002"):  # the third begins another object
+            assert outcomes[-1] == "15 sweeps: 14 the same, 1 the same by itself"
+
+
+def test_a_rule_without_the_end_of_objects(tmp_path: Path):
+    """Sidecars of versions before it: all sweeps until NEW OBJECT are fused, also after
+    max_sweeps and a pause."""
+    model = toy_bundle.load(tmp_path / "bundle")
+    it, after = Classifier(model, rig.VirtualClock(), max_sweeps=2), []
+    for n, z in enumerate([(0, 0), (6, 0), (0, 0), (0, 0)], 1):
+        sweep = replace(toy_bundle.sweep(*z, number=n, object=1), start_ns=n * 10**12)
+        verdict = it(sweep).as_dict()
+        after.append(verdict.pop("after"))
+        rule = {name: it.rule[name] for name in ("fuse", "min_probability", "max_sweeps")}
+        about = {"rule": rule, "bundle": model.id, "verdict": verdict}
+        save(tmp_path / f"sweep-{n:06d}.npy", sweep, toy_bundle.FORMAT, about)
+    assert after == [0, 1, 2, 3]
+    assert played(tmp_path, model)[2][-1] == "4 sweeps: 4 the same"
+    (tmp_path / "sweep-000002.npy").unlink()
+    assert played(tmp_path, model)[2][-1] == "3 sweeps: 1 the same, 2 the same by itself"
 
 
 def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
@@ -324,11 +374,23 @@ def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
             {"rule": {"fuse": "guess", "min_probability": 0.5, "max_sweeps": 0}},
             "sidecar cannot be used",
         ),
+        (
+            {
+                "rule": {
+                    "fuse": "vote",
+                    "min_probability": 0.5,
+                    "max_sweeps": 0,
+                    "conflict": "guess",
+                }
+            },
+            "conflict 'guess' is not one of new, refuse, fuse",
+        ),
         ({"rule": {"how": "vote", "sure": 0.5, "most_sweeps": 0}}, "sidecar cannot be used"),
         ({"rule": 3}, "sidecar cannot be used"),
         ({"run": "first"}, "sidecar cannot be used"),
         ({"verdict": 7}, "sidecar cannot be used"),
         ({"verdict": {"fused": "two"}}, "sidecar cannot be used"),
+        ({"verdict": {"after": "two"}}, "sidecar cannot be used"),
         ({"verdict": {"time_ns": None}}, "sidecar cannot be used"),
         ({"verdict": {"time_ns": "now"}}, "sidecar cannot be used"),
     ],
