@@ -327,6 +327,20 @@ def test_banned_words_do_not_come_back():
     assert found == []
 
 
+def test_no_merge_is_left_unfinished():
+    """No file has the marks of a merge conflict. One in a decision was reflowed with its text."""
+    marks = re.compile(r"^(<{7} |>{7} |\|{7} )", re.MULTILINE)
+    texts = [p for p in ROOT.glob("*") if p.is_file()]
+    for folder in ("appliance", "train", "firmware_config", "systemd", "tests", "docs"):
+        texts += [p for p in ROOT.glob(f"{folder}/**/*") if p.is_file()]
+    found = [
+        str(path.relative_to(ROOT))
+        for path in texts
+        if marks.search(path.read_bytes().decode("utf-8", "ignore"))
+    ]
+    assert found == []
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of the box, built from the project."""
