@@ -45,6 +45,8 @@ COLUMNS = {
     "hard" + BLIND: "level-blind\nT-HARD",
 }
 """Columns of the picture of all methods."""
+LOADS = "static-svm"
+"""The method that sees mean loads alone."""
 NEAR_ON_AVERAGE = 0.02
 """Target of the calibration for the mean."""
 Row = Mapping[str, Any]
@@ -148,6 +150,10 @@ class PaperReport:
             "methods": summary["methods"],
             "overview": [self._overview(method) for method in (BEST, CNN, *self.own)],
             "ahead": self._ahead(),
+            "loads_method": LOADS,
+            "loads": [
+                row for part in ("hard", HARD_BLIND[1]) if (row := self.rows.get((part, LOADS)))
+            ],
             "match": self._match(),
         }
 

@@ -62,7 +62,7 @@ def summary(quick: bool = False, cnn: bool = True) -> dict[str, Any]:
     outcomes = [
         outcome(p, m, w)
         for p in paper_experiment.FULL
-        for m in (*paper_experiment.BASELINES, "default-reattached")
+        for m in (*paper_experiment.BASELINES, "static-svm", "default-reattached")
         for w in (1, 2)
     ]
     outcomes += [outcome(p, "paper-cnn", right=0.9) for p in ("lopo", "hard") if cnn]
@@ -176,7 +176,7 @@ def test_summary_pools_seeds_and_keeps_each_result(results):
         6,
     )
     assert row["share"][0] == round(row["right"] / 144, 4)
-    assert len(results["results"]) == 6 * 6 * 2 + 2
+    assert len(results["results"]) == 6 * 7 * 2 + 2
     assert np.sum(results["confusion"]["H-svm"], 1).tolist() == [24] * 6
     assert results["costs"] == {"paper-cnn": [[[1, 1.7], [7, 0.5]]] * 2}
 
@@ -278,6 +278,9 @@ def test_both_worlds_stand_side_by_side(results, made):
         assert (line[2] == "–") == part.endswith("level-blind")
     text = " ".join(PageReader(made[0]).text.split())
     assert all(value in text for line in lines for value in line)
+    loads = [f"{100 * shares[part, 'static-svm']:.1f} %" for part in ("hard", "hard/level-blind")]
+    assert f"Mean loads alone (static-svm) name {loads[0]} of T-HARD in the laboratory" in text
+    assert f"and {loads[1]} in the level-blind world" in text
 
 
 def curve(step: int = 400, seed: int = 1, left: int | None = 4, world: str = "") -> dict[str, Any]:
