@@ -106,7 +106,7 @@ FULL = in_both_worlds(
     }
 )
 FULL_STEPS = (
-    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3), 1),
+    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3, 4, 5), 1),
     Step(NEIGHBOURS, (*HARD, *HARD_BLIND), (1, 2, 3), 1),
     Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3), 90),
     Step(OWN[:1], ("lopo",), (1, 2, 3), 60),
