@@ -104,7 +104,7 @@ def _bar(axes: Axes, y: float, bar: Bar) -> None:
     axes.plot([low, high], [y, y], color=BLACK, linewidth=1.4)
     write(axes, -0.03, y, bar.name, ha="right")
     write(axes, 1.04, y, percent(mean, 0), ACCENT, ha="left", weight="bold")
-    write(axes, 1.25, y, interval((low, high), 0), GREY, SMALL, ha="left")
+    write(axes, 1.31, y, interval((low, high), 0), GREY, SMALL, ha="left")
     if bar.printed is not None:
         axes.plot(bar.printed, y, zorder=3, **PRINTED)
         write(axes, 1.87, y, exact_percent(bar.printed), ha="right")
