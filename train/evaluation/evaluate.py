@@ -20,7 +20,7 @@ from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol, draw
 from train.evaluation import parallel
 from train.evaluation.fold import Fold, FoldTask, key, run
-from train.metrics.score import Score, fuse, interval, provenance
+from train.metrics.score import Score, confusion, fuse, interval, provenance
 from train.models import methods as known_methods
 from train.models.methods import FULL_EFFORT, Effort
 from train.onnx_tools import parity
@@ -61,8 +61,6 @@ class Result:
     def json(self) -> dict[str, Any]:
         """The result for scripts; every count has its 95 % interval."""
         logits, sweeps = self.logits, self.sweeps
-        confusion = np.zeros((len(sweeps.materials),) * 2, int)
-        np.add.at(confusion, (sweeps.labels[self.test], logits.argmax(1)), 1)
         result: dict[str, Any] = {
             "method": self.method,
             "protocol": self.protocol,
@@ -84,7 +82,7 @@ class Result:
                 "agreement": min(f.agreement for f in self.folds),
                 "ran": ", ".join(ran),
                 "materials": list(sweeps.materials),
-                "confusion": confusion.tolist(),
+                "confusion": confusion(sweeps.labels[self.test], logits).tolist(),
                 "set": sweeps.source,
                 "format": sweeps.format.json(),
             }

@@ -71,6 +71,19 @@ def widen(
     )
 
 
+def confusion(labels: Array, scores: Array) -> Array:
+    """Counts int64 [K, K], rows by `labels` [n], columns by the largest of `scores` [n, K]."""
+    counts = np.zeros((scores.shape[1],) * 2, np.int64)
+    np.add.at(counts, (labels, scores.argmax(1)), 1)
+    return counts
+
+
+def row_shares(counts: Array) -> Array:
+    """Each row of `counts` [K, K] divided by its sum; a row of zeros stays."""
+    shares: Array = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    return shares
+
+
 def fuse(logits: Array, together: Array) -> tuple[Array, Array]:
     """Fuse the sweeps that have the same value in `together` [n].
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from train.data import transforms
 from train.data.transforms import WHOLE, Change
+from train.metrics.score import confusion
 from train.selection.nested_cv import Trials
 from train.selection.scene import Scene
 from train.selection.select import Selection
@@ -256,9 +257,7 @@ def classes(choice: Selection, wanted: float) -> Json:
 def _confused(label: Array, probability: Array) -> Array:
     """[K, K], above the diagonal: for two materials, the share of their sweeps that are taken for
     the other."""
-    k = probability.shape[1]
-    counts = np.zeros((k, k))
-    np.add.at(counts, (label, probability.argmax(1)), 1)
+    counts = confusion(label, probability)
     size = counts.sum(1)
     return np.triu((counts + counts.T) / np.maximum(size[:, None] + size, 1), 1)
 

@@ -30,6 +30,7 @@ from train.evaluation.evaluate import Where
 from train.evaluation.fold import fingerprint
 from train.export import measure, pack
 from train.export.measure import Measurement
+from train.metrics.score import confusion, row_shares
 from train.models import methods
 from train.models.methods import Effort, Method
 from train.selection.nested_cv import Difference, Refused, Trials, Unseen
@@ -341,9 +342,8 @@ class Selection:
         """Confused pairs of materials, the most frequent first: shares of the sweeps of a
         material."""
         _, _, sweep, probability = self.trials.tested(self.final.chosen)
-        names, counts = self.trials.sweeps.materials, np.zeros((probability.shape[1],) * 2)
-        np.add.at(counts, (self.trials.sweeps.labels[sweep], probability.argmax(1)), 1)
-        shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+        sweeps = self.trials.sweeps
+        names, shares = sweeps.materials, row_shares(confusion(sweeps.labels[sweep], probability))
         wrong = [
             (shares[a, b], a, b)
             for a, b in np.argwhere((shares > 0) & ~np.eye(len(names), dtype=bool))

@@ -207,14 +207,11 @@ def _point(logits: dict[str, Array], given: dict[str, Dataset]) -> dict[str, Any
         "cost": round(float(log_loss(given["train"].labels, softmax(logits["train"]))), 6)
     }
     for name, sweeps in given.items():
-        named = logits[name].argmax(1)
-        right = named == sweeps.labels
+        right = logits[name].argmax(1) == sweeps.labels
         ends = score.interval(right, sweeps.group("position"))
         point[name] = [round(float(value), 4) for value in (right.mean(), *ends)]
         if name != "train":
-            confusion = np.zeros((len(sweeps.materials),) * 2, int)
-            np.add.at(confusion, (sweeps.labels, named), 1)
-            point[f"{name} confusion"] = confusion.tolist()
+            point[f"{name} confusion"] = score.confusion(sweeps.labels, logits[name]).tolist()
     return point
 
 

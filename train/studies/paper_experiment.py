@@ -180,14 +180,12 @@ class Outcome:
         places = [np.array(each["position"]) + PLACES * i for i, each in enumerate(newest)]
         place = np.concatenate(places) + 2 * PLACES * seed
         costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])]
-        confusion = np.zeros((len(skin.MATERIALS),) * 2, int)
-        np.add.at(confusion, (labels, logits.argmax(1)), 1)
         about = {
             "part": part + (BLIND if curve["world"] else ""),
             "method": CNN,
             "seed": seed,
             "ran": f"{point['step']} of {curve['steps']} iterations of 50",
-            "confusion": confusion.tolist(),
+            "confusion": score.confusion(labels, logits).tolist(),
             **dict.fromkeys(("fit_s", "ms_p50", "agreement")),
             "materials": list(skin.MATERIALS),
             "commit": curve["commit"],

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from train.metrics.score import row_shares
 from train.reports import confusion_plot, html, provenance
 from train.reports.formatting import estimate, exact_percent, points, seconds
 from train.studies import TEMPLATES, differences, plots
@@ -336,7 +337,7 @@ def _gap(ours: Row, other: Row | None) -> str:
 
 def _worst(matrix: NDArray[Any], names: Sequence[str]) -> list[dict[str, Any]]:
     """The two greatest confusions."""
-    rows = matrix / np.maximum(matrix.sum(1, keepdims=True), 1)
+    rows = row_shares(matrix)
     off = np.where(np.eye(len(names), dtype=bool), -1, rows)
     order = np.argsort(off, axis=None)[::-1][:2]
     return [

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from train.metrics.score import row_shares
 from train.studies.paper_values import ACCURACY, CNN, CONFUSION, COST, FIGURES, SEVERAL
 
 Array = NDArray[Any]
@@ -129,7 +130,7 @@ def _lead(shares: Mapping[tuple[str, str], float]) -> Stamp:
 def correlation(confusion: Array) -> float:
     """Spearman's rank correlation of the shares off the diagonal of counts [K, K] with Fig. 11;
     0 if nothing is confused."""
-    rows = confusion / np.maximum(confusion.sum(1, keepdims=True), 1)
+    rows = row_shares(confusion)
     off = ~np.eye(len(rows), dtype=bool)
     if np.ptp(rows[off]) == 0:
         return 0.0
@@ -143,7 +144,7 @@ def _confusions(confusion: Array) -> Stamp:
 
 
 def _least(confusion: Array, names: Sequence[str]) -> Stamp:
-    order = np.argsort(np.diag(confusion) / np.maximum(confusion.sum(1), 1), kind="stable")
+    order = np.argsort(np.diag(row_shares(confusion)), kind="stable")
     least = [names[i] for i in order[: len(LEAST_RECOGNISED)]]
     why = f"{BEST} recognises {', '.join(least)} least"
     return Stamp(12, set(least) == set(LEAST_RECOGNISED), why)
