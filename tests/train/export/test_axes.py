@@ -101,7 +101,17 @@ def test_the_demo_slides_a_skin_that_feels_shear(
     fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
     assert (
         main(
-            ["fit", "--set", "sim:T-REALx3:1001:1", "--seed", "1", "--out", fit, "--size", "bands"]
+            [
+                "fit",
+                "--set",
+                "sim:T-REALx3/level-blind:1001:1",
+                "--seed",
+                "1",
+                "--out",
+                fit,
+                "--size",
+                "bands",
+            ]
         )
         == 0
     )
