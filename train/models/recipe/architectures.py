@@ -72,8 +72,9 @@ class Architecture:
     sees only the spectrum. spectrum: whether the head sees the bands of spectrum.py after the
     stages' responses. fewest: number of stages that are never cut off. pools: pooling of the filter
     bank of bank.py: 0 without a bank, 1 by magnitudes, 2 by shares as well. distribution: whether
-    the head sees the shares of distribution.py. loads: whether it sees those of loads.py. mains_hz:
-    frequency of the mains, to whose hum stages and spectrum do not respond.
+    the head sees the shares of distribution.py. loads: whether it sees those of loads.py.
+    relations: number of scales of relations.py that it sees. mains_hz: frequency of the mains, to
+    whose hum stages and spectrum do not respond.
     """
 
     channels: tuple[int, ...]
@@ -85,6 +86,7 @@ class Architecture:
     pools: int = 0
     distribution: bool = False
     loads: bool = False
+    relations: int = 0
     mains_hz: float = MAINS_HZ
 
     def cut(self, depth: int, spectrum: bool = False) -> Architecture:

@@ -20,6 +20,7 @@ from train.calibration.heads import HeadData, HeadPart, HeadPlan
 from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
+from train.models.recipe import relations
 
 Array = NDArray[Any]
 TINY = 1e-12
@@ -188,8 +189,8 @@ class FeatureColumns:
     """Numbers of the features of a trunk, by their source.
 
     magnitudes, shares: int [n], the two features of each filter. kinds: the filters of each kind,
-    zero-sum ones first. levels, loads, bands: of the distribution, the loads and the spectrum; may
-    be empty.
+    zero-sum ones first. levels, loads, relations, bands: of the distribution, the loads, the
+    relations [scales, n] and the spectrum; may be empty.
     """
 
     magnitudes: Array
@@ -197,21 +198,25 @@ class FeatureColumns:
     kinds: tuple[Array, ...]
     levels: Array
     loads: Array
+    relations: Array
     bands: Array
 
     @classmethod
-    def of(cls, layout: Mapping[str, slice], free: Array) -> FeatureColumns:
-        """The columns of a trunk with this graph.layout; free: bool [n], of its filters."""
-        magnitudes, shares, levels, loads, bands = (
+    def of(cls, layout: Mapping[str, slice], free: Array, scales: int) -> FeatureColumns:
+        """The columns of a trunk with this graph.layout. free: bool [n], of its filters. scales:
+        number of scales of its relations."""
+        magnitudes, shares, levels, loads, relations, bands = (
             np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
-            for name in ("magnitudes", "shares", "levels", "loads", "bands")
+            for name in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
         )
         kinds = tuple(np.flatnonzero(free == kind) for kind in np.unique(free))
-        return cls(magnitudes, shares, kinds, levels, loads, bands)
+        by_scale = relations.reshape(max(scales, 1), -1)
+        return cls(magnitudes, shares, kinds, levels, loads, by_scale, bands)
 
     def filters(self) -> Array:
         """The filter [F] of each feature, -1 if it is not of a filter."""
-        every = (self.magnitudes, self.shares, self.levels, self.loads, self.bands)
+        views = (self.levels, self.loads, self.relations, self.bands)
+        every = (self.magnitudes, self.shares, *views)
         filters = np.full(1 + max(int(part.max(initial=-1)) for part in every), -1)
         for part in (self.magnitudes, self.shares):
             filters[part] = np.arange(len(part))
@@ -273,6 +278,30 @@ class Candidates:
         }
         return without | ({"without copies": _without_copies} if self.copies else {})
 
+    def related(self, best: Heads) -> dict[str, Heads]:
+        """The relations beside the best candidate, and beside two discriminants of filters of all
+        kinds, in which they have more weight.
+
+        Few scales and all scales each have a discriminant: which of them carries over depends on
+        what changes.
+        """
+        of, copies = self.columns, best[0].copies
+        if not of.relations.size:
+            return {}
+        seen = [(of.magnitudes, of.shares, of.bands), (of.magnitudes, of.levels, of.bands)]
+        filters, views = (
+            tuple(HeadPart(tuple(np.concatenate(part).tolist()), copies) for part in parts)
+            for parts in (
+                seen[: 1 + len(of.levels)],
+                (of.relations[: relations.SHORT], of.relations),
+            )
+        )
+        views = tuple(dict.fromkeys(views))
+        return {
+            "relations beside filters": (*filters, *views),
+            "relations beside the best": (*best, *views),
+        }
+
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
         loads = self.columns.loads
@@ -292,8 +321,8 @@ class Candidates:
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
     """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them; loads join
-    last, where they help."""
+    latter. Plain candidates are compared first, then extensions of the best of them; relations and
+    loads join last, where they help."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():
@@ -308,9 +337,10 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
     extended = list(scored(candidates.extended(best.plan.parts)))
     best = min([usual, *others, *extended], key=scores.loss)
     chosen = best if scores.better(best, usual) else usual
-    loaded = list(scored(candidates.loaded(chosen.plan.parts)))
-    if loaded and scores.helps(best := min(loaded, key=scores.loss), chosen):
-        return best
+    for joining in (candidates.related, candidates.loaded):
+        joined = list(scored(joining(chosen.plan.parts)))
+        if joined and scores.helps(best := min(joined, key=scores.loss), chosen):
+            chosen = best
     return chosen
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from appliance.core.types import SweepFormat
-from train.models.recipe import bank, distribution, loads, spectrum
+from train.models.recipe import bank, distribution, loads, relations, spectrum
 from train.models.recipe.architectures import FLOOR, NOISE_LIMIT, PREFIXES, Architecture, each_frame
 from train.onnx_tools import graph_builder
 from train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
@@ -83,6 +83,7 @@ def trunk_graph(
     parts += nodes.distribution(weights) if architecture.distribution else []
     parts += nodes.means() if keep_means else []
     parts += nodes.loads() if architecture.loads else []
+    parts += nodes.relations() if architecture.relations else []
     parts += nodes.spectrum() if architecture.spectrum else []
     size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
     g = nodes.g
@@ -100,7 +101,8 @@ def layout(
     keep_means: bool = False,
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
-    bank, `levels` of the distribution, `means`, `loads`, `bands`."""
+    bank, `levels` of the distribution, `means`, `loads`, `relations`,
+    `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
@@ -109,6 +111,7 @@ def layout(
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "means": keep_means * format.channels,
         "loads": architecture.loads * loads.count(format),
+        "relations": architecture.relations and architecture.relations * relations.each(format),
         "bands": architecture.spectrum * spectrum.count(format),
     }
     ends = np.cumsum(list(counts.values())).tolist()
@@ -202,6 +205,11 @@ class _TrunkNodes:
         """See loads.nodes."""
         counts = self.g("Cast", self.raw, to=FLOAT)
         return [loads.nodes(self.g, counts, self._format, self._scale, self._prefixes)]
+
+    def relations(self) -> list[str]:
+        """See relations.nodes."""
+        given = self._format, self._scale, self._architecture.relations, self._prefixes
+        return [relations.nodes(self.g, self.raw, self.attenuation, *given)]
 
     def spectrum(self) -> list[str]:
         """See spectrum.nodes."""

@@ -1,7 +1,7 @@
 """The default recipe: from the sweeps of a training set to a finished model.
 
     training sweeps, and augmented copies of them
-       |   features:    filters, distribution, spectrum and loads, in closed form
+       |   features:    filters, distribution, spectrum, loads and relations, in closed form
        v
     candidates:         sums of discriminants, each of some of the features
        |   judged:      by groups that their heads did not see; then fewer filters
@@ -37,7 +37,7 @@ from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
 from train.models.linear_head import hold_out_or_all
 from train.models.methods import Log, no_log
-from train.models.recipe import bank, choice, distribution, graph, spectrum
+from train.models.recipe import bank, choice, distribution, graph, relations, spectrum
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ, Architecture
 from train.models.recipe.augment import (
     COPIES,
@@ -225,7 +225,8 @@ def features(setup: Setup) -> FixedFeatures:
     """Step 1: the features that need no training."""
     setup.part(1)(f"features of {len(setup.sweeps)} sweeps and {COPIES} copies of each")
     trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.mains_hz)
-    columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free)
+    scales = trunk.architecture.relations
+    columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
     return FixedFeatures(trunk, setup.data(trunk), columns)
 
 
@@ -285,10 +286,11 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
     """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
     it."""
     size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
-    filters, shares, levels, loads, bands = (
+    filters, shares, levels, loads, related, bands = (
         used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
         for part in (
-            layout.get(k, slice(0, 0)) for k in ("magnitudes", "shares", "levels", "loads", "bands")
+            layout.get(k, slice(0, 0))
+            for k in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
         )
     )
     architecture = replace(
@@ -296,6 +298,7 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
         pools=(len(filters) > 0) + (len(shares) > 0),
         distribution=len(levels) > 0,
         loads=len(loads) > 0,
+        relations=len(related) and len(related) // relations.each(fixed.sweeps.format),
         spectrum=len(bands) > 0,
     )
     weights = dict(stages.weights) if stages else {}
@@ -357,6 +360,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         pools=2,
         distribution=True,
         loads=True,
+        relations=relations.scales(format),
         mains_hz=mains_hz,
     )
     kinds = (False,) if architecture.zero_sum(format.window) else (False, True)
@@ -443,6 +447,8 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
     words += ["magnitudes and shares" if pools > 1 else "magnitudes"] * (len(filters) > 0)
     words += ["distribution"] * trunk.architecture.distribution
     words += ["loads"] * trunk.architecture.loads
+    scales = trunk.architecture.relations
+    words += [f"relations at {scales} scales"] * (scales > 0)
     words += ["spectrum"] * trunk.architecture.spectrum
     words += [f"stages of {', '.join(map(str, channels))} channels"] * (len(channels) > 0)
     copied = sum(part.copies for part in plan.parts)

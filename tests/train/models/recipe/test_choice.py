@@ -42,9 +42,10 @@ def candidates(
     copies: bool = False,
     loads: Sequence[int] = (),
     grouped: bool = True,
+    relations: Sequence[Sequence[int]] = ((),),
 ) -> Candidates:
     """The candidates of a trunk with these features."""
-    parts = [np.array(part, int) for part in (magnitudes, shares, levels, loads, bands)]
+    parts = [np.array(part, int) for part in (magnitudes, shares, levels, loads, relations, bands)]
     columns = FeatureColumns(*parts[:2], tuple(map(np.array, kinds)), *parts[2:])
     return Candidates(columns, copies, grouped)
 
@@ -332,6 +333,23 @@ def test_loads_join_where_held_out_groups_show_it():
     assert {1, 2} <= set(joined.plan.columns().tolist())
     alone = choice.choose(at, Candidates(columns, False, False), print)
     assert not {1, 2} & set(alone.plan.columns().tolist())
+
+
+def test_relations_join_where_held_out_groups_show_it():
+    """Relations that name the material in all groups join, with a discriminant of few scales and
+    one of all; those that mislead in another group stay away."""
+    given, parts = known(seed=3)
+    x = given.features[:, [3, 0, 1, 2, 4]].copy()
+    x[:, 0] += 0.4 * given.features[:, 0]
+    at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
+    heads = candidates([[0]], [0], [0], relations=[[1], [2], [3], [3]])
+    joined = choice.choose(at, heads, print).plan.parts
+    assert [part.columns for part in joined[-2:]] == [(1, 2, 3), (1, 2, 3, 3)]
+    assert not {4} & set(
+        choice.choose(at, candidates([[0]], [0], [0], relations=[[4]]), print)
+        .plan.columns()
+        .tolist()
+    )
 
 
 def test_loads_that_mislead_in_another_group_stay_away():
