@@ -376,7 +376,7 @@ def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
     out = run(
         tmp_path / "venv" / "bin" / "palpate", "check", "--sim", "skin", "--virtual", cwd=tmp_path
     )
-    assert out.count("ok  ") == 4
+    assert out.count("ok  ") == 5
 
 
 def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):

@@ -22,6 +22,7 @@ from appliance.bridges.server import TcpPeer
 from appliance.bridges.source import BoxView, Source
 from appliance.client.answers import Answer
 from appliance.core.clock import Clock
+from appliance.core.directions import DIRECTIONS
 from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.log import log
 from appliance.core.status import Status
@@ -106,6 +107,18 @@ SLIDE = {"speed_mm_s": 10, "force_n": 100}
 """The registers that a peer may write, after the label's text: speed and force of the slide as the
 command START has them, and the steps of a register in one mm/s or N."""
 SLIDE_AT = ADDRESSES["label"] + LABEL_WORDS
+
+
+def _direction_code(answer: Answer) -> int:
+    """1 + index in DIRECTIONS; 0: it was not measured."""
+    return DIRECTIONS.index(answer.direction) + 1 if answer.direction in DIRECTIONS else 0
+
+
+MEASURED = (
+    Register("measured speed", _of_answer(lambda answer: 10 * (answer.measured_mm_s or 0))),
+    Register("direction", _of_answer(_direction_code)),
+)
+"""The last entries of the map, after the registers of SLIDE."""
 COUNTERS = {
     "heartbeat",
     "answers",
@@ -119,13 +132,19 @@ COUNTERS = {
 """Entries that wrap; all others stay at the largest number that fits."""
 
 
-def registers(view: BoxView, *, alive: bool) -> list[int]:
-    """The words of all registers. alive: the box was heard lately."""
+def _words(entries: Sequence[Register], view: BoxView) -> list[int]:
+    """The words of some entries."""
     words: list[int] = []
-    for register in REGISTERS:
+    for register in entries:
         value, top = register.get(view), 1 << 16 * register.words
         value = value % top if register.name in COUNTERS else min(value, top - 1)
         words += [value >> 16 * i & 0xFFFF for i in reversed(range(register.words))]
+    return words
+
+
+def registers(view: BoxView, *, alive: bool) -> list[int]:
+    """The words of REGISTERS and of the label's text. alive: the box was heard lately."""
+    words = _words(REGISTERS, view)
     if not alive:
         words[ADDRESSES["state of the skin"]] = 0
         words[ADDRESSES["status"]] = STALE
@@ -186,7 +205,7 @@ class ModbusBridge:
         return (
             inputs(view, alive=alive)
             if function == pdu.READ_INPUTS
-            else [*registers(view, alive=alive), *slide]
+            else [*registers(view, alive=alive), *slide, *_words(MEASURED, view)]
         )
 
     async def _write(self, wanted: Writing, coils: list[bool], slide: list[int]) -> None:

@@ -56,10 +56,11 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def values(fields: Mapping[str, Any]) -> list[KeyValue]:
-    """Fields as texts: true and false in lower case, numbers as Python writes them."""
+    """Fields as texts: true and false in lower case, numbers as Python writes them, "" for None."""
+    texts = {name: "" if v is None else str(v) for name, v in fields.items()}
     return [
-        KeyValue(key=name, value=str(v).lower() if isinstance(v, bool) else str(v))
-        for name, v in fields.items()
+        KeyValue(key=name, value=text.lower() if isinstance(fields[name], bool) else text)
+        for name, text in texts.items()
     ]
 
 

@@ -246,6 +246,8 @@ class FeedSource:
             state.source if state else "",
             line["share"],
             line["detail"],
+            measured_mm_s=line.get("measured_mm_s"),
+            direction=line.get("direction", ""),
         )
 
 

@@ -17,6 +17,7 @@ from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
 from appliance.signal.contact import ContactPositions
+from appliance.signal.slide import SpeedRange
 from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
@@ -128,6 +129,7 @@ class Manifest:
         unnoticed; 0 for a bundle that was never signed.
     unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
         unknown, then `json` omits it.
+    speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
     """
 
     name: str
@@ -146,6 +148,7 @@ class Manifest:
     runtime: str = "0.0.0"
     counter: int = 0
     unloaded: tuple[float, ...] = ()
+    speeds: SpeedRange | None = None
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -183,8 +186,9 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        if not self.unloaded:
-            del values["unloaded"]
+        for name in ("unloaded", "speeds"):
+            if not getattr(self, name):
+                del values[name]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property
@@ -234,6 +238,8 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
         )
+    if manifest.speeds and not manifest.contact:
+        raise BundleError("manifest has `speeds` without `place`; export the bundle again")
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(
             "manifest has `place` without `thresholds.contact`; export the bundle again"

@@ -24,7 +24,8 @@ class Answer:
 
     time_s: of the box's monotonic clock. lost: number of lost frames in the window. loss_known:
     whether lost frames can be seen. missed: number of answers before this one that did not arrive,
-    counted by the numbers of the sweeps.
+    counted by the numbers of the sweeps. measured_mm_s, direction: of the slide as the box measured
+    it, `rows+`, `rows-`, `cols+` or `cols-` for the direction; None and "" if it was not measured.
     """
 
     sweep: int
@@ -42,6 +43,8 @@ class Answer:
     detail: str = ""
     loss_known: bool = True
     missed: int = 0
+    measured_mm_s: float | None = None
+    direction: str = ""
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> Answer:
@@ -76,6 +79,8 @@ class Answer:
                 float(share),
                 ",".join(fields[12:13]),
                 fields[13:14] != ["1"],
+                measured_mm_s=float(fields[14]) if "".join(fields[14:15]) else None,
+                direction="".join(fields[15:16]),
             )
         except ValueError as e:
             raise FormatError(

@@ -226,6 +226,8 @@ class Verdict:
     the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
     in place, or if the bundle does not have the positions. after: number of the last sweep before
     it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
+    measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
+    in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
     """
 
     sweep: int
@@ -246,10 +248,12 @@ class Verdict:
     after: int = 0
     speed_mm_s: float | None = None
     force_n: float | None = None
+    measured_mm_s: float | None = None
+    direction: str | None = None
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
-        """All fields by name, for JSON, which keeps numbers bit for bit; without a speed or force
-        that is None. arrays: include `scores` and `own`, as lists."""
+        """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
+        None. arrays: include `scores` and `own`, as lists."""
         # sidecars, the feed and the status file call the displacement `moved`
         values = {
             "moved" if name == "displacement" else name: value

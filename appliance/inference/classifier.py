@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,13 +24,14 @@ from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.inference.session import ModelRunner
 from appliance.signal import features
 from appliance.signal.contact import displacement
+from appliance.signal.slide import Slide, SlideMeter
 from appliance.signal.window_check import Finding, inspect
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
 
 
-_NONE = np.empty(0)
+_NONE, _NO_SLIDE = np.empty(0), Slide()
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
 all others."""
@@ -59,6 +60,14 @@ def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
         1e-9  # max() keeps the first of equals; argmax must agree
     )
     return votes
+
+
+@dataclass(frozen=True, slots=True)
+class Touched:
+    """Where and how the finger touched in a sweep. displacement: as in Verdict."""
+
+    displacement: str = ""
+    slide: Slide = _NO_SLIDE
 
 
 class Classifier:
@@ -99,7 +108,8 @@ class Classifier:
         self._means = (
             ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
         )
-        rule = bundle.manifest.displacement
+        rule, place = bundle.manifest.displacement, bundle.manifest.contact
+        self._slide = SlideMeter(bundle.format, place.pitch_mm if place else None)
         self._displaced_means = (
             ClassDistances(classes, known, bundle.manifest.labels, rule)
             if rule and known and classes
@@ -218,26 +228,27 @@ class Classifier:
             finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        displaced, rule = self._displacement(sweep), self.bundle.manifest.displacement
-        logits, novelty = self._classify(sweep.frames.taxels, bool(displaced))
+        touch, rule = self._touch(sweep), self.bundle.manifest.displacement
+        displaced = bool(touch.displacement)
+        logits, novelty = self._classify(sweep.frames.taxels, displaced)
         if novelty:
-            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), displacement=displaced)
+            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), touch=touch)
         return self.conclude(
-            sweep, softmax(logits / (rule.temperature if displaced and rule else 1)), displaced
+            sweep, softmax(logits / (rule.temperature if displaced and rule else 1)), touch
         )
 
     def conclude(
-        self, sweep: Sweep, scores: NDArray[np.float64], displaced: str | None = None
+        self, sweep: Sweep, scores: NDArray[np.float64], touch: Touched | None = None
     ) -> Verdict:
         """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with the
         other sweeps of the object.
 
-        displaced: result of `_displacement`; None: it is computed here.
+        touch: result of `_touch`; None: it is computed here.
         """
-        displaced = self._displacement(sweep) if displaced is None else displaced
+        touch = touch or self._touch(sweep)
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
             return self._verdict(
-                sweep, Finding(Status.UNKNOWN, "the model gives no number"), displacement=displaced
+                sweep, Finding(Status.UNKNOWN, "the model gives no number"), touch=touch
             )
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
@@ -247,18 +258,17 @@ class Classifier:
         if conflict and self._ends.conflict == "refuse":
             self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
             finding = Finding(Status.CONFLICT, conflict)
-            return self._verdict(
-                sweep, finding, own=scores, displacement=displaced, after=earlier.last
-            )
+            return self._verdict(sweep, finding, own=scores, touch=touch, after=earlier.last)
         kept = (scores,) if conflict else (*before, scores)
         self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
         fused = self._fuse(kept)
         status, rule = Status.OK, self.bundle.manifest.displacement
-        if fused.max() < max(self.min_probability, rule.unsure if displaced and rule else 0):
+        least = rule.unsure if touch.displacement and rule else 0
+        if fused.max() < max(self.min_probability, least):
             final = 0 < self._ends.max_sweeps <= len(kept)
             status = Status.UNDECIDED if final else Status.UNSURE
         return self._verdict(
-            sweep, Finding(status, conflict), fused, len(kept), scores, displaced, earlier.last
+            sweep, Finding(status, conflict), fused, len(kept), scores, touch, earlier.last
         )
 
     def forget(self) -> None:
@@ -312,13 +322,14 @@ class Classifier:
         logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
         return logits, means.novelty(values[-1])
 
-    def _displacement(self, sweep: Sweep) -> str:
-        """A message with the distance of the contact from its positions in training, "" if it is
-        at one of them."""
-        m = self.bundle.manifest
+    def _touch(self, sweep: Sweep) -> Touched:
+        """The displacement of the contact from its positions in training, and the slide, which is
+        measured in whole windows only."""
+        m, taxels = self.bundle.manifest, sweep.frames.taxels
+        slide = self._slide(taxels) if len(taxels) == m.format.window else _NO_SLIDE
         if m.contact is None or m.thresholds.contact is None:
-            return ""
-        return displacement(sweep.frames.taxels, self.tare, m.thresholds.contact, m.contact)
+            return Touched(slide=slide)
+        return Touched(displacement(taxels, self.tare, m.thresholds.contact, m.contact), slide)
 
     def _verdict(
         self,
@@ -327,17 +338,14 @@ class Classifier:
         scores: NDArray[np.float64] = _NONE,
         fused: int = 0,
         own: NDArray[np.float64] = _NONE,
-        displacement: str = "",
+        touch: Touched = Touched(),
         after: int = 0,
     ) -> Verdict:
         label, best, second = "", 0.0, 0.0
         if len(scores):
             order = np.argsort(-scores, kind="stable")  # the first of equal scores, as argmax does
-            label, best, second = (
-                self.bundle.manifest.labels[order[0]],
-                scores[order[0]],
-                scores[order[1]],
-            )
+            label = self.bundle.manifest.labels[order[0]]
+            best, second = scores[order[:2]]
         now = self._clock.now_ns()
         return Verdict(
             sweep=sweep.id,
@@ -351,11 +359,20 @@ class Classifier:
             lost=sweep.lost,
             latency_ns=now - sweep.complete_ns,
             bundle=self.bundle.id,
-            detail="; ".join(filter(None, (displacement, finding.detail))),
+            detail=self._detail(finding, touch),
             share=sweep.share,
             own=own,
-            displacement=displacement,
+            displacement=touch.displacement,
             after=after,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
+            measured_mm_s=touch.slide.speed_mm_s,
+            direction=touch.slide.direction or None,
         )
+
+    def _detail(self, finding: Finding, touch: Touched) -> str:
+        """The displacement, a speed outside of training if the answer is uncertain, the finding."""
+        trained = self.bundle.manifest.speeds
+        uncertain = finding.status in (Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN)
+        untrained = trained.outside(touch.slide) if trained and uncertain else ""
+        return "; ".join(filter(None, (touch.displacement, untrained, finding.detail)))

@@ -88,8 +88,12 @@ class Command:
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
     """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
-    lost frames of the skin can be seen; if not, a last field says so, and the detail is shortened
-    to make room for it."""
+    lost frames of the skin can be seen.
+
+    Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
+    detail is shortened to make room for them. If an empty detail does not suffice, the slide is
+    left out.
+    """
     fields = (
         v.sweep,
         f"{v.time_ns / 1e9:.3f}",
@@ -104,6 +108,12 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
         source,
         f"{v.share:.2f}",
     )
+    unseen: list[object] = [] if loss_known else [1]
+    if v.measured_mm_s is not None:
+        slide = [*(unseen or [""]), f"{v.measured_mm_s:.1f}", v.direction]
+        # a sentence of full length may have been cut
+        if (room := MAX_LINE - len(sentence("RES", *fields, "", *slide))) > 0:
+            return sentence("RES", *fields, v.detail[:room], *slide)
     if loss_known:
         return sentence("RES", *fields, v.detail)
     room = MAX_LINE - len(sentence("RES", *fields, "", 1))

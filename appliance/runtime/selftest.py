@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from appliance.bundle.bundle import Bundle
+from appliance.bundle.bundle import Bundle, Manifest
 from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError, PortError, SensorError, SensorMismatch
@@ -20,6 +20,7 @@ from appliance.io.robot_link import SerialSink
 from appliance.io.trigger import GpioTrigger
 from appliance.io.usb_sensor import fits
 from appliance.runtime.assembly import UNSIGNED, gpio
+from appliance.signal.slide import SlideMeter
 
 LISTEN_S = 1.0
 """Time for which frames of the skin are counted."""
@@ -43,8 +44,7 @@ def check(
     devices: Devices,
     spent_ns: Callable[[], int] = time.thread_time_ns,
 ) -> Iterator[CheckResult]:
-    """Check all components, one after another, also after a failure. The skin is checked without a
-    bundle, too.
+    """Check all components in turn, also after a failure; the skin also without a bundle.
 
     spent_ns: processor time that this thread has taken so far.
     """
@@ -70,6 +70,7 @@ def check(
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
+        yield CheckResult("speed", True, _speed(loaded[0].manifest))
     yield _try(
         "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
     )
@@ -83,6 +84,18 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
         return CheckResult(component, True, look())
     except ApplianceError as e:
         return CheckResult(component, False, str(e))
+
+
+def _speed(manifest: Manifest) -> str:
+    """The speeds that can be measured, and those of training."""
+    place, trained = manifest.contact, manifest.speeds
+    meter = SlideMeter(manifest.format, place.pitch_mm if place else None)
+    if meter.why:
+        return f"not measured: {meter.why}"
+    measured = f"measured from {meter.slowest_mm_s:.3g} to {meter.fastest_mm_s:.3g} mm/s"
+    if trained is None:
+        return f"{measured}; the bundle does not state those of training: export it again"
+    return f"{measured}, trained {trained}"
 
 
 def _skin(

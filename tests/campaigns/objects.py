@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference import classifier
-from appliance.inference.classifier import Classifier
+from appliance.inference.classifier import Classifier, Touched
 from appliance.inference.objects import contradicts
 from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
@@ -136,7 +136,7 @@ def answers(
         for n, (_, own, object) in enumerate(given, 1):
             times = n * PERIOD_NS, n * PERIOD_NS + SLIDE_NS
             sweep = Sweep(n, *times, Status.OK, Frames.empty(model.format), object=object)
-            v = own if not len(own.own) else it.conclude(sweep, own.own, own.displacement)
+            v = own if not len(own.own) else it.conclude(sweep, own.own, Touched(own.displacement))
             named.append(v.label if v.status is Status.OK else "")
     return named
 

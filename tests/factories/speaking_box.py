@@ -7,7 +7,7 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -29,9 +29,14 @@ def state(
 
 
 def result(
-    sweep: int, status: str = "ok", label: str = "wood", share: str = "1.00", detail: str = ""
+    sweep: int,
+    status: str = "ok",
+    label: str = "wood",
+    share: str = "1.00",
+    detail: str = "",
+    optional: Sequence[object] = (),
 ) -> bytes:
-    """A RES sentence."""
+    """A RES sentence. optional: the fields after the detail."""
     return sentence(
         "RES",
         sweep,
@@ -47,6 +52,7 @@ def result(
         "sim",
         share,
         detail,
+        *optional,
     )
 
 

@@ -31,6 +31,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import shaped_distances
 from train.calibration.contact import Contacts
+from train.calibration.slide_speeds import trained_speeds
 from train.data.readers import counted
 from train.data.sets import Dataset
 from train.export import bundle_score
@@ -105,24 +106,8 @@ def pack(
     far a contact is from the trained positions. Raises ExportRefused if a check fails, and
     BundleError if a label or the target cannot be used.
     """
-    contacts = content.contacts or Contacts.of(content.train)
     files = _files(content)
-    manifest = bundle.Manifest(
-        name=name,
-        version=version,
-        format=content.train.format,
-        input=content.input,
-        labels=content.train.materials,
-        thresholds=thresholds(content.train, contacts.limit.contact, full_scale),
-        contact=contacts.positions(pitch_mm),
-        unloaded=contacts.limit.known_tare(),
-        runtime=RUNTIME,
-        early=content.early,
-        known=content.known,
-        displacement=content.displacement,
-        files={k: bundle.file_entry(v) for k, v in files.items()},
-        made=_made(content, commit, contacts.limit.why),
-    )
+    manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
@@ -132,6 +117,37 @@ def pack(
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
+
+
+def _manifest(
+    content: Content,
+    files: dict[str, bytes],
+    named: tuple[str, str, str],
+    full_scale: float | None,
+    pitch_mm: float | None,
+) -> bundle.Manifest:
+    """The manifest without figures. named: name, version and commit."""
+    contacts = content.contacts or Contacts.of(content.train)
+    place, (name, version, commit) = contacts.positions(pitch_mm), named
+    speeds, unmeasured = trained_speeds(content.train, place.pitch_mm if place else None)
+    unknown = {"contact": contacts.limit.why, "speeds": unmeasured}
+    return bundle.Manifest(
+        name=name,
+        version=version,
+        format=content.train.format,
+        input=content.input,
+        labels=content.train.materials,
+        thresholds=thresholds(content.train, contacts.limit.contact, full_scale),
+        contact=place,
+        unloaded=contacts.limit.known_tare(),
+        speeds=speeds,
+        runtime=RUNTIME,
+        early=content.early,
+        known=content.known,
+        displacement=content.displacement,
+        files={k: bundle.file_entry(v) for k, v in files.items()},
+        made=_made(content, commit, unknown),
+    )
 
 
 def _files(content: Content) -> dict[str, bytes]:
@@ -151,8 +167,9 @@ def means_file(classes: bundle.Classes) -> bytes:
     return packed.getvalue()
 
 
-def _made(content: Content, commit: str, contact_unknown_because: str) -> dict[str, Any]:
-    """The entry `made` of a manifest."""
+def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, Any]:
+    """The entry `made` of a manifest. unknown: for parts that may be unknown the reason, "" if
+    they are known."""
     made = {
         "commit": commit,
         "set": content.train.source,
@@ -161,8 +178,7 @@ def _made(content: Content, commit: str, contact_unknown_because: str) -> dict[s
         "torch": metadata.version("torch") if find_spec("torch") else None,
         "onnxruntime": onnxruntime.__version__,
     }
-    if contact_unknown_because:
-        made["contact_unknown_because"] = contact_unknown_because
+    made |= {f"{part}_unknown_because": why for part, why in unknown.items() if why}
     return made | content.about
 
 

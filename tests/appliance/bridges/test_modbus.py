@@ -106,6 +106,32 @@ def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address:
         }
 
 
+MEASURED_AT = 42
+
+
+@pytest.mark.parametrize(
+    ("optional", "words"),
+    [
+        ((), [0, 0]),
+        ((1,), [0, 0]),
+        (("", "30.5", "rows+"), [305, 1]),
+        ((1, "8.0", "rows-"), [80, 2]),
+        (("", "400.0", "cols+"), [4000, 3]),
+        (("", "9999.9", "cols-"), [65535, 4]),
+        (("", "30.5", "sideways"), [305, 0]),
+    ],
+)
+def test_the_measured_slide_is_read(
+    box: SpeakingBox, raw: RawModbus, optional: tuple[object, ...], words: list[int]
+):
+    """The last two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
+    speed, or a direction of a later version. They are refused to writers."""
+    box.say(result(1, optional=optional))
+    eventually(lambda: word(raw, "answers") == 1)
+    assert raw.registers(MEASURED_AT, 2) == words
+    assert modbus.SLIDE_AT + len(modbus.SLIDE) == MEASURED_AT
+
+
 def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Address):
     """pymodbus pulses NEW, START and STOP: the box hears them once each, in order, and the answer's
     number rises."""
@@ -334,6 +360,8 @@ VERDICT = {
     "bundle": "b1",
     "share": 0.5,
     "detail": "",
+    "measured_mm_s": 61.2,
+    "direction": "cols-",
 }
 HELLO = {"type": "hello", "schema": 1, "labels": ["wood", "paper"], "bundle": "b1", "format": {}}
 
@@ -368,6 +396,7 @@ def test_the_feed_in_place_of_the_line(tmp_path: Path):
                 1,
             )
             assert client.registers(ADDRESSES["frames"], 2) == [1, 70_000 - 65_536]
+            assert client.registers(MEASURED_AT, 2) == [612, 4]
             assert client.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
             connection.close()
 
@@ -473,8 +502,10 @@ def test_the_document_has_the_map():
     assert [(int(at), name) for at, name in rows if name in ADDRESSES] == [
         (at, name) for name, at in ADDRESSES.items()
     ]
+    last = [name.partition("_")[0] for name in modbus.SLIDE]
+    last += [register.name for register in modbus.MEASURED]
     assert [(int(at), name) for at, name in rows if name not in ADDRESSES] == [
-        (modbus.SLIDE_AT + i, name.partition("_")[0]) for i, name in enumerate(modbus.SLIDE)
+        (modbus.SLIDE_AT + i, name) for i, name in enumerate(last)
     ]
     assert re.findall(
         r"^\| \d+ \| `([a-z]+)` \|",

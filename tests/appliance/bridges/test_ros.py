@@ -67,6 +67,9 @@ def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
         "0.9",
         "false",
     )
+    assert (heard["values"]["measured_mm_s"], heard["values"]["direction"]) == ("", "")
+    slid = verdict(box, node, result(1, optional=("", "30.5", "cols-")))["values"]
+    assert (slid["measured_mm_s"], slid["direction"], slid["lost"]) == ("30.5", "cols-", "0")
     assert heard["stamp"] > 0
     assert verdict(box, node, result(2, "unsure"))["level"] == WARN
     assert verdict(box, node, result(3, "unknown", ""))["level"] == WARN

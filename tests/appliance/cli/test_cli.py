@@ -291,8 +291,8 @@ def test_check_says_ok_part_by_part(capsys: pytest.CaptureFixture[str]):
     """On the rig all devices are present."""
     assert main(["check", "--sim", "skin", "--virtual"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["ok"] * 4
-    assert "SIM0001" in lines[2]
+    assert [line.split()[0] for line in lines] == ["ok"] * 5
+    assert "SIM0001" in lines[3]
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,30 @@ def test_a_field_more_is_the_loss_that_cannot_be_seen():
         result(verdict(Status.OK), "usb", loss_known=known).decode() for known in (True, False)
     ]
     assert [Answer.read(line).loss_known for line in lines] == [True, False]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_measured_slide_survives_its_sentence(known: bool):
+    """Speed and direction in fields 15 and 16, whether field 14 is empty or not. A reader of 14
+    fields finds the same answer without them."""
+    slid = replace(verdict(Status.OK, "moved 2.1 mm"), measured_mm_s=61.04, direction="cols-")
+    line = result(slid, "usb", loss_known=known).decode()
+    read = Answer.read(line)
+    assert read
+    assert (read.measured_mm_s, read.direction, read.loss_known) == (61.0, "cols-", known)
+    fields = sentences.read(line.encode()).fields
+    assert len(fields) == 16
+    older = Answer.of(fields[:14])
+    assert replace(read, measured_mm_s=None, direction="") == older
+    assert older.detail == "moved 2.1 mm"
+
+
+def test_a_measured_speed_of_another_form_is_named():
+    """A word for the speed."""
+    line = result(replace(verdict(Status.OK), measured_mm_s=30.0, direction="rows+"), "usb")
+    fields = sentences.read(line).fields
+    with pytest.raises(FormatError, match="older than the box"):
+        Answer.of([*fields[:14], "fast", "rows+"])
 
 
 @pytest.mark.parametrize("status", list(Status))

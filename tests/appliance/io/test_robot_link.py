@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,29 @@ def test_result_is_the_documents_example():
     checksum."""
     line = result(verdict(), "usb").decode().strip()
     assert f"`{line[:-2]}hh`" in PROTOCOL
+
+
+def test_a_measured_slide_shortens_the_detail():
+    """Fields 15 and 16 follow an empty field 14, and the detail keeps the rest of the 128
+    characters. Without a measured slide the sentence is that of earlier versions."""
+    far = verdict(detail="moved 2.1 mm too far towards row 4; " * 3)
+    line = result(replace(far, measured_mm_s=30.04, direction="rows+"), "usb")
+    assert len(line) == MAX_LINE
+    assert line.rpartition(b"*")[0].endswith(b",,30.0,rows+")
+    assert b",1.00,moved 2.1 mm too far towards" in line
+    assert result(verdict(), "usb").endswith(b",usb,1.00,*23\r\n")
+
+
+def test_a_slide_without_room_is_left_out():
+    """A sentence whose other fields fill the line: no number is cut, and field 14 remains."""
+    full = replace(
+        verdict("x" * 24, Status.UNDECIDED), sweep=10**9, time_ns=10**17, latency_ns=10**11
+    )
+    slid = replace(full, measured_mm_s=9999.9, direction="cols+")
+    for known in (True, False):
+        line = result(slid, "replay", loss_known=known)
+        assert line == result(full, "replay", loss_known=known)
+        assert len(line) <= MAX_LINE
 
 
 def test_every_status_is_documented():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -10,6 +12,7 @@ from appliance.bundle import bundle
 from appliance.core import config
 from appliance.core.clock import Clock
 from appliance.runtime import selftest
+from appliance.signal.slide import SpeedRange
 from appliance.sim import devices, rig, script
 
 
@@ -41,3 +44,28 @@ def test_what_reading_takes_of_a_core(share: float, ok: bool):
     assert found.ok == ok
     assert f"750 Hz, 750 frames in 1.0 s, 0 lost, {100 * share:.1f} % of a core" in found.detail
     assert ("use a faster board" in found.detail) != ok
+
+
+@pytest.mark.parametrize(
+    ("changes", "detail"),
+    [
+        ({}, "measured from 8 to 400 mm/s; the bundle does not state those of training: export"),
+        ({"speeds": SpeedRange(27.6, 33.1)}, "measured from 8 to 400 mm/s, trained 28 to 33"),
+        (
+            {"contact": None, "displacement": None},
+            "not measured: the distance between taxels is unknown; export with --pitch-mm",
+        ),
+    ],
+)
+def test_which_speeds_are_measured(changes: dict[str, Any], detail: str):
+    """The check shows the speeds that can be measured and those of training, or the reason."""
+    acts, source, format = script.named("skin", None, 1, spread=False)
+    built = devices.build(format, acts, rig.VirtualClock(), source)
+    packaged = bundle.load(bundle.DEFAULT)
+    changed = replace(packaged, manifest=replace(packaged.manifest, **changes))
+    found = {
+        result.component: result
+        for result in selftest.check(built.wire(config.load(None)), lambda: changed, built)
+    }
+    assert found["speed"].ok
+    assert found["speed"].detail.startswith(detail)

@@ -35,6 +35,8 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
     assert manifest.input == METHODS[name].input
     assert manifest.made["method"] == name
+    assert manifest.speeds is None
+    assert "the distance between taxels is unknown" in manifest.made["speeds_unknown_because"]
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
     model = METHODS[name].train(
@@ -81,7 +83,11 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
         == 0
     )
     assert "bundle: h 2," in capsys.readouterr().out
-    assert bundle.load(tmp_path / "h").manifest.input == "H"
+    manifest = bundle.load(tmp_path / "h").manifest
+    assert manifest.input == "H"
+    assert manifest.speeds
+    assert 28 < manifest.speeds.least_mm_s < 30 < manifest.speeds.most_mm_s < 32
+    assert "speeds_unknown_because" not in manifest.made
     chosen = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
     assert palpate(["check", *chosen]) == 0
     assert palpate(["demo", *chosen, "--sweeps", "2"]) == 0

@@ -1,0 +1,32 @@
+"""Range of the speeds at which the fingers of a training set slid, measured from their counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from appliance.signal.slide import SlideMeter, SpeedRange
+from train.data.sets import Dataset
+
+MOST_SWEEPS = 1000
+"""Most sweeps that are measured, evenly spread over the set."""
+LEAST_SHARE, LEAST_SWEEPS = 0.2, 5
+"""Least share and number of measured sweeps that give a range."""
+OUTER = 0.02
+"""Share of the measured sweeps at each end that the range leaves out, since a few speeds are
+wrong."""
+
+
+def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange | None, str]:
+    """The range of the measured speeds of `sweeps`, or None and the reason. pitch_mm: distance
+    between taxels, None if unknown."""
+    meter = SlideMeter(sweeps.format, pitch_mm)
+    if meter.why:
+        return None, meter.why
+    count = min(len(sweeps), MOST_SWEEPS)
+    chosen = np.linspace(0, len(sweeps) - 1, count).round().astype(int)
+    measured = [slide.speed_mm_s for slide in map(meter, sweeps.samples[chosen])]
+    speeds = [speed for speed in measured if speed is not None]
+    if len(speeds) < max(LEAST_SWEEPS, LEAST_SHARE * count):
+        return None, f"the speed was measured in {len(speeds)} of {count} sweeps"
+    ends = np.quantile(speeds, (OUTER, 1 - OUTER), method="nearest")
+    return SpeedRange(*map(float, ends)), ""
