@@ -16,6 +16,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
+from appliance.signal.broken_taxels import Bridging
 from appliance.signal.contact import ContactPositions
 from appliance.signal.window_check import WindowLimits
 
@@ -128,6 +129,8 @@ class Manifest:
         unnoticed; 0 for a bundle that was never signed.
     unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
         unknown, then `json` omits it.
+    bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
+        omits it.
     """
 
     name: str
@@ -146,6 +149,7 @@ class Manifest:
     runtime: str = "0.0.0"
     counter: int = 0
     unloaded: tuple[float, ...] = ()
+    bridging: Bridging | None = None
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -183,8 +187,9 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        if not self.unloaded:
-            del values["unloaded"]
+        for name in ("unloaded", "bridging"):
+            if not values[name]:
+                del values[name]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property
@@ -233,6 +238,12 @@ def _check_parts(manifest: Manifest) -> None:
     if manifest.displacement and not (manifest.known and manifest.contact):
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
+        )
+    taxels = manifest.format.rows * manifest.format.cols
+    if manifest.bridging and manifest.bridging.taxels >= taxels:
+        raise BundleError(
+            f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
+            "export the bundle again"
         )
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -41,3 +42,19 @@ def test_what_reading_takes_of_a_core(share: float, ok: bool):
     assert found.ok == ok
     assert f"750 Hz, 750 frames in 1.0 s, 0 lost, {100 * share:.1f} % of a core" in found.detail
     assert ("use a faster board" in found.detail) != ok
+
+
+@pytest.mark.parametrize("proven", [True, False])
+def test_check_says_how_many_broken_taxels_are_bridged(proven: bool):
+    """And that a bundle without this figure refuses them; it passes all the same."""
+    acts, source, format = script.named("skin", None, 1, spread=False)
+    built = devices.build(format, acts, rig.VirtualClock(), source)
+    packaged = bundle.load(bundle.DEFAULT)
+    manifest = packaged.manifest if proven else replace(packaged.manifest, bridging=None)
+    first, *_ = selftest.check(
+        built.wire(config.load(None)), lambda: replace(packaged, manifest=manifest), built
+    )
+    assert first.component == "bundle"
+    assert first.ok
+    wanted = "up to 4 broken taxels or one row or one column bridged" if proven else "are refused"
+    assert wanted in first.detail
