@@ -16,6 +16,7 @@ from appliance.core.errors import BundleError, FormatError
 from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
+from appliance.signal.broken_taxels import Bridging
 from appliance.signal.contact import ContactPositions
 from appliance.signal.slide import SpeedRange
 from appliance.signal.window_check import WindowLimits
@@ -130,6 +131,8 @@ class Manifest:
     unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
         unknown, then `json` omits it.
     speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
+    bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
+        omits it.
     """
 
     name: str
@@ -149,6 +152,7 @@ class Manifest:
     counter: int = 0
     unloaded: tuple[float, ...] = ()
     speeds: SpeedRange | None = None
+    bridging: Bridging | None = None
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -186,8 +190,8 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        for name in ("unloaded", "speeds"):
-            if not getattr(self, name):
+        for name in ("unloaded", "speeds", "bridging"):
+            if not values[name]:
                 del values[name]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
@@ -240,6 +244,12 @@ def _check_parts(manifest: Manifest) -> None:
         )
     if manifest.speeds and not manifest.contact:
         raise BundleError("manifest has `speeds` without `place`; export the bundle again")
+    taxels = manifest.format.rows * manifest.format.cols
+    if manifest.bridging and manifest.bridging.taxels >= taxels:
+        raise BundleError(
+            f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
+            "export the bundle again"
+        )
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(
             "manifest has `place` without `thresholds.contact`; export the bundle again"

@@ -125,7 +125,10 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class BoxState:
-    """The state of the box, with the fields of STA; it counts since the start of its program."""
+    """The state of the box, with the fields of STA; it counts since the start of its program.
+
+    degraded: broken taxels that the box bridges, "" for none.
+    """
 
     time_s: float
     skin: str
@@ -138,6 +141,7 @@ class BoxState:
     dropped: int
     bundle: str
     source: str
+    degraded: str = ""
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> BoxState:
@@ -159,6 +163,7 @@ class BoxState:
                 dropped,
                 bundle,
                 source,
+                ",".join(fields[18:19]),
             )
         except ValueError as e:
             raise FormatError(

@@ -16,7 +16,8 @@ class Health:
     the sensor from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see
     SensorCounters), of the serial line `dropped`, of the trigger `glitches`, `lost_edges` and
     `storms` (see EdgeCounters). loss_known: the skin counts its frames; if not, `lost_frames`
-    counts only the losses that can be inferred.
+    counts only the losses that can be inferred. degraded: taxels that are broken over the stream
+    and bridged ("silent taxel 2.3"), "" for none.
     """
 
     time_ns: int
@@ -40,9 +41,11 @@ class Health:
     storms: int
     loss_known: bool = True
     ready: bool = False
+    degraded: str = ""
 
     @property
     def text(self) -> str:
         """One line for a person."""
         skin = f"skin {self.skin}: {self.trouble}" if self.trouble else f"skin {self.skin}"
+        skin += f", {self.degraded}" if self.degraded else ""
         return f"{skin}. Sweeps answered: {self.answered}"

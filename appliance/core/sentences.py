@@ -47,11 +47,12 @@ def checksum(body: str) -> str:
 
 def sentence(kind: str, *fields: object) -> bytes:
     """`$PPLP,KIND,field,…*hh` with CR and LF. Characters that NMEA reserves become spaces. A line
-    that is too long is cut, but never within a number: whole numbers in the last fields are left
-    out until the rest fits."""
+    that is too long is cut, but never within a number: whole numbers in the last fields, and texts
+    behind them for which no room is left, are left out until the rest fits."""
     body = ",".join([TALKER, kind, *(UNSAFE.sub(" ", str(f)) for f in fields)])
     if len(body) > MAX_LINE - 6:
-        if fields and isinstance(fields[-1], int):
+        no_room = len(body) - len(str(fields[-1])) > MAX_LINE - 6
+        if isinstance(fields[-1], int) or (no_room and len(fields) > 1):
             return sentence(kind, *fields[:-1])
         body = body[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")

@@ -224,7 +224,8 @@ class Verdict:
     share of the window that was used, less than 1 in an early answer. own: float64 [K]
     probabilities of this sweep alone; empty if it has none. displacement: distance of
     the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
-    in place, or if the bundle does not have the positions. after: number of the last sweep before
+    in place, or if the bundle does not have the positions. degraded: the broken taxels that were
+    bridged ("silent taxel 2.3"); "" for none. after: number of the last sweep before
     it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
     measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
     in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
@@ -245,6 +246,7 @@ class Verdict:
     share: float = 1.0
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     displacement: str = ""
+    degraded: str = ""
     after: int = 0
     speed_mm_s: float | None = None
     force_n: float | None = None

@@ -27,6 +27,7 @@ from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.recording.recording import SweepFolder
+from appliance.signal.broken_taxels import BrokenTaxels
 
 FILE = "agreement.json"
 KEPT = 100
@@ -202,6 +203,9 @@ class Shadow(Observer):
         tare = np.asarray(circumstances["tare"], np.float64)
         sent = not np.array_equal(tare, self._tare)  # by TARE; before it each bundle uses its own
         self._classifier.tare = tare if sent else self._classifier.bundle.manifest.tare
+        self._classifier.taxels.broken = BrokenTaxels.read(
+            circumstances.get("broken"), self._classifier.format
+        )
         begin_ns = self._clock.now_ns()
         self._due_ns = min(self._due_ns, begin_ns + PERIOD_NS)
         try:

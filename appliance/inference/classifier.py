@@ -1,8 +1,9 @@
 """Classifies the sweeps of a bundle's format.
 
 Each window is checked, classified, and fused with the other sweeps of its object. The graph takes
-the raw counts; nothing is scaled here. A faulty window or an unknown material gets a status with
-the reason instead of a label.
+the raw counts; nothing is scaled here. Broken taxels are bridged by their neighbours, as far as the
+bundle tolerates it. A faulty window or an unknown material gets a status with the reason instead of
+a label.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from numpy.typing import NDArray
 from appliance.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict
+from appliance.core.observer import Observer
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from appliance.inference.novelty import ClassDistances
 from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.inference.session import ModelRunner
+from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
 from appliance.signal.contact import displacement
 from appliance.signal.slide import Slide, SlideMeter
-from appliance.signal.window_check import Finding, inspect
+from appliance.signal.window_check import Finding
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
@@ -62,6 +65,10 @@ def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
     return votes
 
 
+def _degraded(finding: Finding) -> str:
+    return finding.degraded and f"degraded: {finding.degraded}"
+
+
 @dataclass(frozen=True, slots=True)
 class Touched:
     """Where and how the finger touched in a sweep. displacement: as in Verdict."""
@@ -70,7 +77,7 @@ class Touched:
     slide: Slide = _NO_SLIDE
 
 
-class Classifier:
+class Classifier(Observer):
     """Runs one bundle in one thread.
 
     Sweeps with the same `object` number above 0 are fused, until the object ends (ObjectRule).
@@ -86,6 +93,9 @@ class Classifier:
     thresholds.unsure. max_sweeps, conflict, object_s: as in ObjectRule; by default only NEW OBJECT
     ends an object. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared
     its inputs and outputs with the manifest.
+
+    taxels: the broken taxels. As an observer of the loop it searches the stream for them; without a
+    stream they are found in each window alone.
     """
 
     def __init__(
@@ -104,6 +114,7 @@ class Classifier:
         self._ends = ObjectRule(max_sweeps, conflict, object_s)
         self._sweeps = FusedSweeps()
         self.tare = bundle.manifest.tare
+        self.taxels = TaxelWatch(bundle.manifest)
         known, classes = bundle.manifest.known, bundle.classes
         self._means = (
             ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
@@ -140,8 +151,20 @@ class Classifier:
         return self.bundle.id
 
     def about(self) -> dict[str, Any]:
-        """Entries for sidecars, so that a replay applies the same rule. tare: [R, C] raw counts."""
-        return {"tare": self.tare.tolist(), "bundle": self.bundle.id, "rule": self.rule}
+        """Entries for sidecars, so that a replay applies the same rule. tare: [R, C] raw counts.
+        broken: silent and noisy taxels over the stream, [2, R, C]; absent if there are none."""
+        broken = self.taxels.broken
+        entries = {"tare": self.tare.tolist(), "bundle": self.bundle.id, "rule": self.rule}
+        return entries | ({"broken": broken.kinds.tolist()} if broken else {})
+
+    @property
+    def degraded(self) -> str:
+        """The taxels that are broken over the stream, "" if there are none."""
+        return self.taxels.broken.text if self.taxels.broken else ""
+
+    def frames(self, frames: Frames) -> None:
+        """Search the frames of the stream for broken taxels."""
+        self.taxels.put(frames, self.tare)
 
     def describe(self) -> list[object]:
         """The bundle's name, version, id and format."""
@@ -225,31 +248,42 @@ class Classifier:
         classified."""
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
-            finding = inspect(sweep.frames.taxels, self.tare, self.bundle.manifest.thresholds)
+            sweep, finding = self.repaired(sweep)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        touch, rule = self._touch(sweep), self.bundle.manifest.displacement
+        touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
         displaced = bool(touch.displacement)
         logits, novelty = self._classify(sweep.frames.taxels, displaced)
         if novelty:
-            return self._verdict(sweep, Finding(Status.UNKNOWN, novelty), touch=touch)
-        return self.conclude(
-            sweep, softmax(logits / (rule.temperature if displaced and rule else 1)), touch
-        )
+            finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
+            return self._verdict(sweep, finding, touch=touch)
+        scores = softmax(logits / (rule.temperature if displaced and rule else 1))
+        return self.conclude(sweep, scores, touch, finding.degraded)
+
+    def repaired(self, sweep: Sweep) -> tuple[Sweep, Finding]:
+        """A sweep with frames, its broken taxels bridged, and the result of its check."""
+        taxels, finding = self.taxels.repaired(sweep.frames.taxels, self.tare)
+        if not finding.degraded:
+            return sweep, finding
+        return replace(sweep, frames=replace(sweep.frames, taxels=taxels)), finding
 
     def conclude(
-        self, sweep: Sweep, scores: NDArray[np.float64], touch: Touched | None = None
+        self,
+        sweep: Sweep,
+        scores: NDArray[np.float64],
+        touch: Touched | None = None,
+        degraded: str = "",
     ) -> Verdict:
         """The verdict on a valid sweep with the probabilities `scores` float64 [K], fused with the
         other sweeps of the object.
 
-        touch: result of `_touch`; None: it is computed here.
+        touch: result of `_touch`; None: it is computed here. degraded: as in Finding.
         """
-        touch = touch or self._touch(sweep)
+        if touch is None:
+            touch = self._touch(sweep, sweep.frames.taxels.mean(axis=0, dtype=np.float64))
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
-            return self._verdict(
-                sweep, Finding(Status.UNKNOWN, "the model gives no number"), touch=touch
-            )
+            finding = Finding(Status.UNKNOWN, "the model gives no number", degraded)
+            return self._verdict(sweep, finding, touch=touch)
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
             earlier = FusedSweeps(sweep.object)
@@ -257,7 +291,7 @@ class Classifier:
         conflict = self._conflict(scores, before)
         if conflict and self._ends.conflict == "refuse":
             self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
-            finding = Finding(Status.CONFLICT, conflict)
+            finding = Finding(Status.CONFLICT, conflict, degraded)
             return self._verdict(sweep, finding, own=scores, touch=touch, after=earlier.last)
         kept = (scores,) if conflict else (*before, scores)
         self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
@@ -267,19 +301,20 @@ class Classifier:
         if fused.max() < max(self.min_probability, least):
             final = 0 < self._ends.max_sweeps <= len(kept)
             status = Status.UNDECIDED if final else Status.UNSURE
-        return self._verdict(
-            sweep, Finding(status, conflict), fused, len(kept), scores, touch, earlier.last
-        )
+        finding = Finding(status, conflict, degraded)
+        return self._verdict(sweep, finding, fused, len(kept), scores, touch, earlier.last)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
         self._sweeps = FusedSweeps()
 
-    def conclude_if_ok(self, sweep: Sweep, scores: NDArray[np.float64]) -> Verdict | None:
+    def conclude_if_ok(
+        self, sweep: Sweep, scores: NDArray[np.float64], degraded: str = ""
+    ) -> Verdict | None:
         """The verdict of `conclude` on an unfinished sweep if its status is ok; otherwise None, and
         the sweep is not counted."""
         before = self._sweeps
-        verdict = self.conclude(sweep, scores)
+        verdict = self.conclude(sweep, scores, degraded=degraded)
         if verdict.status is Status.OK:
             return verdict
         self._sweeps = before
@@ -322,14 +357,14 @@ class Classifier:
         logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
         return logits, means.novelty(values[-1])
 
-    def _touch(self, sweep: Sweep) -> Touched:
+    def _touch(self, sweep: Sweep, mean: NDArray[np.float64] | None) -> Touched:
         """The displacement of the contact from its positions in training, and the slide, which is
-        measured in whole windows only."""
+        measured in whole windows only. mean: counts [R, C] or [R, C, A] of the window."""
         m, taxels = self.bundle.manifest, sweep.frames.taxels
         slide = self._slide(taxels) if len(taxels) == m.format.window else _NO_SLIDE
-        if m.contact is None or m.thresholds.contact is None:
+        if mean is None or m.contact is None or m.thresholds.contact is None:
             return Touched(slide=slide)
-        return Touched(displacement(taxels, self.tare, m.thresholds.contact, m.contact), slide)
+        return Touched(displacement(mean, self.tare, m.thresholds.contact, m.contact), slide)
 
     def _verdict(
         self,
@@ -363,6 +398,7 @@ class Classifier:
             share=sweep.share,
             own=own,
             displacement=touch.displacement,
+            degraded=finding.degraded,
             after=after,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
@@ -375,4 +411,5 @@ class Classifier:
         trained = self.bundle.manifest.speeds
         uncertain = finding.status in (Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN)
         untrained = trained.outside(touch.slide) if trained and uncertain else ""
-        return "; ".join(filter(None, (touch.displacement, untrained, finding.detail)))
+        texts = touch.displacement, untrained, finding.detail, _degraded(finding)
+        return "; ".join(filter(None, texts))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier, softmax
-from appliance.signal.window_check import inspect
 
 if TYPE_CHECKING:
     from appliance.bundle.manifest import Early
@@ -54,25 +53,24 @@ class EarlyExit:
         """The verdict on a sweep with share < 1, or None if the rest of the sweep is needed; then
         the sweep is not counted.
 
-        The frames are checked like a whole window, and a faulty sweep is not answered early. For
-        the graph the window is completed by repeating the last frame; the heads up to this step do
-        not depend on the repeated frames.
+        The frames are checked like a whole window: broken taxels are bridged, and a faulty sweep is
+        not answered early. For the graph the window is completed by repeating the last frame; the
+        heads up to this step do not depend on the repeated frames.
         """
-        taxels = sweep.frames.taxels
-        if (
-            inspect(taxels, self._classifier.tare, self._manifest.thresholds).status
-            is not Status.OK
-        ):
+        sweep, finding = self._classifier.repaired(sweep)
+        if finding.status is not Status.OK:
             return None
-        scores = self.scores(sweep)
-        return (
-            self._classifier.conclude_if_ok(sweep, scores[-1])
-            if decides(scores, self._rule)
-            else None
-        )
+        scores = self._scores(sweep)
+        if not decides(scores, self._rule):
+            return None
+        return self._classifier.conclude_if_ok(sweep, scores[-1], finding.degraded)
 
     def scores(self, sweep: Sweep) -> NDArray[np.float64]:
         """Probabilities float64 [d, K] at the steps that a sweep with share < 1 has reached."""
+        return self._scores(self._classifier.repaired(sweep)[0])
+
+    def _scores(self, sweep: Sweep) -> NDArray[np.float64]:
+        """As `scores`, of a sweep whose broken taxels were bridged."""
         taxels = sweep.frames.taxels
         rest = self._manifest.format.window - len(taxels)
         step = round(sweep.share * (self.steps + 1))  # counted from 1

@@ -79,6 +79,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
         )
     run = Classifier(old, SystemClock())
+    sweeps = np.stack([run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps])
     z, golden = (
         np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden)
     )

@@ -26,10 +26,10 @@ UNCHECKED = Finding(
 class SweepCheck(Observer):
     """Checks each window against the unloaded skin, which it finds by itself or takes from a TARE.
 
-    model: "", since there is no bundle.
+    model: "", since there is no bundle. degraded: "", since nothing is bridged.
     """
 
-    model = ""
+    model = degraded = ""
 
     def __init__(self, format: SweepFormat, clock: Clock) -> None:
         self.format, self._clock = format, clock

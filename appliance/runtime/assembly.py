@@ -73,7 +73,7 @@ def box(
         port,
         stack,
         capture,
-        observers,
+        [run, *observers],
         NO_COMMANDS,
         codes=(*bundle.manifest.labels, *labels),
         early=early_exit(settings, run),

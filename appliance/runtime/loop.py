@@ -56,6 +56,11 @@ class Answerer(Protocol):
         """The id of the bundle, "" without a bundle."""
         ...
 
+    @property
+    def degraded(self) -> str:
+        """Taxels that are broken over the stream and bridged, "" for none."""
+        ...
+
     def __call__(self, sweep: Sweep) -> Verdict:
         """The verdict on one sweep."""
         ...
@@ -280,6 +285,7 @@ class Box:
             storms=edges.storms,
             loss_known=sensor.loss_known,
             ready=self._able and not self._cutter.sweeping,
+            degraded=self._answerer.degraded,
         )
 
     def circumstances(self) -> dict[str, Any]:
@@ -320,7 +326,7 @@ class Box:
             h.glitches,
             h.lost_edges,
             h.storms,
-            *([] if h.loss_known else [1]),
+            *_last_fields(h),
         ]
 
     def _answer_to(self, command: Command) -> bytes:
@@ -373,6 +379,14 @@ class Box:
         if not self._cutter.interrupt(Status.ABORTED, self._clock.now_ns()):
             raise ApplianceError("no sweep is open, so there is nothing to abort")
         return []
+
+
+def _last_fields(h: Health) -> list[object]:
+    """The fields of STA that are often missing: whether lost frames cannot be seen, and broken
+    taxels."""
+    if h.degraded:
+        return ["" if h.loss_known else 1, h.degraded]
+    return [] if h.loss_known else [1]
 
 
 _COMMANDS: dict[str, Callable[[Box], list[object]]] = {

@@ -28,6 +28,7 @@ from appliance.recording.capture import Playback
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
+from appliance.signal.broken_taxels import BrokenTaxels
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
@@ -98,7 +99,7 @@ class KeptSweep:
 
     object: the folder, run and object number that fused sweeps share. rule: None without an entry.
     tare: [R, C] or [R, C, A] raw counts, None without an entry. bundle: its id, or "". verdict: as
-    `Verdict.as_dict` returns it, or empty.
+    `Verdict.as_dict` returns it, or empty. broken: taxels that were broken over the stream.
     """
 
     sweep: Sweep
@@ -108,6 +109,7 @@ class KeptSweep:
     tare: NDArray[np.float64] | None
     bundle: str
     verdict: dict[str, Any]
+    broken: BrokenTaxels | None = None
 
     @classmethod
     def read(cls, path: Path) -> KeptSweep:
@@ -125,7 +127,8 @@ class KeptSweep:
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "after", "time_ns")):
                 raise TypeError("the verdict's fused, after and time_ns must be whole numbers")
-            return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict)
+            broken = BrokenTaxels.read(about.get("broken"), format)
+            return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict, broken)
         except (TypeError, ValueError) as e:
             raise FormatError(
                 f"{path}: its sidecar cannot be used: {e}; use a sweep that was not changed"
@@ -216,6 +219,7 @@ class SweepReplay:
             else:
                 self._classifier = assembly.classifier(self._settings, self._bundle, self._clock)
         self._classifier.tare = self._bundle.manifest.tare if kept.tare is None else kept.tare
+        self._classifier.taxels.broken = kept.broken
         self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)
         return self._classifier
 
@@ -297,4 +301,5 @@ def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
     port = StdoutPort("replay", play.commands)
     cutter = SweepCutter(bundle.format, settings.sweep)
     pipeline = Pipeline(play, play, cutter, classifier, assembly.early_exit(settings, classifier))
-    Box(pipeline, play, port=port, source="replay").run(lambda: play.finished)
+    box = Box(pipeline, play, port=port, observers=[classifier], source="replay")
+    box.run(lambda: play.finished)

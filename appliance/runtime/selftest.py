@@ -22,6 +22,8 @@ from appliance.io.usb_sensor import fits
 from appliance.runtime.assembly import UNSIGNED, gpio
 from appliance.signal.slide import SlideMeter
 
+UNPROVEN = "broken taxels are refused: export it again to measure how many can be bridged"
+"""Text of a bundle without `bridging`."""
 LISTEN_S = 1.0
 """Time for which frames of the skin are counted."""
 MOST_READING = 0.5
@@ -56,7 +58,10 @@ def check(
         enrolled = "".join(
             f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items()
         )
-        return f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}"
+        return (
+            f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}; "
+            + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
+        )
 
     def golden() -> str:
         classifier = Classifier(loaded[0], devices.clock)

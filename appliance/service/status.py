@@ -168,6 +168,8 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
         "bundle": report["bundle"] or "none",
         "sweeps": f"{report['answered']} answered",
     }
+    if report.get("degraded"):
+        facts["degraded"] = f"{report['degraded']}: bridged by its neighbours; check the skin"
     if edges := _trigger(report):
         facts["trigger"] = edges
     if report["dropped"]:

@@ -99,10 +99,16 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     differ between attachments, which causes larger errors in a fit. A saturated taxel counts at
     full scale.
     """
-    taxels, tare = normal(taxels, 1), normal(tare, 0)
+    taxels = normal(taxels, 1)
     # contiguous: twice as fast to reduce
     series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)
-    load = series.mean(axis=1, dtype=np.float64).reshape(tare.shape) - tare
+    mean = series.mean(axis=1, dtype=np.float64).reshape(taxels.shape[1:])
+    return centre_of(mean, normal(tare, 0), contact)
+
+
+def centre_of(mean: NDArray[np.float64], tare: NDArray[np.float64], contact: float) -> Point | None:
+    """As `centre`, from the mean counts [R, C] along the normal. tare: [R, C]."""
+    load = mean - tare
     load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
     total = load.sum()
     if total <= 0:
@@ -147,11 +153,15 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
 
 
 def displacement(
-    taxels: NDArray[Any], tare: NDArray[np.float64], contact: float, positions: ContactPositions
+    mean: NDArray[np.float64],
+    tare: NDArray[np.float64],
+    contact: float,
+    positions: ContactPositions,
 ) -> str:
     """The displacement of a sweep's contact from the trained positions, for example "moved 2.1 mm
-    too far towards row 4"; "" if there is none. taxels, tare, contact: as for `centre`."""
-    found = centre(taxels, tare, contact)
+    too far towards row 4"; "" if there is none. mean: counts [R, C] or [R, C, A] of its window.
+    tare, contact: as for `centre`."""
+    found = centre_of(normal(mean, 0), normal(tare, 0), contact)
     if found is None or positions.within(offset := positions.offset(found)):
         return ""
     return f"moved {advice(offset, tare.shape[:2])}"

@@ -1,4 +1,4 @@
-"""The commands that make and judge bundles: fit, export, pack, score, parity."""
+"""The commands that make and judge bundles: fit, export, pack, score, parity, bridge."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from train.data import labels
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
-from train.export import bundle_score, measure, pack, quantized_bundle
+from train.export import bridging, bundle_score, measure, pack, quantized_bundle
 from train.models import methods
 from train.models.recipe import recipe
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ
@@ -40,13 +40,16 @@ LEAST_STEPS = 2
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, score, parity."""
+    """fit, export, pack, score, parity, bridge."""
     _add_fit(add)
     _add_bundles(add)
     score = add("score", run_score)
     score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(score)
     score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    bridge = add("bridge", run_bridge)
+    bridge.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    options.add_set(bridge)
     parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
@@ -343,6 +346,13 @@ def run_score(args: argparse.Namespace) -> None:
         )
 
 
+def run_bridge(args: argparse.Namespace) -> None:
+    """Measure the broken taxels that the bundle tolerates, and write them into its manifest."""
+    manifest = bridging.write(args.bundle, options.load(args))
+    print(bridging.text(manifest))
+    print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
+
+
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:
     return args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
 
@@ -355,6 +365,7 @@ def _print(manifest: Manifest, out: Path) -> None:
     if why := manifest.made.get("contact_unknown_because"):
         print(f"no-contact cannot be detected: {why}")
     _print_figures(manifest.figures)
+    print(bridging.text(manifest))
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()

@@ -28,6 +28,9 @@ PROGRAM = Program(
             "export": "quantize a fit and pack its bundle",
             "pack": "train any method and pack its bundle",
             "score": "run a set through the box's classifier with a bundle, and print the answers",
+            "bridge": (
+                "measure how many broken taxels a bundle tolerates, and write it into its manifest"
+            ),
             "parity": "show what int8 changes in a model's answers, and in each tensor",
             "report": "write a page about a bundle: its answers to a set, its limits, its cost",
             "sign": "sign a bundle, so that boxes take it",
@@ -36,7 +39,7 @@ PROGRAM = Program(
     {
         "sets": ("sets", "pull"),
         "importing": ("import",),
-        "bundles": ("fit", "export", "pack", "score", "parity"),
+        "bundles": ("fit", "export", "pack", "score", "bridge", "parity"),
         "choose": ("choose",),
         "evaluation": ("evaluate",),
         "report": ("report",),

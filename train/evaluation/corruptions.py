@@ -74,12 +74,12 @@ class Corruption:
         if severity == 0:
             return samples
         rng = np.random.default_rng([seed, *self.name.encode()])
-        return _digitized(
+        return digitized(
             self.change(samples.astype(np.float32), severity, rng, test), samples.dtype
         )
 
 
-def _digitized(x: Array, kind: np.dtype[Any]) -> Array:
+def digitized(x: Array, kind: np.dtype[Any]) -> Array:
     """Counts as the converter gives them: whole numbers within the range of their type. float32
     stays unchanged."""
     if kind.kind == "f":
@@ -175,19 +175,31 @@ def _some(x: Array, n: float, rng: Generator) -> Array:
     return chosen
 
 
-def _dead(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return np.where(_some(x, n, rng), 0, x)
+def dead(x: Array, chosen: Array, rng: Generator, test: EvaluationSweeps) -> Array:
+    """`x` float32 [N, T, R, C] or [N, T, R, C, A] with the taxels `chosen` at 0. chosen: bool, as
+    `_some` returns it."""
+    return np.where(chosen, 0, x)
 
 
-def _stuck(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return np.where(_some(x, n, rng), rng.uniform(x.min(), x.max(), (len(x), 1, *x.shape[2:])), x)
+def stuck(x: Array, chosen: Array, rng: Generator, test: EvaluationSweeps) -> Array:
+    """As `dead`, with each taxel at some count of the set's range."""
+    return np.where(chosen, rng.uniform(x.min(), x.max(), (len(x), 1, *x.shape[2:])), x)
 
 
-def _noisy(x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    noisy: Array = x + _some(x, n, rng) * np.float32(NOISY * test.rms) * rng.standard_normal(
+def noisy(x: Array, chosen: Array, rng: Generator, test: EvaluationSweeps) -> Array:
+    """As `dead`, with white noise of NOISY standard deviations of the set."""
+    noise: Array = x + chosen * np.float32(NOISY * test.rms) * rng.standard_normal(
         x.shape, np.float32
     )
-    return noisy
+    return noise
+
+
+TaxelFault = Callable[[Array, Array, Generator, EvaluationSweeps], Array]
+TAXEL_FAULTS: dict[str, TaxelFault] = {"dead": dead, "stuck": stuck, "noisy": noisy}
+
+
+def _random(fault: TaxelFault, x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    return fault(x, _some(x, n, rng), rng, test)
 
 
 def _gain_spread(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
@@ -349,9 +361,14 @@ CORRUPTIONS = (
         _window_held,
         "files",
     ),
-    Corruption("dead", "dead taxels", "taxels", TAXELS, "read 0", _dead),
+    Corruption("dead", "dead taxels", "taxels", TAXELS, "read 0", partial(_random, dead)),
     Corruption(
-        "stuck", "stuck taxels", "taxels", TAXELS, "each at some count of the set's range", _stuck
+        "stuck",
+        "stuck taxels",
+        "taxels",
+        TAXELS,
+        "each at some count of the set's range",
+        partial(_random, stuck),
     ),
     Corruption(
         "noisy",
@@ -359,7 +376,7 @@ CORRUPTIONS = (
         "taxels",
         TAXELS,
         f"white noise of {NOISY:g} of the set's deviations",
-        _noisy,
+        partial(_random, noisy),
     ),
     Corruption(
         "gain-spread",

@@ -47,7 +47,7 @@ def under_corruptions(
             f"({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
             f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
         )
-    clean, tasks = _answers(box, sweeps), []
+    clean, tasks = answers(box, sweeps), []
     progress = Progress(len(seeds) * len(applicable(test)), log)
     for seed in seeds:
         trials = {answer: robustness.CorruptionCounts(test) for answer in ANSWERS}
@@ -56,7 +56,7 @@ def under_corruptions(
             found = [clean]
             for severity in corruption.severities[1:]:
                 found.append(
-                    _answers(box, replace(sweeps, samples=corruption.apply(test, severity, seed)))
+                    answers(box, replace(sweeps, samples=corruption.apply(test, severity, seed)))
                 )
             for answer, counted in trials.items():
                 counted.add(corruption, [(given[answer], 0) for given in found])
@@ -64,7 +64,7 @@ def under_corruptions(
     return {name: entry["curves"] for name, entry in robustness.merge(tasks)["methods"].items()}
 
 
-def _answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
+def answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
     """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
     five."""
     given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}

@@ -34,7 +34,7 @@ from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
 from train.data.readers import counted
 from train.data.sets import Dataset
-from train.export import bundle_score
+from train.export import bridging, bundle_score
 from train.metrics.answers import REFUSED, UNKNOWN
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
@@ -71,7 +71,8 @@ class Content:
     `held_out_by`. about: description of the training; figures: its results; both for the manifest.
     early, known, displacement: for the manifest. classes: of the embedding, if there is `known`.
     reference: the float model of an int8 model. contacts: of the training sweeps; None to find
-    them.
+    them. unseen: the same content with heads that did not see the held-out sweeps; None if no part
+    of the model has seen them.
     """
 
     model: onnx.ModelProto
@@ -87,6 +88,7 @@ class Content:
     classes: bundle.Classes | None = None
     reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
+    unseen: Content | None = None
 
 
 def pack(
@@ -113,7 +115,9 @@ def pack(
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
             (folder / file).write_bytes(data)
         figures = judge(folder, content.held_out, logits, f"held-out {content.held_out_by}")
-        manifest = replace(manifest, figures=figures | content.figures)
+        tolerance = _tolerance(content, manifest, bundle.load(folder))
+        figures |= content.figures | {bridging.FIGURES: tolerance.figures}
+        manifest = replace(manifest, figures=figures, bridging=tolerance.bridging)
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
@@ -148,6 +152,20 @@ def _manifest(
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit, unknown),
     )
+
+
+def _tolerance(
+    content: Content, manifest: bundle.Manifest, packed: bundle.Bundle
+) -> bridging.Tolerance:
+    """The broken taxels that the bundle tolerates, by heads that did not see the held-out
+    sweeps."""
+    if content.unseen:
+        files = _files(content.unseen)
+        entries = {name: bundle.file_entry(data) for name, data in files.items()}
+        text = replace(manifest, files=entries, early=None).json()
+        packed = bundle.from_files(files | {bundle.MANIFEST: text}, manifest.name)
+    seed = int(content.about.get("seed", 0))
+    return bridging.measure(packed, content.train, content.held_out, seed)
 
 
 def _files(content: Content) -> dict[str, bytes]:

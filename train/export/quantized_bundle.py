@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
+from train.calibration import novelty
 from train.data.sets import Dataset
 from train.export.bundle_graph import bundle_graph
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models.methods import model_inputs
-from train.models.recipe.fitted import Fit, finished
+from train.models.recipe.calibrate import Calibration
+from train.models.recipe.fitted import Fit, calibration_inputs, finished
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.parity import Parity
@@ -93,15 +95,31 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     figures = fit.held_out_figures(f"held-out {content.held_out_by}")
     prefixes = fit.trunk(prefixes=True) if rule.early else None
+    content = replace(content, known=calibration.known())
+    apart = _unseen(fit, calibration)
     return replace(
         content,
+        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=apart.classes()),
         model=bundle_graph(calibration, fit.trunk(), prefixes),
         early=rule.early,
-        known=calibration.known(),
         displacement=calibration.displacement_rule(),
         classes=calibration.classes(),
         about=content.about | {"early": early},
         figures=content.figures | figures,
+    )
+
+
+def _unseen(fit: Fit, calibration: Calibration) -> Calibration:
+    """`calibration` with a head and an embedding that did not see the groups of the held-out
+    sweeps."""
+    given = calibration_inputs(fit)
+    seen = ~np.isin(given.groups, given.groups[given.judged])
+    weight, bias = given.naming_head(seen)
+    return replace(
+        calibration,
+        embedding=novelty.embed(given.whole[seen], given.labels[seen], given.fixed),
+        weight=weight / calibration.temperature,
+        bias=bias / calibration.temperature,
     )
 
 

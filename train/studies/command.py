@@ -20,6 +20,8 @@ PROGRAM = Program(
             " a time",
             "certainty": "measure how far a model's probabilities can be trusted: calibration,"
             " more sweeps, unknown materials, enrolment",
+            "taxels": "break taxels of sweeps, and count the answers of a bundle with and without"
+            " bridging",
             "alignment": "measure whether a displaced contact is flagged before accuracy is lost"
             " (simulated)",
             "cnn-curve": "follow the paper's CNN while it learns the simulated skin",
@@ -40,6 +42,7 @@ PROGRAM = Program(
             "certainty",
             "calibrate",
             "cnn-curve",
+            "taxels",
             "alignment",
             "references",
         ),

@@ -145,3 +145,25 @@ def test_too_few_fields_are_named(kind: type[BoxState | BoxIdentity], fields: li
     """A state or an identity that is cut short."""
     with pytest.raises(FormatError, match="older than the box"):
         kind.of(fields)
+
+
+@pytest.mark.parametrize(
+    ("last", "degraded"), [((), ""), ((1,), ""), ((1, "silent row 2"), "silent row 2")]
+)
+def test_a_state_names_broken_taxels(last: tuple[object, ...], degraded: str):
+    """Field 19 of STA; a box that bridges none does not send it."""
+    fields = ("1.000", "streaming", 0, 1, 2, 3, 4, 5, 6, "9f3c2a1b", "usb", *[0] * 6)
+    line = sentences.read(sentences.sentence("STA", *fields, *last))
+    assert BoxState.of(line.fields).degraded == degraded
+
+
+def test_a_long_state_loses_the_names_of_broken_taxels_first():
+    """The names are cut or left out; no count is cut."""
+    counts = [9_999_999] * 4
+    fields = ("1.000", "streaming", 0, *counts, 5, 6, "9f3c2a1b", "usb", *[88_888] * 6, "")
+    cut = sentences.read(sentences.sentence("STA", *fields, "silent taxel " + "2.3 " * 30))
+    assert cut.fields[:18] == [str(field) for field in fields]
+    assert BoxState.of(cut.fields).degraded.startswith("silent")
+    more = (*fields[:11], *[888_888_888] * 6, "")
+    whole = sentences.read(sentences.sentence("STA", *more, "silent taxel 2.3"))
+    assert set(whole.fields[11:]) == {"888888888"}

@@ -24,6 +24,7 @@ from appliance.core.types import Status, Sweep
 from appliance.deployment import shadow
 from appliance.deployment.shadow import Shadow
 from appliance.inference.classifier import Classifier
+from appliance.signal.broken_taxels import Bridging
 from appliance.sim import rig, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND
@@ -198,6 +199,18 @@ def test_without_a_tare_each_bundle_has_its_own(side):
     assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1, "a": 1}}
 
 
+def test_taxels_that_are_broken_over_the_stream_count_for_both(side):
+    """The candidate, which sees no stream, bridges the same taxels."""
+    rule = Bridging(taxels=1, row=False, column=False, noise=4.0, quietest=2.0, still=False)
+    pair = side(lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, bridging=rule)))
+    far, broken = toy_bundle.sweep(6, 0), np.zeros((2, 2, 2), bool)
+    broken[0, 0, 0] = True  # the taxel that carries the material of the toy
+    for circumstances in ({}, {"broken": broken.tolist()}):
+        about = {"tare": pair.tare.tolist(), **circumstances}
+        pair.shadow.sweep(far, pair.current(far), about)
+    assert pair.shadow.agreement.pairs == {"b": {"b": 1, "a": 1}}
+
+
 def test_what_has_no_window_is_not_compared(side):
     """A sweep without a window says nothing about a bundle, so it is not counted."""
     pair = side()
@@ -239,6 +252,7 @@ class FailingClassifier:
     def __init__(
         self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
     ) -> None:
+        self.format, self.taxels = run.format, run.taxels
         self.bundle, self.self_test, self._run, self._fails, self._act = (
             run.bundle,
             run.self_test,

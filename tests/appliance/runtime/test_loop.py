@@ -271,20 +271,36 @@ def spoiled(fault: str) -> np.ndarray:
     ("fault", "detail"),
     [
         ("saturated", "taxel 2.2"),
-        ("stuck-taxel", "taxel 2.3"),
-        ("dead-taxel", "taxel 3.2"),
         ("no-contact", "raw counts"),
     ],
 )
 def test_a_spoiled_skin_is_seen_before_the_network_is_asked(
     rigged: Callable[..., Rigged], fault: str, detail: str
 ):
-    """Saturation, stuck and dead taxels, no contact: a status with the place, and no label."""
+    """Saturation and no contact: a status with the place, and no label."""
     box = rigged(simulated_devices(touched(spoiled(fault))))
     (verdict,) = box.until(lambda: box.box.answered == 1)
     assert (verdict.status, verdict.label) == (fault, "")
     assert detail in verdict.detail
     assert len(verdict.scores) == 0
+
+
+@pytest.mark.parametrize(("fault", "place"), [("stuck-taxel", "2.3"), ("dead-taxel", "3.2")])
+def test_a_broken_taxel_is_bridged_and_named_everywhere(
+    rigged: Callable[..., Rigged], fault: str, place: str
+):
+    """The answer is ok with the taxel in its detail. READY stays; after some seconds of the same
+    slide STA and the state name the taxel, too."""
+    box = rigged(simulated_devices(touched(spoiled(fault))))
+    (verdict,) = box.until(lambda: box.box.answered == 1)
+    assert (verdict.status, verdict.label) == ("ok", "plastic rough")
+    assert verdict.detail == f"degraded: silent taxel {place}"
+    assert box.box.health.ready
+    assert box.box.health.degraded == f"silent taxel {place}"
+    assert box.box.health.text.startswith(f"skin streaming, silent taxel {place}. ")
+    box.seconds(1.1)
+    fields = next(line for line in reversed(box.heard) if ",STA," in line)
+    assert fields.split("*")[0].split(",")[-2:] == ["", f"silent taxel {place}"]
 
 
 def test_sweeps_of_one_object_are_fused(rigged: Callable[..., Rigged]):

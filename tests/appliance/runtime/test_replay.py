@@ -22,6 +22,7 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.recording.black_box import BlackBox
 from appliance.runtime.replay import replay
+from appliance.signal.broken_taxels import Bridging, BrokenTaxels
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.paths import NO_SITE, SIDECARS_2
@@ -332,6 +333,25 @@ def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path):
     assert ",ok,a," in played(tmp_path / "s.npy", high)[1][0]
 
 
+def test_taxels_that_were_broken_over_the_stream_are_bridged_again(tmp_path: Path):
+    """The sidecar names them, and the verdict is the same. Without the entry it differs."""
+    rule = Bridging(taxels=1, row=False, column=False, noise=4.0, quietest=2.0, still=False)
+    loaded = toy_bundle.load(tmp_path / "bundle")
+    model = replace(loaded, manifest=replace(loaded.manifest, bridging=rule))
+    it, kinds = Classifier(model, rig.VirtualClock()), np.zeros((2, 2, 2), bool)
+    kinds[0, 0, 0] = True
+    it.taxels.broken = BrokenTaxels.of(kinds)
+    sweep, kept = toy_bundle.sweep(6, 0), tmp_path / "s.npy"
+    about = {**it.about(), "verdict": it(sweep).as_dict()}
+    save(kept, sweep, toy_bundle.FORMAT, about)
+    code, (sentence,), outcomes = played(kept, model)
+    assert (code, outcomes) == (0, ["s.npy: the same"])
+    assert ",ok,a," in sentence
+    assert "degraded: silent taxel 1.1" in sentence
+    save(kept, sweep, toy_bundle.FORMAT, {k: v for k, v in about.items() if k != "broken"})
+    assert played(kept, model)[0] == 1
+
+
 def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
     """The rule is read under its old keys; the present settings would give other verdicts."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
@@ -369,6 +389,8 @@ def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
     [
         ({"tare": [[1, 2, 3]]}, "sidecar cannot be used"),
         ({"tare": "heavy"}, "sidecar cannot be used"),
+        ({"broken": [[1, 2, 3]]}, "sidecar cannot be used"),
+        ({"broken": [[1], [2, 3]]}, "sidecar cannot be used"),
         ({"rule": {"fuse": "product"}}, "sidecar cannot be used"),
         (
             {"rule": {"fuse": "guess", "min_probability": 0.5, "max_sweeps": 0}},

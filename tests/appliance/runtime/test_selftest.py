@@ -69,3 +69,19 @@ def test_which_speeds_are_measured(changes: dict[str, Any], detail: str):
     }
     assert found["speed"].ok
     assert found["speed"].detail.startswith(detail)
+
+
+@pytest.mark.parametrize("proven", [True, False])
+def test_check_says_how_many_broken_taxels_are_bridged(proven: bool):
+    """And that a bundle without this figure refuses them; it passes all the same."""
+    acts, source, format = script.named("skin", None, 1, spread=False)
+    built = devices.build(format, acts, rig.VirtualClock(), source)
+    packaged = bundle.load(bundle.DEFAULT)
+    manifest = packaged.manifest if proven else replace(packaged.manifest, bridging=None)
+    first, *_ = selftest.check(
+        built.wire(config.load(None)), lambda: replace(packaged, manifest=manifest), built
+    )
+    assert first.component == "bundle"
+    assert first.ok
+    wanted = "up to 4 broken taxels or one row or one column bridged" if proven else "are refused"
+    assert wanted in first.detail

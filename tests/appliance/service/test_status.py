@@ -109,6 +109,16 @@ def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedSta
     assert status_file.read()["skin"] == "absent"
 
 
+def test_a_bridged_taxel_has_a_line(status_file: ClockedStatus):
+    """With its remedy; a sound skin has none."""
+    status_file.turns(2)
+    assert "degraded" not in status_file.text()
+    status_file.turns(2, replace(HEALTH, degraded="silent taxel 2.3"))
+    assert "degraded silent taxel 2.3: bridged by its neighbours; check the skin" in (
+        status_file.text()
+    )
+
+
 def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
     """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
     written = 0

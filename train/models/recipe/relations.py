@@ -150,4 +150,5 @@ def _cells(format: SweepFormat) -> NDArray[np.float64]:
     row, col = np.arange(rows) * down // rows, np.arange(cols) * across // cols
     cell = (row[:, None] * across + col).ravel()
     number = (cell[:, None] * axes + np.arange(axes)).ravel()
-    return np.eye(down * across * axes)[number].T
+    belongs: NDArray[np.float64] = np.eye(down * across * axes)[number].T
+    return belongs

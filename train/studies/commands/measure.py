@@ -1,4 +1,5 @@
-"""The studies that measure: stress, certainty, calibrate, cnn-curve, alignment, references."""
+"""The studies that measure: stress, certainty, calibrate, cnn-curve, taxels, alignment,
+references."""
 
 from __future__ import annotations
 
@@ -25,11 +26,13 @@ from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_stress
 from train.metrics import score
 from train.models import methods
-from train.studies import alignment, certainty, references, sim_calibration
+from train.studies import alignment, broken_taxels, certainty, references, sim_calibration
 from train.studies.study import results_file, save
 
 STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+TAXEL_SWEEPS = 216
+"""Sweeps of a file whose taxels are broken, as many as the simulated set has."""
 STRESSED_METHODS = "default-reattached,default,minirocket,minirocket-augmented,H-svm,compact"
 """First the recipe of the packaged bundle."""
 
@@ -39,6 +42,7 @@ def register(add: Add) -> None:
     _add_certainty(add)
     _add_calibrate(add)
     _add_cnn_curve(add)
+    _add_taxels(add)
     _add_alignment(add)
     command = add("references", run_references)
     command.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -138,6 +142,23 @@ def _add_alignment(add: Add) -> None:
         "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
     )
     _add_out(command, "alignment")
+
+
+def _add_taxels(add: Add) -> None:
+    command = add("taxels", run_taxels)
+    command.add_argument(
+        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
+    )
+    command.add_argument(
+        "--test",
+        default=STRESSED,
+        metavar="SET",
+        help=f"the set whose taxels are broken; a simulated one is drawn anew ({STRESSED})",
+    )
+    command.add_argument(
+        "--seed", type=numbers.whole("--seed", 0), default=1, help="of the places (1)"
+    )
+    command.add_argument("--times", action="store_true", help="measure the time instead")
 
 
 def _add_stress(add: Add) -> None:
@@ -297,6 +318,21 @@ def run_cnn_curve(args: argparse.Namespace) -> None:
             )
         )
     )
+
+
+def run_taxels(args: argparse.Namespace) -> None:
+    """Print the table, or the times."""
+    loaded = bundle.load(args.bundle)
+    if args.times:
+        print(broken_taxels.times(loaded))
+        return
+    test = (
+        EvaluationSweeps.simulated(args.test)
+        if args.test.startswith("sim:")
+        else EvaluationSweeps.of(sets.load(args.test), TAXEL_SWEEPS)
+    )
+    for line in broken_taxels.table(loaded, test, args.seed):
+        print(line)
 
 
 def run_alignment(args: argparse.Namespace) -> None:

@@ -1,0 +1,248 @@
+"""Measures how many broken taxels a bundle tolerates if the box bridges them.
+
+The limits of a noisy and of a silent taxel are learned from sound sweeps. Then taxels are broken at
+their worst places, one more at a time, and the box answers the held-out sweeps. The manifest gets
+the largest number at which it names about as many as with a sound skin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from appliance.bundle.bundle import MANIFEST, OPTIONAL, Bundle, load
+from appliance.bundle.manifest import Manifest
+from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from appliance.core.types import Status
+from appliance.inference.classifier import Classifier
+from appliance.signal.broken_taxels import Bridging, Comparison, places
+from appliance.signal.taxel_statistics import TaxelStatistics
+from train.data.sets import Dataset, digest
+from train.evaluation.corruptions import TAXEL_FAULTS, digitized
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
+from train.export import bundle_score
+
+Array = NDArray[Any]
+FIGURES = "broken taxels"
+"""Key of the figures in a manifest."""
+MARGIN = 1.25
+"""A noisy taxel has this many times the noise, against its neighbours, of any taxel in training."""
+PARTS = 10
+"""A sound taxel may be constant in the window's tenth from which the box answers earliest."""
+SILENT = ("dead", "stuck")
+"""Faults that the box refuses where it does not bridge them. A noisy taxel that it does not bridge
+costs what it costs without bridging, so it does not decide the number."""
+MOST = 8
+"""Largest number of broken taxels that is tried, and at most a quarter of all."""
+CANDIDATES = 32
+"""Taxels among which the worst places are searched: those with the strongest signal."""
+SEARCHED, JUDGED = 40, 240
+"""Number of sweeps that find the worst places, and that judge the answers there."""
+LOST, WRONG = 0.02, 0.01
+"""Accepted loss of accuracy, and accepted rise of wrong answers, as shares; one sweep is always
+accepted."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The broken taxels that a bundle tolerates. bridging: for the manifest. figures: counts of
+    right and wrong answers by fault and number, for its figures."""
+
+    bridging: Bridging
+    figures: dict[str, Any]
+
+
+def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) -> Tolerance:
+    """The broken taxels that `bundle` tolerates. sound: sweeps of a sound skin, from which the
+    limits are learned. held_out: sweeps that judge, best by a bundle that did not see them."""
+    rows, cols = bundle.format.rows, bundle.format.cols
+    limits = learned(sound)
+    trial = replace(limits, taxels=rows * cols - 1, row=True, column=True)
+    test = EvaluationSweeps.of(held_out, JUDGED, seed)
+    box = Classifier(
+        replace(bundle, manifest=replace(bundle.manifest, bridging=trial)), SystemClock()
+    )
+    sample = EvaluationSweeps.of(test.sweeps, SEARCHED, seed)
+    bench = _Bench(box, test, sample, seed)
+    figures: dict[str, Any] = {"sweeps": len(test.sweeps), "sound": bench.clean}
+    taxels = 0
+    for mask in _worst_places(bench, min(MOST, rows * cols // 4)):
+        holds, figures[_count(mask)] = bench.judged(mask)
+        if not holds:
+            break
+        taxels += 1
+    lines = {}
+    for name, count, others in (("row", rows, cols), ("column", cols, rows)):
+        lines[name] = False
+        if min(count, others) > 1:
+            mask = bench.worst(_lines(rows, cols, name))
+            lines[name], figures[f"one {name}"] = bench.judged(mask)
+    return Tolerance(replace(limits, taxels=taxels, **lines), figures)
+
+
+def learned(sound: Dataset) -> Bridging:
+    """The limits of noisy and silent taxels from sound sweeps, with no broken taxel allowed."""
+    grid = sound.format.rows, sound.format.cols
+    near, own, tenths = [], [], []
+    for window in sound.samples:
+        compared = Comparison.of(TaxelStatistics.of(window), grid)
+        near.append(compared.around)
+        own.append(compared.noise)
+        tenth = window[: max(2, len(window) // PARTS)]
+        tenths.append(Comparison.of(TaxelStatistics.of(tenth), grid))
+    around, noise = np.array(near), np.array(own)
+    heard = np.isfinite(around) & (around > 0)
+    if not heard.any():  # every window is constant
+        return Bridging(0, False, False, MARGIN, 1.0, True)
+    quietest = float(around[heard].min())
+    ratio = float((noise / np.maximum(around, quietest))[heard].max())
+    still = any(bool((tenth.still & tenth.lively(quietest)).any()) for tenth in tenths)
+    return Bridging(0, False, False, MARGIN * max(1.0, ratio), quietest, still)
+
+
+class _Bench:
+    """Breaks taxels of test sweeps and counts the answers of the box.
+
+    clean: [right, wrong] of the sound sweeps. sample: the sweeps that search worst places.
+    """
+
+    def __init__(
+        self, box: Classifier, test: EvaluationSweeps, sample: EvaluationSweeps, seed: int
+    ) -> None:
+        self._box, self._test, self._sample, self._seed = box, test, sample, seed
+        self.signal = test.deviation.reshape(*test.deviation.shape[:2], -1).sum(axis=2)
+        self.clean = self._counts(test.sweeps)[:2]
+
+    def worst(self, masks: Iterable[Array]) -> Array:
+        """The mask [R, C] whose taxels, dead, leave the true materials the least probability."""
+
+        def likely(mask: Array) -> float:
+            return float(self._counts(self._broken("dead", mask, self._sample))[2])
+
+        return min(masks, key=likely)
+
+    def judged(self, mask: Array) -> tuple[bool, dict[str, Any]]:
+        """Whether the box answers as with a sound skin while the taxels of `mask` [R, C] are dead
+        or stuck, and [right, wrong] by fault with the places."""
+        counts = {
+            fault: self._counts(self._broken(fault, mask, self._test))[:2] for fault in TAXEL_FAULTS
+        }
+        return self._holds(counts), counts | {"at": places(mask)}
+
+    def _holds(self, counts: Mapping[str, list[int]]) -> bool:
+        n, (right, wrong) = len(self._test.sweeps), self.clean
+        lost = max(1, LOST * n)
+        more = max(1, WRONG * n)
+        return all(
+            counts[fault][0] >= right - lost and counts[fault][1] <= wrong + more
+            for fault in SILENT
+        )
+
+    def _broken(self, fault: str, mask: Array, test: EvaluationSweeps) -> Dataset:
+        samples, rng = test.sweeps.samples, np.random.default_rng([self._seed, *fault.encode()])
+        chosen = mask.reshape(1, 1, *mask.shape, *(1,) * (samples.ndim - 4))
+        broken = TAXEL_FAULTS[fault](samples.astype(np.float32), chosen, rng, self._test)
+        return replace(test.sweeps, samples=digitized(broken, samples.dtype))
+
+    def _counts(self, sweeps: Dataset) -> list[Any]:
+        """Right and wrong answers with status ok, and the sum of the probabilities of the true
+        materials."""
+        right, wrong, likely = 0, 0, 0.0
+        for i, verdict in bundle_score.verdicts(self._box, sweeps):
+            truth = int(sweeps.labels[i])
+            named = verdict.label == sweeps.materials[truth]
+            right += verdict.status is Status.OK and named
+            wrong += verdict.status is Status.OK and not named
+            likely += float(verdict.scores[truth]) if len(verdict.scores) else 0.0
+        return [right, wrong, likely]
+
+
+def _worst_places(bench: _Bench, most: int) -> Iterable[Array]:
+    """Masks [R, C] of one broken taxel, two, and so on: to the worst places so far the worst other
+    one is added."""
+    mask = np.zeros(bench.signal.shape, bool)
+    strongest = np.argsort(-bench.signal, axis=None)[:CANDIDATES]
+    for _ in range(most):
+        left = [at for at in strongest if not mask.flat[at]]
+        mask = bench.worst(map(_with(mask), left))
+        yield mask
+
+
+def _count(mask: Array) -> str:
+    n = int(mask.sum())
+    return f"{n} taxel{'s' * (n > 1)}"
+
+
+def _with(mask: Array) -> Callable[[int], Array]:
+    """Adds the taxel with a number to a copy of `mask` [R, C]."""
+
+    def added(at: int) -> Array:
+        more = mask.copy()
+        more.flat[at] = True
+        return more
+
+    return added
+
+
+def _lines(rows: int, cols: int, name: str) -> Iterable[Array]:
+    """A mask [R, C] for each row, or for each column."""
+    for at in range(rows if name == "row" else cols):
+        mask = np.zeros((rows, cols), bool)
+        mask[at if name == "row" else slice(None), at if name == "column" else slice(None)] = True
+        yield mask
+
+
+def text(manifest: Manifest) -> str:
+    """The broken taxels that a bundle tolerates, with the answers at the worst places, in words."""
+    if manifest.bridging is None:
+        return "broken taxels: not measured, so the box refuses them"
+    lines = [f"broken taxels: {manifest.bridging.text} bridged"]
+    figures = manifest.figures.get(FIGURES, {})
+    if figures:
+        right, wrong = figures["sound"]
+        lines.append(f"  sound skin: {right} of {figures['sweeps']} named rightly, {wrong} wrongly")
+    for name, counts in figures.items():
+        if isinstance(counts, dict):
+            answers = "; ".join(
+                f"{fault} {counts[fault][0]} rightly, {counts[fault][1]} wrongly"
+                for fault in TAXEL_FAULTS
+            )
+            lines.append(f"  {name} ({counts['at']}): {answers}")
+    return "\n".join(lines)
+
+
+def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
+    """Measure the bundle in `folder` on `sweeps` of a sound skin, best of none that it has seen,
+    and write the result into its manifest; its other files stay as they are.
+
+    Raises FormatError if the sweeps are of another format or of materials that it lacks, or if the
+    bundle is signed or has enrolled materials, which hold for the manifest as it is.
+    """
+    loaded = load(folder)
+    lacking = sorted(set(sweeps.materials) - set(loaded.manifest.labels))
+    if sweeps.format != loaded.format or lacking:
+        raise FormatError(
+            f"{sweeps.source} ({sweeps.format}, {', '.join(sweeps.materials)}) does not fit the "
+            f"bundle ({loaded.format}, {', '.join(loaded.manifest.labels)}); name a set of its kind"
+        )
+    if bound := [name for name in OPTIONAL if (folder / name).exists()]:
+        raise FormatError(
+            f"{folder} has {', '.join(bound)}, made for its manifest as it is; measure the bundle "
+            "before it is signed"
+        )
+    found = measure(loaded, sweeps, sweeps, seed)
+    figures = found.figures | {"set": sweeps.source, "digest": digest(sweeps)}
+    manifest = replace(
+        loaded.manifest,
+        bridging=found.bridging,
+        figures=loaded.manifest.figures | {FIGURES: figures},
+    )
+    put(folder / MANIFEST, manifest.json())
+    return manifest
