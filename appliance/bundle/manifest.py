@@ -242,8 +242,6 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
         )
-    if manifest.speeds and not manifest.contact:
-        raise BundleError("manifest has `speeds` without `place`; export the bundle again")
     taxels = manifest.format.rows * manifest.format.cols
     if manifest.bridging and manifest.bridging.taxels >= taxels:
         raise BundleError(

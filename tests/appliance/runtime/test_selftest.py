@@ -49,7 +49,10 @@ def test_what_reading_takes_of_a_core(share: float, ok: bool):
 @pytest.mark.parametrize(
     ("changes", "detail"),
     [
-        ({}, "measured from 8 to 400 mm/s; the bundle does not state those of training: export"),
+        (
+            {"speeds": None},
+            "measured from 8 to 400 mm/s; the bundle does not state those of training: export",
+        ),
         ({"speeds": SpeedRange(27.6, 33.1)}, "measured from 8 to 400 mm/s, trained 28 to 33"),
         (
             {"contact": None, "displacement": None},
