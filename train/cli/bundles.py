@@ -28,15 +28,14 @@ from train.evaluation.fold import fingerprint
 from train.export import bridging, bundle_score, measure, pack, quantized_bundle
 from train.models import methods
 from train.models.recipe import recipe
-from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ
+from train.models.recipe.architectures import MAINS_HZ
 from train.models.recipe.augment import Augmentation, default_augmentation
 from train.models.recipe.fitted import Fit
+from train.models.recipe.sizes import SIZES, UNLIMITED
 
 MAINS = (50, 60)
 """Frequencies of the mains in Hz: public grids have no others."""
 STEPS = recipe.Settings().steps
-LEAST_STEPS = 2
-"""Steps that the training of a network needs at least, since its learning rate rises and falls."""
 
 
 def register(add: Add) -> None:
@@ -105,17 +104,9 @@ def _add_model(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--size",
-        choices=[*ARCHITECTURES, "chosen"],
-        default="chosen",
-        help=(
-            "train a network of this size (default: filters, spectrum and stages as chosen on "
-            "held-out groups)"
-        ),
-    )
-    command.add_argument(
-        "--keep-means",
-        action="store_true",
-        help="also give the head the mean of each taxel, for comparison",
+        choices=SIZES,
+        help="; ".join(f"{name}: at most {size.about}" for name, size in SIZES.items())
+        + " (default: no limit)",
     )
 
 
@@ -214,60 +205,26 @@ def run_fit(args: argparse.Namespace) -> None:
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
-    """The fit for these options, and the file that keeps its training until the fit is written.
-
-    Raises FormatError if options contradict each other.
-    """
-    _check(args)
+    """The fit for these options, and the file that keeps its training until the fit is written."""
     changes = {
         name: share
         for name in ("displaced", "stretch")
         if (share := getattr(args, name)) is not None
     }
-    architecture = replace(ARCHITECTURES.get(args.size, recipe.FIXED), mains_hz=float(args.mains))
-    augmentation = replace(
-        default_augmentation(architecture.zero_sum(sweeps.format.window)), **changes
-    )
+    zero_sum = recipe.FIXED.zero_sum(sweeps.format.window)
+    augmentation = replace(default_augmentation(zero_sum), **changes)
     unfinished = _unfinished(args, sweeps, augmentation)
-    if args.size in ARCHITECTURES:
-        from train.models.recipe import stages  # here: the default recipe needs no PyTorch
-
-        trained = stages.FitRecipe(
-            steps=args.steps, augmentation=augmentation, keep_means=args.keep_means
-        )
-        return stages.fit_network(
-            sweeps, args.seed, trained, options.Log(), architecture, unfinished
-        ), unfinished
     settings = recipe.Settings(
         args.steps,
         augmentation,
         unfinished=unfinished,
+        size=SIZES.get(args.size, UNLIMITED),
         reattached=args.reattached,
         mains_hz=float(args.mains),
     )
     made = recipe.fit(sweeps, args.seed, settings, options.Log())
     print(f"chosen: {made.about['chosen']}; {_text(made.about['validation'])} of held-out parts")
     return made, unfinished
-
-
-def _check(args: argparse.Namespace) -> None:
-    """Raises FormatError if options contradict each other."""
-    network = args.size in ARCHITECTURES
-    if network and args.reattached:
-        raise FormatError(
-            f"--reattached is for the default recipe; --size {args.size} sees such "
-            "copies anyway, leave it out"
-        )
-    if network and args.steps < LEAST_STEPS:
-        raise FormatError(
-            f"--steps {args.steps} trains no network; use {LEAST_STEPS} or more with "
-            f"--size {args.size}"
-        )
-    if args.keep_means and not network:
-        raise FormatError(
-            f"--keep-means needs --size, one of {', '.join(ARCHITECTURES)}; the default "
-            "recipe removes means"
-        )
 
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, augmentation: Augmentation) -> Path:

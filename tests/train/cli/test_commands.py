@@ -75,14 +75,6 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         (["--set", "sim:T-LAB:1:1", "--steps", "-1"], "--steps -1 is out of range"),
         (["--set", "sim:T-LAB:1:1", "--steps", "x"], "--steps x is out of range"),
         (
-            ["--set", "sim:T-LAB:1:1", "--steps", "0", "--size", "1k"],
-            "--steps 0 trains no network; use 2 or more",
-        ),
-        (
-            ["--set", "sim:T-LAB:1:1", "--reattached", "--size", "1k"],
-            "--reattached is for the default recipe; --size 1k",
-        ),
-        (
             ["--set", "sim:T-LAB:1:1", "--row-shift", "3"],
             "--row-shift 3 is out of range; use a number from 0 to 1",
         ),

@@ -27,7 +27,7 @@ from train.export import bundle_score
     "size",
     [
         pytest.param((), id="chosen", marks=pytest.mark.thorough),
-        pytest.param(("--size", "10k", "--steps", "60"), id="stages"),
+        pytest.param(("--size", "stages", "--steps", "60"), id="stages"),
     ],
 )
 def test_from_a_set_to_the_answers_of_the_box(

@@ -21,6 +21,7 @@ from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
 from train.models.recipe import relations
+from train.models.recipe.sizes import Size
 
 Array = NDArray[Any]
 TINY = 1e-12
@@ -213,6 +214,25 @@ class FeatureColumns:
         by_scale = relations.reshape(max(scales, 1), -1)
         return cls(magnitudes, shares, kinds, levels, loads, by_scale, bands)
 
+    def limited(self, size: Size) -> FeatureColumns:
+        """Only the features that a model of this size may see; of many filters evenly spaced
+        ones."""
+        kept = [
+            kind[np.linspace(0, len(kind) - 1, min(len(kind), size.filters)).astype(int)]
+            if size.filters is not None
+            else kind
+            for kind in self.kinds
+        ]
+        numbers = np.sort(np.concatenate([np.empty(0, int), *kept]))
+        return replace(
+            self,
+            magnitudes=self.magnitudes[numbers],
+            shares=self.shares[numbers],
+            kinds=tuple(np.searchsorted(numbers, kind) for kind in kept if len(kind)),
+            levels=self.levels if size.distribution else self.levels[:0],
+            relations=self.relations[: size.scales],
+        )
+
     def filters(self) -> Array:
         """The filter [F] of each feature, -1 if it is not of a filter."""
         views = (self.levels, self.loads, self.relations, self.bands)
@@ -240,7 +260,7 @@ class Candidates:
     loads: bool = False
 
     def plain(self) -> dict[str, Heads]:
-        """The usual candidate, and magnitudes alone.
+        """The usual candidate, and magnitudes alone; the spectrum, if the size has no filters.
 
         It adds three discriminants for each kind of filters. All see the magnitudes, the
         second also the shares and the spectrum, the third also the distribution and the spectrum.
@@ -248,6 +268,8 @@ class Candidates:
         that is.
         """
         levels, bands = self.columns.levels, self.columns.bands
+        if not self.columns.kinds:
+            return {"spectrum": (HeadPart(tuple(bands.tolist()), self.copies),)}
         magnitudes = self.by_kind(shares=False)
         usual = (*magnitudes, *_with(self.by_kind(shares=True), bands))
         if len(levels):
@@ -331,8 +353,9 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
 
     usual, *others = scored(candidates.plain())
     for name, lessen in candidates.reduced().items():
-        (less,) = scored({name: lessen(usual.plan.parts)})
-        usual = less if scores.worse(usual, less) else usual
+        if parts := lessen(usual.plan.parts):
+            (less,) = scored({name: parts})
+            usual = less if scores.worse(usual, less) else usual
     best = min([usual, *others], key=scores.loss)
     extended = list(scored(candidates.extended(best.plan.parts)))
     best = min([usual, *others, *extended], key=scores.loss)

@@ -1,4 +1,4 @@
-"""The methods of the default recipe: default, default-reattached and filter-bank.
+"""The methods of the default recipe: default, its sizes, default-reattached and filter-bank.
 
 Each is the int8 graph that the box runs; its precision "float" is the model before quantization.
 """
@@ -17,6 +17,7 @@ from train.models.linear_head import expanded_head
 from train.models.methods import FULL_EFFORT, PACKAGED, Effort, Log, Method, no_log
 from train.models.recipe import recipe
 from train.models.recipe.fitted import CompactModel
+from train.models.recipe.sizes import SIZES
 from train.onnx_tools.graph_builder import GraphModel, with_head
 
 Array = NDArray[Any]
@@ -47,10 +48,21 @@ def train(
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
-    """`default`, the same for a skin that is taken off and put back, and `filter-bank`, which
-    neither chooses nor trains."""
+    """`default` and its sizes, the same for a skin that is taken off and put back, and
+    `filter-bank`, which neither chooses nor trains."""
     settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
+    sizes = (
+        Method(
+            f"palpate-{name}",
+            f"as default, but with {size.about} at most",
+            "raw",
+            partial(train, settings=replace(settings, size=size)),
+            effort=f"{settings.steps} iterations of stages" if size.stages else "",
+        )
+        for name, size in SIZES.items()
+    )
     return (
+        *sizes,
         Method(
             "default",
             "the box's default: filters, spectrum and trained stages as held-out groups of the "

@@ -49,6 +49,7 @@ from train.models.recipe.augment import (
 from train.models.recipe.bank import Bank
 from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
 from train.models.recipe.fitted import Fit, finished
+from train.models.recipe.sizes import UNLIMITED, Size
 from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
 
@@ -72,15 +73,17 @@ class Settings:
     steps: of the training of stages; 0 for no stages. augmentation: None for the default. choose:
     False to use one discriminant of all zero-sum filters. unfinished: a file that keeps the
     training of stages from time to time; from it an interrupted training goes on with the same
-    bits. reattached: the skin will be taken off and put back after the recordings; all heads then
-    see augmented copies. mains_hz: see Architecture. calibrate: whether the fit is finished with
-    calibration and contacts, which a bundle needs and `evaluate` does not.
+    bits. size: what the model may contain at most. reattached: the skin will be taken off and put
+    back after the recordings; all heads then see augmented copies. mains_hz: see Architecture.
+    calibrate: whether the fit is finished with calibration and contacts, which a bundle needs and
+    `evaluate` does not.
     """
 
     steps: int = 600
     augmentation: Augmentation | None = None
     choose: bool = True
     unfinished: Path | None = None
+    size: Size = UNLIMITED
     reattached: bool = False
     mains_hz: float = MAINS_HZ
     calibrate: bool = True
@@ -155,7 +158,8 @@ class Setup:
         """Whether stages can be trained."""
         each = np.unique(self.sweeps.labels, return_counts=True)[1]
         enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
-        return bool(self.settings.steps and enough and self.by != "nothing" and find_spec("torch"))
+        wanted = self.settings.steps and self.settings.size.stages
+        return bool(wanted and enough and self.by != "nothing" and find_spec("torch"))
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
@@ -227,6 +231,12 @@ def features(setup: Setup) -> FixedFeatures:
     trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.mains_hz)
     scales = trunk.architecture.relations
     columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
+    columns = columns.limited(setup.settings.size)
+    if not (columns.kinds or len(columns.bands)):
+        raise FormatError(
+            f"windows of {setup.sweeps.format.window} frames are too short for a spectrum, and "
+            "this size has nothing else; use a size with filters"
+        )
     return FixedFeatures(trunk, setup.data(trunk), columns)
 
 

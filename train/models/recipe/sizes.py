@@ -1,0 +1,44 @@
+"""The sizes of the recipe, from the spectrum alone to everything.
+
+A size says what a model may contain at most. Held-out groups choose within it, as they do without
+a limit, so a model has less where less suffices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from train.models.recipe import relations
+
+
+@dataclass(frozen=True)
+class Size:
+    """The views of a size; every size has the spectrum, and loads may join everywhere.
+
+    about: its content in words. filters: most filters of each kind; scales: most scales of the
+    relations; None for no limit. distribution, stages: whether they may join.
+    """
+
+    about: str = "all views"
+    filters: int | None = None
+    scales: int | None = None
+    distribution: bool = True
+    stages: bool = True
+
+
+SIZES = {
+    "bands": Size("the spectrum", 0, 0, False, False),
+    "pairs": Size("the spectrum and relations of few scales", 0, relations.SHORT, False, False),
+    "64": Size(
+        "64 filters of each kind, the spectrum and relations of few scales",
+        64,
+        relations.SHORT,
+        False,
+        False,
+    ),
+    "stages": Size("the spectrum and trained stages", 0, 0, False),
+    "256": Size("256 filters of each kind and all views in closed form", 256, stages=False),
+}
+"""By name."""
+UNLIMITED = Size()
+"""Without a size a model may contain everything."""
