@@ -639,10 +639,8 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "frames lost     0 of" in out
 
 
-@pytest.mark.parametrize("keep", [True, False])
-def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
-    """Materials that differ only in their offset are distinguished by a head that sees means, and
-    by no other."""
+def test_a_network_does_not_see_offsets(tmp_path: Path):
+    """It cannot distinguish materials that differ only in their offset."""
     whole = easy(seed=3)
     rng = np.random.default_rng(4)
     labels = rng.permutation(whole.labels)
@@ -652,12 +650,8 @@ def test_means_are_seen_only_where_they_are_kept(keep: bool, tmp_path: Path):
     )
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
-        made = stages.fit_network(
-            offset, 1, FitRecipe(steps=20, keep_means=keep), architecture=ARCHITECTURES["20k"]
-        )
+        made = stages.fit_network(offset, 1, FitRecipe(steps=20), architecture=ARCHITECTURES["20k"])
         manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
     except ExportRefused:  # what was never learnt may not survive int8 either
-        assert not keep
         return
-    accuracy = manifest.figures["held-out recording"]["accuracy"]
-    assert accuracy > 0.95 if keep else accuracy < 0.6
+    assert manifest.figures["held-out recording"]["accuracy"] < 0.6

@@ -21,7 +21,7 @@ from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
 from train.models.recipe import relations
-from train.models.recipe.sizes import Size
+from train.models.recipe.sizes import ModelSize
 
 Array = NDArray[Any]
 TINY = 1e-12
@@ -214,7 +214,7 @@ class FeatureColumns:
         by_scale = relations.reshape(max(scales, 1), -1)
         return cls(magnitudes, shares, kinds, levels, loads, by_scale, bands)
 
-    def limited(self, size: Size) -> FeatureColumns:
+    def limited(self, size: ModelSize) -> FeatureColumns:
         """Only the features that a model of this size may see; of many filters evenly spaced
         ones."""
         kept = [

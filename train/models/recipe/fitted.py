@@ -83,11 +83,6 @@ class Fit:
     contacts: Contacts | None = None
 
     @property
-    def keep_means(self) -> bool:
-        """Whether the head sees the means of the taxels."""
-        return bool(self.about["recipe"]["keep_means"])
-
-    @property
     def bands(self) -> int:
         """Number of features of the spectrum, which are the last ones and were not trained."""
         return self.architecture.spectrum * spectrum.count(self.train.format)
@@ -102,7 +97,7 @@ class Fit:
         graph.trunk_graph."""
         ranges, format = self.ranges if int8 else None, self.train.format
         return graph.trunk_graph(
-            format, self.scale, self.weights, self.architecture, ranges, prefixes, self.keep_means
+            format, self.scale, self.weights, self.architecture, ranges, prefixes
         )
 
     def in_float(self) -> Fit:

@@ -67,7 +67,6 @@ def trunk_graph(
     architecture: Architecture,
     ranges: Ranges | None = None,
     prefixes: bool = False,
-    keep_means: bool = False,
 ) -> onnx.ModelProto:
     """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 if there
     are `ranges`. The bands of the spectrum are the last features, in float.
@@ -81,11 +80,10 @@ def trunk_graph(
     parts = nodes.stages(weights) if architecture.channels else []
     parts += nodes.bank(weights) if architecture.pools else []
     parts += nodes.distribution(weights) if architecture.distribution else []
-    parts += nodes.means() if keep_means else []
     parts += nodes.loads() if architecture.loads else []
     parts += nodes.relations() if architecture.relations else []
     parts += nodes.spectrum() if architecture.spectrum else []
-    size = max(part.stop for part in layout(format, weights, architecture, keep_means).values())
+    size = max(part.stop for part in layout(format, weights, architecture).values())
     g = nodes.g
     features = graph_builder.side_by_side(g, parts)
     shape = [1, PREFIXES, size] if prefixes else [1, size]
@@ -98,10 +96,9 @@ def layout(
     format: SweepFormat,
     weights: Mapping[str, Array],
     architecture: Architecture,
-    keep_means: bool = False,
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
-    bank, `levels` of the distribution, `means`, `loads`, `relations`,
+    bank, `levels` of the distribution, `loads`, `relations`,
     `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
@@ -109,7 +106,6 @@ def layout(
         "magnitudes": filters,
         "shares": filters * (architecture.pools > 1),
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
-        "means": keep_means * format.channels,
         "loads": architecture.loads * loads.count(format),
         "relations": architecture.relations and architecture.relations * relations.each(format),
         "bands": architecture.spectrum * spectrum.count(format),
@@ -193,13 +189,6 @@ class _TrunkNodes:
             x = graph_builder.channels_first(g, taxels.rounded, 1.0, taxels.zero)
         levels, int8 = distribution.Levels.of(weights), self._own is not None
         return [distribution.pooled(g, self._format, levels, x, taxels.step, int8, self._prefixes)]
-
-    def means(self) -> list[str]:
-        """Scaled means of the taxels [1, 1 or PREFIXES, R * C]."""
-        g, window = self.g, self._format.window
-        counts = each_frame(window).known_steps(window, self._prefixes)
-        levels = self._levels(g("Cast", self.raw, to=FLOAT), counts)
-        return [g("Mul", levels, g.constant(self._scale))]
 
     def loads(self) -> list[str]:
         """See loads.nodes."""

@@ -49,7 +49,7 @@ from train.models.recipe.augment import (
 from train.models.recipe.bank import Bank
 from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
 from train.models.recipe.fitted import Fit, finished
-from train.models.recipe.sizes import UNLIMITED, Size
+from train.models.recipe.sizes import UNLIMITED, ModelSize
 from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
 
@@ -83,7 +83,7 @@ class Settings:
     augmentation: Augmentation | None = None
     choose: bool = True
     unfinished: Path | None = None
-    size: Size = UNLIMITED
+    size: ModelSize = UNLIMITED
     reattached: bool = False
     mains_hz: float = MAINS_HZ
     calibrate: bool = True
@@ -330,7 +330,6 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
         "recipe": {
             "augmentation": vars(setup.augmentation),
             "steps": settings.steps,
-            "keep_means": False,
             "reattached": settings.reattached,
             "mains_hz": settings.mains_hz,
         },

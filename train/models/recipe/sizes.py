@@ -12,7 +12,7 @@ from train.models.recipe import relations
 
 
 @dataclass(frozen=True)
-class Size:
+class ModelSize:
     """The views of a size; every size has the spectrum, and loads may join everywhere.
 
     about: its content in words. filters: most filters of each kind; scales: most scales of the
@@ -27,18 +27,20 @@ class Size:
 
 
 SIZES = {
-    "bands": Size("the spectrum", 0, 0, False, False),
-    "pairs": Size("the spectrum and relations of few scales", 0, relations.SHORT, False, False),
-    "64": Size(
+    "bands": ModelSize("the spectrum", 0, 0, False, False),
+    "pairs": ModelSize(
+        "the spectrum and relations of few scales", 0, relations.SHORT, False, False
+    ),
+    "64": ModelSize(
         "64 filters of each kind, the spectrum and relations of few scales",
         64,
         relations.SHORT,
         False,
         False,
     ),
-    "stages": Size("the spectrum and trained stages", 0, 0, False),
-    "256": Size("256 filters of each kind and all views in closed form", 256, stages=False),
+    "stages": ModelSize("the spectrum and trained stages", 0, 0, False),
+    "256": ModelSize("256 filters of each kind and all views in closed form", 256, stages=False),
 }
 """By name."""
-UNLIMITED = Size()
+UNLIMITED = ModelSize()
 """Without a size a model may contain everything."""

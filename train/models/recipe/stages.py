@@ -111,9 +111,7 @@ class Compact(Network):
 
     If the window is long, the first kernels sum to zero and do not respond to the mains. Only
     texture remains, and int8 can take the raw counts as they are. `scale` brings the texture to
-    about 1. The batch norms only serve training; `fused` folds them in. keep_means: show the mean
-    of each taxel to the head as well, for comparison; if materials were recorded one after another,
-    the means reveal the session rather than the material.
+    about 1. The batch norms only serve training; `fused` folds them in.
     """
 
     def __init__(
@@ -122,11 +120,10 @@ class Compact(Network):
         classes: int,
         scale: float,
         norm: bool = True,
-        keep_means: bool = False,
         architecture: Architecture = DEFAULT,
     ) -> None:
         super().__init__(format, scale)
-        self.keep_means, self.architecture = keep_means, architecture
+        self.architecture = architecture
         stages, inputs = (
             architecture.stages(format.window),
             (format.channels, *architecture.channels),
@@ -148,7 +145,7 @@ class Compact(Network):
             nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels
         )
         bands = architecture.spectrum * spectrum.count(format)
-        self.head = nn.Linear(sum(architecture.channels) + keep_means * inputs[0] + bands, classes)
+        self.head = nn.Linear(sum(architecture.channels) + bands, classes)
 
     def responses(self, prepared: Tensor) -> list[Tensor]:
         """[B, R * C, T] -> for each stage its responses [B, channels, steps], which are not
@@ -171,8 +168,6 @@ class Compact(Network):
         """Raw counts [B, T, R, C] -> the features that the head sees [B, F]."""
         prepared = self.prepare(counts)
         parts = [self.features(prepared)]
-        if self.keep_means:
-            parts.append(counts.flatten(2).float().mean(1) * self.scale)
         if self.architecture.spectrum:
             parts.append(
                 band_powers(limit_noise(prepared), self.format, self.architecture.mains_hz)
@@ -202,9 +197,7 @@ class Compact(Network):
         """The first `depth` stages of a fused network, with the spectrum or without; its head is
         not fitted yet."""
         architecture = self.architecture.cut(depth, spectrum)
-        less = Compact(
-            self.format, self.head.out_features, self.scale, False, self.keep_means, architecture
-        )
+        less = Compact(self.format, self.head.out_features, self.scale, False, architecture)
         less.convs.load_state_dict(self.convs[:depth].state_dict())
         return less.eval()
 
@@ -226,9 +219,7 @@ class Compact(Network):
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; of a fused network."""
         weights = self.weights()
-        trunk = trunk_graph(
-            self.format, self.scale, weights, self.architecture, keep_means=self.keep_means
-        )
+        trunk = trunk_graph(self.format, self.scale, weights, self.architecture)
         return with_head(trunk, weights["head.weight"], weights["head.bias"])
 
     @torch.no_grad()
@@ -253,7 +244,7 @@ def network_of(fit: Fit) -> Compact:
     """The network of a fit, ready to run; the fit has no filter bank."""
     with torch.random.fork_rng(devices=[]):  # its first weights are drawn and overwritten
         format, classes = fit.train.format, len(fit.train.materials)
-        model = Compact(format, classes, fit.scale, False, fit.keep_means, fit.architecture)
+        model = Compact(format, classes, fit.scale, False, fit.architecture)
     state = {k: torch.from_numpy(v) for k, v in fit.weights.items() if not k.startswith("int8.")}
     model.load_state_dict(state)
     return model.eval()
@@ -264,14 +255,13 @@ class FitRecipe(training.TrainingRecipe):
     """The training of the compact network.
 
     augmentation: of the training sweeps, None for `default_augmentation`; it replaces gain and
-    noise. keep_means: see Compact; the closed-form head sees the means, the convolutions never do.
+    noise.
     """
 
     steps: int = 600
     noise: float = 0.0
     gain: float = 0.0
     augmentation: Augmentation | None = None
-    keep_means: bool = False
 
     def json(self) -> dict[str, Any]:
         """The entry `recipe` of a fit and of the manifest of its bundle."""
@@ -313,7 +303,6 @@ def fit_network_on(
     recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
     with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
         model, cost = _learned(train, scale, seed, recipe, log, architecture, unfinished)
-        model.keep_means = recipe.keep_means
         model.architecture = replace(architecture, spectrum=bands > 0)
         ranges = model.ranges(train.samples)
         inputs = _head_inputs(model, ranges, train, held, copies(train, augmentation, seed, COPIES))
@@ -375,12 +364,7 @@ def _head_inputs(
     """The features of the training sweeps with their copies, and of the held-out sweeps: (float,
     int8)."""
     trunk = graph.trunk_graph(
-        model.format,
-        model.scale,
-        model.weights(),
-        model.architecture,
-        ranges,
-        keep_means=model.keep_means,
+        model.format, model.scale, model.weights(), model.architecture, ranges
     )
     trunks: tuple[Callable[[Dataset], Array], ...] = (
         partial(features, model),

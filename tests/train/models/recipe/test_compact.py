@@ -449,23 +449,3 @@ def test_training_augments_as_its_generator_says(frames: int):
     assert torch.equal(first, same)
     assert not torch.equal(first, second)
     assert torch.equal(x, before)
-
-
-def test_a_kept_mean_is_shown_in_both_forms(fitted: Fit):
-    """With keep_means the head sees the mean of each taxel beside the other features, in int8 too,
-    and for each prefix."""
-    s = easy(6)
-    made = stages.fit_network(s, 1, FitRecipe(steps=2, keep_means=True), architecture=SMALL)
-    level = s.samples.mean(axis=(1,)).reshape(len(s), -1) * made.scale
-    first = sum(made.architecture.channels)
-    for int8 in (False, True):
-        np.testing.assert_allclose(
-            graph_builder.run(made.trunk(int8), s.samples)[:, first : first + 4], level, rtol=1e-5
-        )
-        of_tenths = graph_builder.run(made.trunk(int8, prefixes=True), s.samples)
-        np.testing.assert_allclose(of_tenths[:, -1, first : first + 4], level, rtol=1e-5)
-        assert of_tenths.shape[2] == first + 4 + made.bands
-    assert (
-        graph_builder.run(fitted.trunk(), s.samples).shape[1]
-        == sum(fitted.architecture.channels) + fitted.bands
-    )

@@ -14,7 +14,7 @@ from train.data.sets import Dataset
 from train.models import methods
 from train.models.recipe import bank, recipe
 from train.models.recipe.choice import FeatureColumns
-from train.models.recipe.sizes import SIZES, UNLIMITED, Size
+from train.models.recipe.sizes import SIZES, UNLIMITED, ModelSize
 
 
 @cache
@@ -48,7 +48,7 @@ def test_filters_of_a_size_are_spread_evenly_over_each_kind():
         np.arange(46, 58).reshape(4, 3),
         np.arange(58, 60),
     )
-    few = columns.limited(Size(filters=4, scales=2, distribution=False))
+    few = columns.limited(ModelSize(filters=4, scales=2, distribution=False))
     assert few.magnitudes.tolist() == [0, 3, 7, 11, 12, 14, 16, 19]
     assert few.shares.tolist() == [20, 23, 27, 31, 32, 34, 36, 39]
     assert [kind.tolist() for kind in few.kinds] == [[0, 1, 2, 3], [4, 5, 6, 7]]
