@@ -304,8 +304,8 @@ class Candidates:
         """The relations beside the best candidate, and beside two discriminants of filters of all
         kinds, in which they have more weight.
 
-        Few scales and all scales each have a discriminant: which of them carries over depends on
-        what changes.
+        Few scales and all scales each have a discriminant: few carry over to a new speed, all to
+        a new force.
         """
         of, copies = self.columns, best[0].copies
         if not of.relations.size:

@@ -73,7 +73,7 @@ class Settings:
     steps: of the training of stages; 0 for no stages. augmentation: None for the default. choose:
     False to use one discriminant of all zero-sum filters. unfinished: a file that keeps the
     training of stages from time to time; from it an interrupted training goes on with the same
-    bits. size: what the model may contain at most. reattached: the skin will be taken off and put
+    bits. size: limits the content of the model. reattached: the skin will be taken off and put
     back after the recordings; all heads then see augmented copies. mains_hz: see Architecture.
     calibrate: whether the fit is finished with calibration and contacts, which a bundle needs and
     `evaluate` does not.

@@ -1,7 +1,7 @@
 """The sizes of the recipe, from the spectrum alone to everything.
 
-A size says what a model may contain at most. Held-out groups choose within it, as they do without
-a limit, so a model has less where less suffices.
+A size limits the content of a model. Held-out groups choose within it, as they do without a limit,
+so a model is smaller where a smaller one suffices.
 """
 
 from __future__ import annotations
