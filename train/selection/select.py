@@ -33,6 +33,7 @@ from train.export.measure import Measurement
 from train.metrics.score import confusion, row_shares
 from train.models import methods
 from train.models.methods import Effort, Method
+from train.models.recipe.sizes import SIZES
 from train.selection.nested_cv import Difference, Refused, Trials, Unseen
 from train.selection.scene import Budget, Scene
 
@@ -85,14 +86,14 @@ class BundleCost:
 
 
 def candidates(scene: Scene) -> list[str]:
-    """The methods of the scene. By default, the cheap classical methods of the paper, the compact
-    family and the default."""
+    """The methods of the scene. By default, the cheap classical methods of the paper, and the
+    recipe in all sizes."""
     if scene.methods:
         return list(scene.methods)
-    known = methods.every()
-    family = [name for name in known if name.startswith("compact-")] or ["compact"]
-    family += ["filter-bank", "default"]
-    return [name for name in ("L-gauss", "L-svm", "H-svm", *family) if name in known]
+    sizes = (f"palpate-{name}" for name in SIZES)
+    return [
+        name for name in ("L-gauss", "L-svm", "H-svm", *sizes, "default") if name in methods.every()
+    ]
 
 
 def bundle_costs(
