@@ -228,9 +228,14 @@ class FeedSource:
             state = self._view.state
             return state and replace(state, skin=line["skin"], sweeping=bool(line["sweeping"]))
         if kind == "health":
-            names = [name for name in BoxState.__slots__ if name not in ("time_s", "sweeping")]
-            values = {name: line[name] for name in names}
-            return BoxState(time_s=line["time_ns"] / 1e9, sweeping=bool(line["sweeping"]), **values)
+            own = ("time_s", "sweeping", "degraded")  # the last is missing in earlier versions
+            values = {name: line[name] for name in BoxState.__slots__ if name not in own}
+            return BoxState(
+                time_s=line["time_ns"] / 1e9,
+                sweeping=bool(line["sweeping"]),
+                degraded=line.get("degraded", ""),
+                **values,
+            )
         state = self._view.state
         return Answer(
             line["sweep"],

@@ -35,11 +35,13 @@ labels [M] of augmented copies."""
 @dataclass(frozen=True)
 class HeadPart:
     """One discriminant. columns: numbers of the features that it sees. copies: whether it sees
-    augmented copies of the sweeps too. factor: of its logits; temperatures are in it."""
+    augmented copies of the sweeps too. factor: of its logits; temperatures are in it. weight: the
+    size of its logits beside those of others."""
 
     columns: tuple[int, ...]
     copies: bool
     factor: float = 1.0
+    weight: float = 1.0
 
     def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
         """Weight [K, F] over all features, and bias [K]; see fit_discriminant."""

@@ -78,12 +78,11 @@ class HeldOutScores:
         self._logits: dict[tuple[Columns, bool], Array] = {}
 
     def score(self, parts: Sequence[HeadPart]) -> ScoredPlan:
-        """The candidate that adds the logits of `parts`, each scaled to the same size; their own
-        factors are ignored."""
+        """The candidate that adds the logits of `parts`, each scaled to the size of its weight;
+        their own factors are ignored."""
         logits = [self._of(part) for part in parts]
-        factors = [
-            1 / max(float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()), TINY) for x in logits
-        ]
+        sizes = [float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()) for x in logits]
+        factors = [part.weight / max(size, TINY) for part, size in zip(parts, sizes, strict=True)]
         total = np.sum([x * f for x, f in zip(logits, factors, strict=True)], axis=0)
         temperature = weighted_platt_temperature(total, self.labels, self.weights)
         plan = HeadPlan(

@@ -59,6 +59,8 @@ STAGES = ARCHITECTURES["50k"]
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
+STAGES_WEIGHT = 0.5
+"""Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on stages improve too little for their share of the
 bundle's size and time."""
@@ -420,11 +422,12 @@ def _beside_stages(plan: HeadPlan) -> list[HeadPart]:
 
     Stages and fixed features are so different that they err on different sweeps. Together they name
     sweeps of a new condition better than either alone, which held-out parts hardly show. Therefore
-    stages are added unless they are worse.
+    stages are added unless they are worse. They have less weight than others: where a force or a
+    direction is new, they are the weakest.
     """
     size = sum(STAGES.channels)
     fixed = [replace(p, columns=tuple(np.add(p.columns, size).tolist())) for p in plan.parts]
-    return [HeadPart(tuple(range(size)), True), *fixed]
+    return [HeadPart(tuple(range(size)), True, weight=STAGES_WEIGHT), *fixed]
 
 
 def _lean_columns(columns: FeatureColumns, plan: HeadPlan) -> Array:

@@ -335,6 +335,15 @@ def test_loads_join_where_held_out_groups_show_it():
     assert not {1, 2} & set(alone.plan.columns().tolist())
 
 
+def test_a_weight_is_the_size_of_logits_beside_others():
+    """Half the weight of a discriminant halves its logits in the sum, before the temperature."""
+    at = scores()
+    one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
+    even, less = (at.score([one, replace(other, weight=weight)]).plan for weight in (1.0, 0.5))
+    ratio = [plan.parts[1].factor / plan.parts[0].factor for plan in (even, less)]
+    assert ratio[1] == pytest.approx(ratio[0] / 2)
+
+
 def test_relations_join_where_held_out_groups_show_it():
     """Relations that name the material in all groups join, with a discriminant of few scales and
     one of all; those that mislead in another group stay away."""
