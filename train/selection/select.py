@@ -90,10 +90,8 @@ def candidates(scene: Scene) -> list[str]:
     recipe in all sizes."""
     if scene.methods:
         return list(scene.methods)
-    sizes = (f"palpate-{name}" for name in SIZES)
-    return [
-        name for name in ("L-gauss", "L-svm", "H-svm", *sizes, "default") if name in methods.every()
-    ]
+    known, sizes = methods.every(), (f"palpate-{name}" for name in SIZES)
+    return [name for name in ("L-gauss", "L-svm", "H-svm", *sizes, "default") if name in known]
 
 
 def bundle_costs(
