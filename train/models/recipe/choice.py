@@ -306,18 +306,18 @@ class Candidates:
         Few scales and all scales each have a discriminant: few carry over to a new speed, all to
         a new force.
         """
-        of, copies = self.columns, best[0].copies
+        of = self.columns
         if not of.relations.size:
             return {}
-        seen = [(of.magnitudes, of.shares, of.bands), (of.magnitudes, of.levels, of.bands)]
-        filters, views = (
-            tuple(HeadPart(tuple(np.concatenate(part).tolist()), copies) for part in parts)
-            for parts in (
-                seen[: 1 + len(of.levels)],
-                (of.relations[: relations.SHORT], of.relations),
-            )
-        )
-        views = tuple(dict.fromkeys(views))
+
+        def head(*views: Array) -> HeadPart:
+            numbers = np.concatenate([view.ravel() for view in views])
+            return HeadPart(tuple(numbers.tolist()), best[0].copies)
+
+        filters = [head(of.magnitudes, of.shares, of.bands)]
+        if len(of.levels):
+            filters.append(head(of.magnitudes, of.levels, of.bands))
+        views = dict.fromkeys((head(of.relations[: relations.SHORT]), head(of.relations)))
         return {
             "relations beside filters": (*filters, *views),
             "relations beside the best": (*best, *views),

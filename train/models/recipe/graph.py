@@ -98,8 +98,7 @@ def layout(
     architecture: Architecture,
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
-    bank, `levels` of the distribution, `loads`, `relations`,
-    `bands`."""
+    bank, `levels` of the distribution, `loads`, `relations`, `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
@@ -107,7 +106,7 @@ def layout(
         "shares": filters * (architecture.pools > 1),
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "loads": architecture.loads * loads.count(format),
-        "relations": architecture.relations and architecture.relations * relations.each(format),
+        "relations": architecture.relations * relations.each(format),
         "bands": architecture.spectrum * spectrum.count(format),
     }
     ends = np.cumsum(list(counts.values())).tolist()

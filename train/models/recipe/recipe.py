@@ -310,7 +310,7 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
         pools=(len(filters) > 0) + (len(shares) > 0),
         distribution=len(levels) > 0,
         loads=len(loads) > 0,
-        relations=len(related) and len(related) // relations.each(fixed.sweeps.format),
+        relations=len(related) // relations.each(fixed.sweeps.format),
         spectrum=len(bands) > 0,
     )
     weights = dict(stages.weights) if stages else {}
