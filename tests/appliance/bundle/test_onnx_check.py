@@ -307,7 +307,8 @@ def test_the_campaign_would_tell(
         np.ones(400 << 20, np.uint8)
 
     monkeypatch.setattr(hostile_fuzz, "run", run)
-    monkeypatch.setattr(hostile_fuzz, "DEADLINE_S", 0.5)
+    if how == "hangs":  # the others end by themselves, a busy machine in its own time
+        monkeypatch.setattr(hostile_fuzz, "DEADLINE_S", 0.5)
     fuzz = hostile_fuzz.Fuzz(owns, 1)
     monkeypatch.setattr(
         hostile_fuzz.Fuzz, "model", lambda self, number: (owns[0].model, owns[0], Random(1))
