@@ -47,7 +47,7 @@ def dot(
 DOTS = [
     dot("compact-1k", "int8", 0.02, 0.90, 0.91),
     dot("compact-1k", "float", 0.05, 0.91, 0.92),
-    dot("default", "int8", 0.04, 0.95, 0.93),
+    dot("palpate", "int8", 0.04, 0.95, 0.93),
     dot("H-svm", "float", 0.5, 0.93, 0.96, family="L and H"),
     dot("L-gauss", "float", 0.1, 0.6, 0.6, family="L and H"),
     dot("minirocket", "float", 50.0, 0.96, family="MiniRocket"),

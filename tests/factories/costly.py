@@ -17,7 +17,7 @@ COSTLY = {
     "recurrent",
     "multirocket-hydra",
     "quant",
-    "default",
+    "palpate",
     "palpate-64",
     "palpate-stages",
     "palpate-256",

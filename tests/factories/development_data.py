@@ -16,7 +16,7 @@ def entry(case: str, method: str, mean: float, each: int = 0) -> dict[str, Any]:
         "n": 100,
         "seeds": [1, 2],
     }
-    forms = {"float": ends | {"mean": round(mean + 0.01, 4)}} if method == "default" else {}
+    forms = {"float": ends | {"mean": round(mean + 0.01, 4)}} if method == "palpate" else {}
     return {
         "case": case,
         "method": method,
@@ -33,12 +33,12 @@ def figures(**changes: Any) -> dict[str, Any]:
     The third method cannot run the second case.
     """
     results = [
-        entry("one", "default", 0.9),
+        entry("one", "palpate", 0.9),
         entry("one", "quick <b>", 0.8),
         entry("one", "quant", 0.85),
-        entry("two", "default", 0.7),
+        entry("two", "palpate", 0.7),
         entry("two", "quant", 0.755),
-        entry("one", "default", 0.5, each=5),
+        entry("one", "palpate", 0.5, each=5),
         entry("one", "quant", 0.61, each=5),
     ]
     cases = [
@@ -57,7 +57,7 @@ def figures(**changes: Any) -> dict[str, Any]:
         }
         for name in ("one", "two")
     ]
-    names = ["default", "quick <b>", "quant"]
+    names = ["palpate", "quick <b>", "quant"]
     runs = [
         {
             "methods": names,
@@ -85,7 +85,7 @@ def figures(**changes: Any) -> dict[str, Any]:
                     "ms_p50": ms,
                     "ms_p99": 2 * ms,
                 }
-                for name, ms in (("default", 0.1), ("quant", 22.0), ("minirocket", 10.0))
+                for name, ms in (("palpate", 0.1), ("quant", 22.0), ("minirocket", 10.0))
             ],
         },
         "left_out": {"quick <b>, two": "a window of 8 frames is too short"},

@@ -12,9 +12,9 @@ SEVERITIES = {
     "gain-up": ("higher gain", "share", [0.0, 0.2, 0.5]),
 }
 METHODS = {
-    "default": {"dead": (98, 96, 80), "hum": (98, 90, 60), "gain-up": (98, 97, 97)},
+    "palpate": {"dead": (98, 96, 80), "hum": (98, 90, 60), "gain-up": (98, 97, 97)},
     "minirocket": {"dead": (96, 50, 30), "hum": (96, 96, 40), "gain-up": (96, 95, 95)},
-    "compact": {"dead": (97, 98, 90), "hum": (97, 85, 70), "gain-up": (97, 97, 97)},
+    "minirocket-augmented": {"dead": (97, 98, 90), "hum": (97, 85, 70), "gain-up": (97, 97, 97)},
     "H-svm": {"dead": (80, 80, 79), "hum": (80, 79, 79), "gain-up": (80, 79, 78)},
     "L-svm": {"dead": (80, 80, 79), "hum": (80, 70, 60), "gain-up": (80, 79, 78)},
     "L-knn": {"dead": (80, 80, 79), "hum": (80, 79, 79), "gain-up": (80, 79, 10)},

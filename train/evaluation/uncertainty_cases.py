@@ -117,13 +117,13 @@ class Case:
 def learn(task: CaseTask, sweeps: Dataset) -> Case:
     """Train, and compute the features of every sweep with the trained trunk.
 
-    Raises FormatError if the method is not one of the compact family, or cannot work with this set.
+    Raises FormatError if the method is not one of ours, or cannot work with this set.
     """
     (method,) = methods.find([task.method], task.effort)
     if not methods.module_of(task.method).startswith("train.models.recipe."):
         raise FormatError(
             f"method {task.method!r} gives no features of the tenths of a sweep; "
-            "use default, compact or one of its family"
+            "use palpate or one of its sizes"
         )
     kept = task.train[sweeps.labels[task.train] != task.left_out]
     part = sweeps.take(kept)

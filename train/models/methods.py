@@ -28,9 +28,9 @@ Log = Callable[[str], None]
 """Shows a line of progress."""
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11 of the paper and its Fig. 9."""
-SHIPPED = "default"
-"""The method of `fit`."""
-PACKAGED = "default-reattached"
+SHIPPED = "palpate"
+"""The method of `palpate-train fit`."""
+PACKAGED = "palpate-reattached"
 """The method of `fit --reattached`, which made the packaged bundle."""
 MODULES = (
     "train.models.peers.baselines",
@@ -42,10 +42,9 @@ MODULES = (
     "train.models.peers.ds_cnn",
     "train.models.peers.lite",
     "train.models.peers.edge_spectral",
-    "train.models.recipe.default",
+    "train.models.recipe.palpate",
     "train.models.peers.paper_cnn",
     "train.models.peers.recurrent",
-    "train.models.recipe.methods",
 )
 """Each defines METHODS, and methods(effort) if it trains networks."""
 

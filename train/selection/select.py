@@ -91,7 +91,7 @@ def candidates(scene: Scene) -> list[str]:
     if scene.methods:
         return list(scene.methods)
     known, sizes = methods.every(), (f"palpate-{name}" for name in SIZES)
-    return [name for name in ("L-gauss", "L-svm", "H-svm", *sizes, "default") if name in known]
+    return [name for name in ("L-gauss", "L-svm", "H-svm", *sizes, "palpate") if name in known]
 
 
 def bundle_costs(

@@ -26,7 +26,7 @@ from train.export import measure
 from train.metrics import score
 from train.models import methods
 from train.models.methods import Effort, Method
-from train.models.recipe.architectures import ARCHITECTURES
+from train.models.recipe.sizes import SIZES
 from train.studies import precisions, stress_targets
 from train.studies.method_names import family
 from train.studies.precisions import Packed
@@ -41,7 +41,7 @@ TRAIN, STRESS = "train", "stress"
 """Cases without a protocol: the sweeps that bundles and stressed methods are trained on, and those
 that are corrupted."""
 TRAINING = StudyCase(("sim:T-REAL/level-blind:1",))
-OURS = ("default", "filter-bank", "compact", *(f"compact-{size}" for size in ARCHITECTURES))
+OURS = ("palpate", *(f"palpate-{size}" for size in SIZES))
 PEERS = (
     "L-gauss",
     "L-knn",
@@ -86,7 +86,7 @@ QUICK = Study(
         TRAIN: StudyCase(("sim:T-REAL/level-blind:1001:3",), only=NEAR),
         STRESS: StudyCase(("sim:T-LAB/level-blind:1002:1",)),
     },
-    ("compact-1k", "compact", "L-gauss", "H-svm", "minirocket"),
+    ("palpate-bands", "palpate-pairs", "L-gauss", "H-svm", "minirocket"),
 )
 QUICK_EFFORT, QUICK_ROUNDS = Effort(share=0.02), 5
 

@@ -77,7 +77,7 @@ def html(
         picture=pages.picture(picture),
         quick=quick,
         shipped=chosen == SHIPPED,
-        chosen=method_names.plain_name(chosen, _weights(dots, chosen)),
+        chosen=method_names.plain_name(chosen),
         lines=_lines(dots, there, chosen),
         shown=comparison.shown,
         simulated=any("simulated" in axis.short for axis in there.values()),
@@ -127,10 +127,6 @@ def _methods(dots: Sequence[Dot], of: Sequence[int], network: int) -> set[str]:
     return {dot["method"] for dot, one in zip(dots, of, strict=True) if one == network}
 
 
-def _weights(dots: Sequence[Dot], method: str) -> int | None:
-    return next((dot.get("weights") for dot in dots if dot["method"] == method), None)
-
-
 def _lines(
     dots: Sequence[Dot], accuracies: Mapping[str, ChartAxis], chosen: str
 ) -> list[dict[str, Any]]:
@@ -173,13 +169,7 @@ def _who(dots: Sequence[Dot]) -> list[list[str]]:
 
 def _together(those: Sequence[Dot]) -> str:
     """The common name of models that differ in size alone."""
-    names = list(dict.fromkeys(map(label, those)))
-    sizes = sorted(dot["weights"] for dot in those if dot.get("weights"))
-    return (
-        f"{OURS}, {method_names.size(sizes[0])} to {method_names.size(sizes[-1])} weights"
-        if len(names) > 1 and sizes
-        else names[0]
-    )
+    return label(those[0])
 
 
 def _table(

@@ -17,11 +17,12 @@ from train.evaluation.evaluate import Plan
 from train.metrics import score
 from train.models import methods
 from train.models.methods import Effort
+from train.models.recipe.sizes import SIZES
 from train.studies.chart_experiment import FABRICS, SEVEN, joined
 from train.studies.study import NO_DATA, Study, StudyCase, StudyRun
 
 Json = dict[str, Any]
-OURS = ("default", "default-reattached", "filter-bank", "compact-50k")
+OURS = ("palpate", "palpate-reattached", *(f"palpate-{name}" for name in SIZES))
 """Our methods. The first of them with results is compared with the peers."""
 PEERS = (
     "minirocket",
@@ -72,7 +73,7 @@ QUICK = Study(
             ("sim:T-REAL/level-blind:1001:3",), "leave:position", ("position<=2",), curve=EACH
         ),
     },
-    ("compact-50k", "edge-spectral", "L-gauss"),
+    ("palpate-bands", "edge-spectral", "L-gauss"),
 )
 QUICK_EFFORT = Effort(share=0.02)
 

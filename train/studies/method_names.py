@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from train.models import methods
-from train.models.methods import SHIPPED
+from train.models.methods import PACKAGED, SHIPPED
+from train.models.recipe.sizes import SIZES
 
 OURS = "Palpate"
-TRAINED = "compact"
-"""Our trained networks. The name in commands contains a bound of the weights, so people see the
-number of weights."""
 NAMES = {
     SHIPPED: (
-        f"{OURS}, as shipped",
-        "what the box runs: filters, spectra and trained layers, as the training sweeps ask for; "
+        f"{OURS}, all views",
+        "filters, spectra, relations of taxels and trained layers, as the training sweeps ask for; "
         "int8",
     ),
-    "default-reattached": (
+    PACKAGED: (
         f"{OURS}, for a skin put back",
         "the packaged bundle’s recipe, `fit --reattached`: altered copies shown to every head, "
         "filters only where they are better; int8",
     ),
-    "filter-bank": (
-        f"{OURS}, filters alone",
-        "a part of what is shipped: random filters and a head in closed form, nothing trained",
-    ),
-    "compact-bands": (
-        f"{OURS}, spectrum alone",
-        "a part of what is shipped: the spectrum that all taxels share",
-    ),
+    **{
+        f"{SHIPPED}-{name}": (f"{OURS}, {name}", f"{size.about} at most; int8")
+        for name, size in SIZES.items()
+    },
     "minirocket": (
         "MiniRocket",
         "10,000 features of fixed small filters and ridge regression: the usual quick choice for "
@@ -76,8 +70,7 @@ NAMES = {
 
 
 FAMILIES = {
-    "train.models.recipe.default": OURS,
-    "train.models.recipe.methods": OURS,
+    "train.models.recipe.palpate": OURS,
     "train.models.peers.baselines": "L and H",
     "train.models.peers.paper_cnn": "deep networks",
     "train.models.peers.recurrent": "deep networks",
@@ -92,30 +85,14 @@ OTHERS = "related work"
 """The origin of a method, by its module."""
 
 
-def plain_name(method: str, weights: int | None = None) -> str:
-    """The name of a method for people. A trained network of ours has its number of `weights`, if
-    that is known."""
-    if method in NAMES:
-        return NAMES[method][0]
-    if method.partition("-")[0] == TRAINED:
-        return f"{OURS}, {size(weights)} weights" if weights else f"{OURS}, trained layers alone"
-    return method
+def plain_name(method: str) -> str:
+    """The name of a method for people."""
+    return NAMES[method][0] if method in NAMES else method
 
 
 def about(method: str) -> str:
     """A method in a line; "" if there is no description."""
-    if method in NAMES:
-        return NAMES[method][1]
-    return (
-        "trained layers and a spectrum, without the filters"
-        if method.partition("-")[0] == TRAINED
-        else ""
-    )
-
-
-def size(weights: int) -> str:
-    """A number of weights in words: 28638 is "29 k", 2248 is "2.2 k"."""
-    return f"{weights / 1000:.{0 if weights >= 9950 else 1}f} k"
+    return NAMES[method][1] if method in NAMES else ""
 
 
 def family(method: str) -> str:

@@ -36,7 +36,7 @@ Json = dict[str, Any]
 BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
-OWN = ("default-reattached", "default")
+OWN = ("palpate-reattached", "palpate")
 BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
 """Tables of the results by method; all but the last are of the case "lopo"."""
 CURVE_CASES = {"lopo": ("left", "new"), "hard": ("hard",)}
@@ -111,7 +111,7 @@ FULL_STEPS = (
     Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3), 90),
     Step(OWN[:1], ("lopo",), (1, 2, 3), 60),
     Step(OWN[:1], ("lopo" + BLIND,), (1,), 130),
-    Step(("minirocket", "filter-bank", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
+    Step(("minirocket", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
     Step(NETWORKS, (*HARD, *HARD_BLIND), (1,), 60),
     Step(("paper-cnn-centred",), ("hard", "hard" + BLIND), (1,), 250),
 )
@@ -130,7 +130,7 @@ QUICK = in_both_worlds(
 QUICK_STEPS = (
     Step(BASELINES, tuple(QUICK), (1, 2), 0.3),
     Step(
-        (*NEIGHBOURS, "minirocket", "filter-bank", "st-hmp", *OWN, *NETWORKS),
+        (*NEIGHBOURS, "minirocket", "st-hmp", *OWN, *NETWORKS),
         (*HARD, *HARD_BLIND),
         (1,),
         1,

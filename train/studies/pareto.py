@@ -17,8 +17,6 @@ from train.models.methods import SHIPPED
 from train.studies.method_names import OURS, plain_name
 
 Dot = Mapping[str, Any]
-ONCE_SHIPPED = "compact"
-"""The packaged method before methods.SHIPPED. It stands out in older charts."""
 
 
 @dataclass(frozen=True)
@@ -205,11 +203,8 @@ def _same(one: Dot, other: Dot) -> bool:
 
 
 def subject(dots: Sequence[Dot]) -> str:
-    """The method that stands out: the packaged method of today, or of the day of the measurement;
-    "" if neither is there."""
-    return next(
-        (name for name in (SHIPPED, ONCE_SHIPPED) if any(dot["method"] == name for dot in dots)), ""
-    )
+    """The method that stands out: ours with all views; "" if it is not there."""
+    return SHIPPED if any(dot["method"] == SHIPPED for dot in dots) else ""
 
 
 def name(dot: Dot) -> str:
@@ -222,5 +217,5 @@ def name(dot: Dot) -> str:
 def label(dot: Dot, short: bool = False) -> str:
     """A network's name for people. short: without "Palpate", for pictures in which colour marks
     ours."""
-    full = plain_name(str(dot["method"]), dot.get("weights"))
-    return full.removeprefix(f"{OURS}, ").removesuffix(" weights") if short else full
+    full = plain_name(str(dot["method"]))
+    return full.removeprefix(f"{OURS}, ") if short else full

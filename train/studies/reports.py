@@ -71,7 +71,7 @@ REPORTS = (
     _study(
         "certainty",
         "--method",
-        "default-reattached",
+        "palpate-reattached",
         "--set",
         "sim:T-REAL/level-blind:1-3",
         "--test",

@@ -12,16 +12,12 @@ from typing import Any
 from appliance.core.errors import FormatError
 from train.evaluation.robustness import POINTS, breaks_first
 from train.reports import html, provenance
-from train.reports.formatting import exact_percent, level, points
+from train.reports.formatting import exact_percent, level
 from train.studies import TEMPLATES, stress_plots
 from train.studies.method_names import about, plain_name
 from train.studies.stress_targets import TARGETS, at_targets
 
 Json = Mapping[str, Any]
-EARLIER = plain_name("compact")
-"""The recipe of `fit` before today's default. Ours may nowhere be more than NEAR below it."""
-NEAR = 0.01
-ROUNDING = 1e-9
 PACKAGED = "the packaged bundle, as the box answers"
 SHOWN = 3
 """Corruptions of each method in the table of the first losses."""
@@ -50,12 +46,9 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
         r=result,
         ours=ours,
         points=exact_percent(POINTS).removesuffix(" %"),
-        earlier=EARLIER,
-        near=NEAR,
         clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         headline=headline(curves[ours]),
-        targets=targets(curves, ours),
         first=[[name, *first(those)] for name, those in _with_box(curves, box).items()],
         most_wrong=most_wrong(box["wrongly"]) if box else None,
         lines=list(target_lines(curves, ours, box)),
@@ -115,32 +108,10 @@ def most_wrong(curves: Json) -> Json:
     }
 
 
-def targets(curves: Mapping[str, Json], ours: str) -> list[Json]:
-    """The target of ours: nowhere more than NEAR below EARLIER. Empty if EARLIER was not tested."""
-    if EARLIER not in curves or ours == EARLIER:
-        return []
-    differences = [
-        at[0] - earlier[0]
-        for at, earlier in zip(
-            at_targets(curves[ours]).values(), at_targets(curves[EARLIER]).values(), strict=True
-        )
-    ]
-    near = sum(difference >= -NEAR - ROUNDING for difference in differences)
-    return [
-        {
-            "what": f"lines of the table below in which {ours} is at most one point "
-            f"below {EARLIER}, the recipe before it",
-            "target": f"{len(differences)} of {len(differences)}",
-            "here": f"{near} of {len(differences)}",
-            "met": near == len(differences),
-        }
-    ]
-
-
 def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
     """A line for each of TARGETS.
 
-    cells: by method. difference: ours less EARLIER. box: right, wrong, network alone.
+    cells: by method. box: right, wrong, network alone.
     """
     found = {name: at_targets(those) for name, those in curves.items()}
     answered = (
@@ -156,16 +127,11 @@ def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]
             if name in curves[ours]
         ]
         what = " or ".join(dict.fromkeys(curve["title"] for curve, _ in those))
-        pair = [found[name][key][0] for name in (ours, EARLIER) if name in found]
         lines.append(
             {
                 "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
                 "cells": [found[name].get(key) for name in curves],
                 "box": [at[key] for at in answered.values()],
-                "difference": points(pair[0] - pair[1], sign=True)
-                if len(pair) == 2 and ours != EARLIER
-                else "–",
-                "missed": len(pair) == 2 and pair[0] - pair[1] < -NEAR - ROUNDING,
             }
         )
     return lines

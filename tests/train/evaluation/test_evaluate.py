@@ -223,7 +223,7 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         ("L-svm", {"numpy", "scikit-learn", "scipy", "onnx", "skl2onnx", "onnxruntime"}, {"aeon"}),
         ("minirocket", {"aeon", "numba", "scikit-learn", "onnxruntime"}, set()),
         ("paper-cnn", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon", "skl2onnx"}),
-        ("default", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon"}),
+        ("palpate", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon"}),
     ],
 )
 def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(

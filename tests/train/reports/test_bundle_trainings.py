@@ -55,7 +55,7 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
     for m in found["left_out"]["materials"].values():
         assert (m["known"], m["unknown"]) == (16, 8)
         assert 0 <= m["false_known"] <= 1
-    assert found["trained"]["method"] == "default"
+    assert found["trained"]["method"] == "palpate"
 
 
 def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
@@ -134,7 +134,7 @@ def figures(curve: list[dict]) -> dict:
         "machine": "m",
         "command": "palpate-train report",
         "curve": curve,
-        "trained": {"method": "default", "set": "t.npz", "sweeps": 60, "effort": 1.0},
+        "trained": {"method": "palpate", "set": "t.npz", "sweeps": 60, "effort": 1.0},
         "left_out": {
             "materials": {
                 "low": {

@@ -84,7 +84,7 @@ def test_the_header_is_collected_wherever_figures_say_it():
     figures = {
         "runs": [
             {
-                "methods": ["default"],
+                "methods": ["palpate"],
                 "seeds": [1, 2],
                 "commit": "a",
                 "shipped": "11111111",
@@ -121,7 +121,7 @@ def test_a_run_records_its_origin():
     assert known["shipped"] == score.shipped()
     assert re.fullmatch(r"[0-9a-f]{8}", known["shipped"])
     assert re.fullmatch(r"20\d\d-\d\d-\d\d", known["date"])
-    assert provenance.of({"method": "default"} | known).older == ""
+    assert provenance.of({"method": "palpate"} | known).older == ""
     assert "without the default" in provenance.of({"method": "minirocket"} | known).older
 
 

@@ -397,14 +397,14 @@ def test_the_picture_is_whole_and_names_do_not_collide():
     words = [node.text for node in texts]
     assert {
         "2.0 k",
-        "Palpate, as shipped",
+        "Palpate, all views",
         "MiniRocket",
         "Named rightly: a speed it never felt",
         "100 %",
         "guessing: 14.3 %",
     } <= set(words)
     assert {
-        "Palpate, as shipped: 95.0 % in 0.04 ms",
+        "Palpate, all views: 95.0 % in 0.04 ms",
         "best peer, MiniRocket: 96.0 % in 9 ms",
     } <= set(words)
     assert "var(--accent" in svg
@@ -466,7 +466,7 @@ def test_methods_have_names_for_people():
 
 def test_an_older_chart_says_so_first():
     """A chart from before the packaged recipe says so first, with a link to today's chart."""
-    old = [one | {"method": "compact"} if one["method"] == "default" else one for one in DOTS]
+    old = [one | {"method": "compact"} if one["method"] == "palpate" else one for one in DOTS]
     text = chart_page.html(old, "")
     said, note = re.search(
         r"</h1>\s*<p[^>]*>(.*?)</p>\s*<p class=\"note\">(.*?)</p>", text, re.S

@@ -127,7 +127,7 @@ def test_hovering_names_a_dot_and_its_figures(seen: BrowsedChart):
         "93.0 %",
         "91.0 – 95.0 %",
         "0.5 ms",
-        "behind Palpate, as shipped",
+        "behind Palpate, all views",
     ):
         assert text in seen.tip()
     seen.page.mouse.move(frame["x"] + 60, frame["y"] + 20)
@@ -300,7 +300,7 @@ def test_what_the_box_ships_stands_out(seen: BrowsedChart):
     )
     assert ringed == [2]
     names = seen.page.locator("#names text").all_text_contents()
-    assert "Palpate, as shipped" in names
+    assert "Palpate, all views" in names
     assert "2.0 k weights" in names
 
 

@@ -57,10 +57,10 @@ def test_the_page_shows_every_figure():
         "1 lines: real and published ahead, not certain +5.0 [−2.1, +12.1] 90.0 % 85.0 – 95.0 %",
         "2 lines: all, the simulated ones too within a point −0.2 [−5.3, +4.8] 80.0 % 76.5 – "
         "83.5 % 80.2 % 76.7 – 83.8 % QUANT",
-        "Palpate, as shipped 90.0 % 91.0 % 1.0 1",
+        "Palpate, all views 90.0 % 91.0 % 1.0 1",
         "quick <b>, two: a window of 8 frames",
         "time of a sweep, MiniRocket’s = 1 1/100 – 2.2",
-        "one: a force it never felt Palpate, as shipped 50.0 % 45.0 – 55.0 % 2 seeds – – 90.0 %",
+        "one: a force it never felt Palpate, all views 50.0 % 45.0 – 55.0 % 2 seeds – – 90.0 %",
         "one: a force it never felt one.npz, force<=180 leave:force digest of one",
         "one: a force it never felt : real sweeps, 4 classes: trained on sweeps of all forces "
         "but one",
@@ -103,7 +103,7 @@ def test_the_chart_has_an_axis_for_each_line_and_their_mean():
     assert {axis["chance"] for axis in data["accuracies"].values()} == {0.25}
     assert list(data["costs"]) == ["ms_p50", "ms_p99"]
     assert [(one["method"], one["ms_p50"], one["chosen"]) for one in data["dots"]] == [
-        ("default", 0.1, True),
+        ("palpate", 0.1, True),
         ("quant", 22.0, False),
     ]
     assert data["dots"][1]["accuracy"]["two"] == {
@@ -115,7 +115,7 @@ def test_the_chart_has_an_axis_for_each_line_and_their_mean():
     }
     assert "older than" not in pages["chart"]
     assert '<a href="development.json" download>' in pages["chart"]
-    assert "Palpate, as shipped: 90.0 % in 0.1 ms" in pictures["front"]
+    assert "Palpate, all views: 90.0 % in 0.1 ms" in pictures["front"]
     assert "best peer, QUANT: 85.0 % in 22 ms" in pictures["front"]
 
 
@@ -123,13 +123,13 @@ def test_the_mean_of_lines_counts_one_set_once():
     """Lines of one file err together, others independently: .05 for one file, .05 / sqrt 2 for
     two.
     """
-    table = development_report.by_case([entry(c, "default", 0.8) for c in ("one", "two")])
+    table = development_report.by_case([entry(c, "palpate", 0.8) for c in ("one", "two")])
     for files, away in ((("a", "a"), 0.05), (("a", "b"), 0.05 / 2**0.5)):
         cases = [
             {"case": name, "set": file} for name, file in zip(("one", "two"), files, strict=True)
         ]
-        ours = development_report.mean_row(table, cases, "default", ["default"], [])["entries"][
-            "default"
+        ours = development_report.mean_row(table, cases, "palpate", ["palpate"], [])["entries"][
+            "palpate"
         ]
         assert (ours["low"], ours["high"]) == pytest.approx((0.8 - away, 0.8 + away))
 
@@ -323,15 +323,15 @@ def test_a_run_is_joined_by_what_it_lacks_of_another():
     Reasons stay only for results that are still missing. The joined run says which part was run
     when.
     """
-    run = figures(methods=["default"], results=[entry("one", "default", 0.9)], left_out={})
+    run = figures(methods=["palpate"], results=[entry("one", "palpate", 0.9)], left_out={})
     del run["times"]
     others = [
-        entry("one", "default", 0.1),
+        entry("one", "palpate", 0.1),
         entry("one", "quant", 0.8),
         entry("two", "minirocket", 0.7),
     ]
     earlier = figures(
-        methods=["quant", "minirocket", "default"],
+        methods=["quant", "minirocket", "palpate"],
         results=others,
         left_out={
             "default, one": "was too slow",
@@ -341,16 +341,16 @@ def test_a_run_is_joined_by_what_it_lacks_of_another():
         },
     )
     made = development_experiment.join(run, [earlier])
-    assert made["methods"] == ["default", "minirocket", "quant"]
+    assert made["methods"] == ["palpate", "minirocket", "quant"]
     assert [(e["case"], e["method"], e["mean"]) for e in made["results"]] == [
-        ("one", "default", 0.9),
+        ("one", "palpate", 0.9),
         ("one", "quant", 0.8),
         ("two", "minirocket", 0.7),
     ]
     assert made["left_out"] == {"quant, two": "too short", "one, 5 each": "no"}
     assert made["runs"] == [*run["runs"], *earlier["runs"]]
     assert made["times"] == earlier["times"]
-    assert run["methods"] == ["default"]  # unchanged
+    assert run["methods"] == ["palpate"]  # unchanged
 
 
 def test_a_run_of_other_sweeps_is_not_joined():
@@ -375,32 +375,32 @@ def test_the_shipped_method_is_named_even_behind_the_front():
         [
             entry(c, m, a)
             for c in ("one", "two")
-            for m, a in (("default", 0.8), ("minirocket", 0.9), ("ds-cnn", 0.7))
+            for m, a in (("palpate", 0.8), ("minirocket", 0.9), ("ds-cnn", 0.7))
         ]
     )
     table["one"]["quant"] = entry("one", "quant", 0.99)
     times = [
         {"method": name, "precision": "float", "runtime": "onnx", "runs_on_box": True, "ms_p50": ms}
-        for name, ms in (("default", 0.5), ("minirocket", 0.05), ("ds-cnn", 0.01), ("quant", 9.0))
+        for name, ms in (("palpate", 0.5), ("minirocket", 0.05), ("ds-cnn", 0.01), ("quant", 9.0))
     ]
     cases = cases_named("one", "two")
     dots = development_chart.dots(times, table, cases, ["one", "two"])
     means = {dot["method"]: dot["accuracy"].get("development", {}).get("mean") for dot in dots}
-    assert means == {"default": 0.8, "minirocket": 0.9, "ds-cnn": pytest.approx(0.7), "quant": None}
+    assert means == {"palpate": 0.8, "minirocket": 0.9, "ds-cnn": pytest.approx(0.7), "quant": None}
     assert dots[0]["accuracy"]["development"]["low"] == pytest.approx(0.8 - 0.05 / 2**0.5)
     svg = scatter.chart(
         dots, ["development"], accuracies=development_chart.axes(cases, ["one", "two"])
     )
-    assert all(name in svg for name in ("Palpate, as shipped", "MiniRocket", "DS-CNN"))
+    assert all(name in svg for name in ("Palpate, all views", "MiniRocket", "DS-CNN"))
     assert "QUANT" not in svg
-    shipped = [part for part in svg.split("<text") if "Palpate, as shipped</text>" in part]
+    shipped = [part for part in svg.split("<text") if "Palpate, all views</text>" in part]
     assert len(shipped) == 1
     assert "--accent" in shipped[0]
 
 
 def test_the_int8_form_of_a_peer_has_a_dot_of_its_own():
     """The dot has its own time and accuracy. Without an accuracy it has none."""
-    table = development_report.by_case([entry("one", "default", 0.8)])
+    table = development_report.by_case([entry("one", "palpate", 0.8)])
     table["one"]["ds-cnn"] = entry("one", "ds-cnn", 0.7) | {
         "forms": {"int8": entry("one", "ds-cnn", 0.6)}
     }
@@ -423,14 +423,14 @@ def test_int8_is_held_against_its_own_float():
     Otherwise int8 has no target.
     """
     times = [
-        {"method": "default", "precision": name, "ms_p50": ms}
+        {"method": "palpate", "precision": name, "ms_p50": ms}
         for name, ms in (("int8", 0.6), ("float", 1.0))
     ]
-    (row,) = development_report._time_targets(times, "default")
+    (row,) = development_report._time_targets(times, "palpate")
     assert (row["here"], row["met"]) == ("0.60", False)
     times[0]["ms_p50"] = 0.5
-    assert next(development_report._time_targets(times, "default"))["met"]
-    assert not list(development_report._time_targets(times[:1], "default"))
+    assert next(development_report._time_targets(times, "palpate"))["met"]
+    assert not list(development_report._time_targets(times[:1], "palpate"))
 
 
 def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
@@ -441,14 +441,14 @@ def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
     results = [
         entry(c, m, a)
         for c in lines
-        for m, a in (("default", 0.8), ("quant", 0.9), ("minirocket", 0.7))
+        for m, a in (("palpate", 0.8), ("quant", 0.9), ("minirocket", 0.7))
     ]
     cases = [
         case | {"case": name, "simulated": False}
         for case in figures()["cases"][:1]
         for name in lines
     ]
-    names = ["default", "minirocket", "quant", "ds-cnn"]
+    names = ["palpate", "minirocket", "quant", "ds-cnn"]
     pages, _ = development_report.render(
         figures(
             cases=cases, results=[*results, entry("one", "ds-cnn", 0.95)], methods=names, times=None
@@ -473,10 +473,10 @@ def test_the_means_that_all_peers_share_stand_beside_the_larger_table():
 def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
     """The verdict stands with the interval."""
     (case,) = list(development_report.WANTED)[:1]
-    table = development_report.by_case([entry(case, "default", mean)])
+    table = development_report.by_case([entry(case, "palpate", mean)])
     cases = cases_named(case)
-    shared = development_report.mean_row(table, cases, "default", ["default"], [])
-    made = development_report.targets([], {case: cases[0]}, table, "default", shared, [])
+    shared = development_report.mean_row(table, cases, "palpate", ["palpate"], [])
+    made = development_report.targets([], {case: cases[0]}, table, "palpate", shared, [])
     rows = {row["what"]: row for row in made}
     assert rows["7 fabrics: a force it never felt"]["met"] == (word == "reached")
     assert rows["7 fabrics: a force it never felt"]["target"] == "≥ 90 %"
@@ -487,20 +487,20 @@ def test_what_was_wanted_of_a_case_is_reached_or_not(mean: float, word: str):
 def test_a_peer_that_lacks_a_line_has_no_mean_and_costs_none_a_line():
     """The mean is over the lines of the peers with the fewest missing lines."""
     table = development_report.by_case(
-        [entry(c, m, a) for c in ("one", "two") for m, a in (("default", 0.8), ("quant", 0.9))]
+        [entry(c, m, a) for c in ("one", "two") for m, a in (("palpate", 0.8), ("quant", 0.9))]
     )
     table["one"]["ds-cnn"] = entry("one", "ds-cnn", 0.99)
     found = development_report.mean_row(
         table,
         cases_named("one", "two"),
-        "default",
-        ["default", "quant", "ds-cnn"],
+        "palpate",
+        ["palpate", "quant", "ds-cnn"],
         ["quant", "ds-cnn"],
     )
     assert (found["shared"], found["line"]["best"]) == (["one", "two"], "QUANT")
     assert found["line"]["gap"][0] == pytest.approx(-0.1)
     assert {name: one["mean"] for name, one in found["entries"].items()} == pytest.approx(
-        {"default": 0.8, "quant": 0.9}
+        {"palpate": 0.8, "quant": 0.9}
     )
 
 
@@ -509,11 +509,11 @@ def test_times_are_told_in_those_of_minirocket():
     times = [
         {"method": "minirocket", "ms_p50": 12.0},
         {"method": "minirocket", "ms_p50": 10.0},
-        {"method": "default", "ms_p50": 0.1},
+        {"method": "palpate", "ms_p50": 0.1},
         {"method": "quant", "ms_p50": 22.0},
     ]
-    names = ["default", "quant", "ds-cnn"]
-    assert development_chart.relative_times(times, names) == {"default": "1/100", "quant": "2.2"}
+    names = ["palpate", "quant", "ds-cnn"]
+    assert development_chart.relative_times(times, names) == {"palpate": "1/100", "quant": "2.2"}
     assert development_chart.relative_times(times[2:], names) == {}
 
 

@@ -133,4 +133,4 @@ def test_a_picture_of_an_older_default_is_called_so():
             if re.search(provenance.FOUND[".svg"], picture.read_text(encoding="utf-8"), re.DOTALL):
                 assert provenance.read(picture).older in text, (document, name)
     assert document_figures.picture_note({"method": "H-svm"}).startswith("*Made without")
-    assert document_figures.picture_note({"method": "default", "shipped": score.shipped()}) == ""
+    assert document_figures.picture_note({"method": "palpate", "shipped": score.shipped()}) == ""

@@ -87,7 +87,7 @@ def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.Captur
     ]
     assert Counter(len(r["materials"]) for r in first) == {7: 6, 4: 6}
     assert all(r["only"] == list(FOUR) for r in first if r["protocol"] == "leave:direction")
-    assert run(data, method="default") == 0
+    assert run(data, method="palpate") == 0
     both = results(data)
     assert [r for r in both if r["method"] == "static-svm"] == first
     assert len(both) == 24

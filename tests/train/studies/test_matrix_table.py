@@ -40,13 +40,13 @@ def test_each_test_says_whether_ours_is_ahead():
     Each has the best peer by name, the difference with an interval, and a verdict in words.
     """
     results = [
-        result("default", "leave:force", 95, means_removed=False),
+        result("palpate", "leave:force", 95, means_removed=False),
         result("static-svm", "leave:force", 98, means_removed=False),
-        result("default", "leave:force", 90),
+        result("palpate", "leave:force", 90),
         result("minirocket", "leave:force", 80),
         result("H-svm", "leave:force", 60),
-        result("default", "leave:rep", 70, classes=7),
-        result("default", "leave:rep", 72, seed=2, classes=7),
+        result("palpate", "leave:rep", 70, classes=7),
+        result("palpate", "leave:rep", 72, seed=2, classes=7),
         result("minirocket", "leave:rep", 78, classes=7),
         result("H-svm", "leave:speed", 50),
     ]
@@ -57,7 +57,7 @@ def test_each_test_says_whether_ours_is_ahead():
     assert head == [
         "test",
         "means",
-        "Palpate, as shipped",
+        "Palpate, all views",
         "best of the others",
         "difference, points",
         "verdict",
@@ -93,7 +93,7 @@ def test_each_test_says_whether_ours_is_ahead():
 def test_ours_alone_has_no_verdict():
     """The line says that there is nothing to compare with."""
     assert (
-        matrix_table.headline([result("default", "leave:force", 90)])
+        matrix_table.headline([result("palpate", "leave:force", 90)])
         .splitlines()[-1]
         .endswith("| 90.0 % [88.0, 92.0] | – | – | no peer was run |")
     )
@@ -106,7 +106,7 @@ def test_the_command_writes_the_table_between_its_markers(
     unchanged.
     """
     (tmp_path / "r.json").write_text(
-        json.dumps([result("default", "leave:force", 90), result("H-svm", "leave:force", 60)])
+        json.dumps([result("palpate", "leave:force", 90), result("H-svm", "leave:force", 60)])
     )
     page, picture = tmp_path / "README.md", tmp_path / "w.svg"
     page.write_text("# Fabrics\n\n<!-- matrix -->\nold\n<!-- /matrix -->\n\nend\n")

@@ -62,7 +62,7 @@ def summary(quick: bool = False, cnn: bool = True) -> dict[str, Any]:
     outcomes = [
         outcome(p, m, w)
         for p in paper_experiment.FULL
-        for m in (*paper_experiment.BASELINES, "static-svm", "default-reattached")
+        for m in (*paper_experiment.BASELINES, "static-svm", "palpate-reattached")
         for w in (1, 2)
     ]
     outcomes += [outcome(p, "paper-cnn", right=0.9) for p in ("lopo", "hard") if cnn]
@@ -273,7 +273,7 @@ def test_both_worlds_stand_side_by_side(results, made):
     lines = paper_report.PaperReport(results).run()["ahead"]
     assert [len(line) for line in lines] == [3] * 4
     for line, part in zip(lines, paper_report.COLUMNS, strict=True):
-        gap = 100 * (shares[part, "default-reattached"] - shares[part, "H-svm"])
+        gap = 100 * (shares[part, "palpate-reattached"] - shares[part, "H-svm"])
         assert line[1].startswith(f"{gap:+.1f} [".replace("-", "−"))
         assert (line[2] == "–") == part.endswith("level-blind")
     text = " ".join(PageReader(made[0]).text.split())
@@ -435,18 +435,18 @@ def test_some_methods_are_run_again_and_the_others_stay():
     earlier, new = summary(), summary(cnn=False)
     for row in new["table"]:
         row["right"] = 1
-    new["table"] = [row for row in new["table"] if row["method"] == "default-reattached"]
-    new["results"] = [one for one in new["results"] if one["method"] == "default-reattached"]
+    new["table"] = [row for row in new["table"] if row["method"] == "palpate-reattached"]
+    new["results"] = [one for one in new["results"] if one["method"] == "palpate-reattached"]
     both = paper_experiment.joined(new, earlier)
     assert len(both["table"]) == len(earlier["table"])
-    assert {row["method"] for row in both["table"] if row["right"] == 1} == {"default-reattached"}
+    assert {row["method"] for row in both["table"] if row["right"] == 1} == {"palpate-reattached"}
     assert len(both["results"]) == len(earlier["results"])
     assert both["several"].keys() == earlier["several"].keys()
-    left = paper_experiment.planned(earlier, [Step(("default-reattached",), ("lopo",), (1,), 1)])
+    left = paper_experiment.planned(earlier, [Step(("palpate-reattached",), ("lopo",), (1,), 1)])
     assert (
         {row["method"] for row in left["table"]}
         == left["confusion"].keys()
-        == {"default-reattached", "paper-cnn"}
+        == {"palpate-reattached", "paper-cnn"}
     )
     with pytest.raises(FormatError, match="a quick run and a whole one cannot be joined"):
         paper_experiment.joined(new, earlier | {"quick": True})

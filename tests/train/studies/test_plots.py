@@ -180,7 +180,7 @@ def test_matrix_takes_the_mean_over_seeds_and_counts_what_it_is_told():
 def test_titles_of_panels_do_not_collide():
     """The title of each panel ends before the next begins, by a generous estimate of its width."""
     rules = dict.fromkeys(("vote", "product"), [ESTIMATE] * 3)
-    names = ["H-svm", *map(paper_values.short_name, (paper_values.CNN, "default-reattached"))]
+    names = ["H-svm", *map(paper_values.short_name, (paper_values.CNN, "palpate-reattached"))]
     at = places(plots.sweeps(dict.fromkeys(names, rules), {}, "sweeps"))
     ends = [(at[name][0], at[name][0] + 0.65 * plot_style.MEDIUM * len(name)) for name in names]
     assert all(end < begin for (_, end), (begin, _) in pairwise(ends))

@@ -16,7 +16,7 @@ from train.studies.reports import ResultFile
 from train.studies.study import save
 
 TODAY: dict[str, Any] = {
-    "method": "default",
+    "method": "palpate",
     "seed": 1,
     "set": "sim:T-REAL:1",
     "commit": "abc",

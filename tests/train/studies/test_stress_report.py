@@ -18,7 +18,7 @@ from train.reports import formatting, html
 from train.studies import stress_plots, stress_report
 from train.studies.method_names import plain_name
 
-OURS, EARLIER = plain_name("default"), plain_name("compact")
+OURS = plain_name("palpate")
 CURVES = {
     plain_name(name): entry["curves"]
     for name, entry in stress_data.figures()["methods"].items()
@@ -64,28 +64,13 @@ def test_a_severity_has_its_unit(unit: str, severity: float, shown: str):
     assert formatting.level({"unit": unit}, severity) == shown
 
 
-def test_nowhere_a_point_below_the_recipe_before():
-    """One of three lines is two points below the earlier recipe: it misses the target and is bold.
-
-    Without the earlier recipe the page has no target.
-    """
-    (line,) = stress_report.targets(CURVES, OURS)
-    assert (line["here"], line["target"], line["met"]) == ("2 of 3", "3 of 3", False)
-    lines = {line["what"]: line for line in stress_report.target_lines(CURVES, OURS, {})}
-    assert [line["missed"] for line in lines.values()] == [True, False, False]
-    assert lines["dead taxels, 1 taxel"]["difference"] == "−2.0"
-    assert lines["50 Hz hum, 1 deviation"]["difference"] == "+5.0"
-    assert stress_report.targets({OURS: CURVES[OURS]}, OURS) == []
-
-
 def test_five_methods_are_drawn():
     """The sixth method is only in the tables. A corruption that affects only that method has no
     picture.
     """
     shown = words(stress_plots.methods(CURVES))
-    assert set(map(plain_name, ("default", "minirocket", "compact", "H-svm", "L-svm"))) <= set(
-        shown
-    )
+    drawn = ("palpate", "minirocket", "minirocket-augmented", "H-svm", "L-svm")
+    assert set(map(plain_name, drawn)) <= set(shown)
     assert plain_name("L-knn") not in shown
     assert [text for text in shown if text in ("50 Hz hum", "dead taxels", "higher gain")] == [
         "50 Hz hum",
@@ -139,7 +124,6 @@ def test_the_page_holds_the_figures():
         "bundle six 3, 8933e0d5",
         "silent 6 answer no-contact",
         "Commit c0ffee, abacus, 2 cores",
-        f"more than a point below {EARLIER}",
     ):
         assert fact in reader.text, fact
 

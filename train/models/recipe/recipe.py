@@ -72,18 +72,17 @@ FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
 class Settings:
     """The settings of a fit.
 
-    steps: of the training of stages; 0 for no stages. augmentation: None for the default. choose:
-    False to use one discriminant of all zero-sum filters. unfinished: a file that keeps the
-    training of stages from time to time; from it an interrupted training goes on with the same
-    bits. size: limits the content of the model. reattached: the skin will be taken off and put
-    back after the recordings; all heads then see augmented copies. mains_hz: see Architecture.
-    calibrate: whether the fit is finished with calibration and contacts, which a bundle needs and
+    steps: of the training of stages; 0 for no stages. augmentation: None for the default.
+    unfinished: a file that keeps the training of stages from time to time; from it an interrupted
+    training goes on with the same bits. size: limits the content of the model. reattached: the skin
+    will be taken off and put back after the recordings; all heads then see augmented copies.
+    mains_hz: see Architecture. calibrate: whether the fit is finished with calibration and
+    contacts, which a bundle needs and
     `evaluate` does not.
     """
 
     steps: int = 600
     augmentation: Augmentation | None = None
-    choose: bool = True
     unfinished: Path | None = None
     size: ModelSize = UNLIMITED
     reattached: bool = False
@@ -244,17 +243,13 @@ def features(setup: Setup) -> FixedFeatures:
 
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
-    copies = setup.settings.choose and setup.settings.reattached
     groups = any(part.group != "recording" for part in setup.parts)
-    return Candidates(fixed.columns, copies, groups)
+    return Candidates(fixed.columns, setup.settings.reattached, groups)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
-    """Step 3: the best candidate by held-out groups, with as few filters as suffice. Without a
-    choice, one discriminant of all zero-sum filters."""
+    """Step 3: the best candidate by held-out groups, with as few filters as suffice."""
     scores = setup.scores(fixed.data, setup.parts)
-    if not setup.settings.choose:
-        return HeadChoice(scores, scores.score(heads.by_kind(shares=True)[:1]))
     chosen = choice.choose(scores, heads, setup.part(2))
     return HeadChoice(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
 
@@ -279,8 +274,6 @@ def with_stages(
     )
     beside = _beside_stages(plan)
     joined = full = scores.score(beside)
-    if not setup.settings.choose:
-        return stages, HeadChoice(scores, full)
     if setup.settings.reattached:
         log("choosing: stages and the spectrum alone")
         lean = scores.score(_stages_alone(_lean_columns(fixed.columns, plan)))

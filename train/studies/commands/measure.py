@@ -33,7 +33,7 @@ STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
 TAXEL_SWEEPS = 216
 """Sweeps of a file whose taxels are broken, as many as the simulated set has."""
-STRESSED_METHODS = "default-reattached,default,minirocket,minirocket-augmented,H-svm,compact"
+STRESSED_METHODS = "palpate-reattached,palpate,minirocket,minirocket-augmented,H-svm"
 """First the recipe of the packaged bundle."""
 
 
@@ -204,7 +204,7 @@ def _add_certainty(add: Add) -> None:
         "--method",
         default=methods.SHIPPED,
         metavar="NAME",
-        help=f"{methods.SHIPPED}, compact or one of its family ({methods.SHIPPED})",
+        help=f"{methods.SHIPPED} or one of its sizes ({methods.SHIPPED})",
     )
     command.add_argument(
         "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"

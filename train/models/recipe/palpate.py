@@ -1,4 +1,4 @@
-"""The methods of the default recipe: default, its sizes, default-reattached and filter-bank.
+"""The methods of our family: palpate, its sizes, and palpate-reattached.
 
 Each is the int8 graph that the box runs; its precision "float" is the model before quantization.
 """
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from train.data.sets import Dataset
 from train.models.linear_head import expanded_head
-from train.models.methods import FULL_EFFORT, PACKAGED, Effort, Log, Method, no_log
+from train.models.methods import FULL_EFFORT, PACKAGED, SHIPPED, Effort, Log, Method, no_log
 from train.models.recipe import recipe
 from train.models.recipe.fitted import CompactModel
 from train.models.recipe.sizes import SIZES
@@ -48,43 +48,30 @@ def train(
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
-    """`default` and its sizes, the same for a skin that is taken off and put back, and
-    `filter-bank`, which neither chooses nor trains."""
+    """`palpate`, its sizes, and the same for a skin that is taken off and put back."""
     settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
+
+    def method(name: str, about: str, settings: recipe.Settings) -> Method:
+        trains = f"{settings.steps} iterations of stages" if settings.size.stages else ""
+        return Method(name, about, "raw", partial(train, settings=settings), effort=trains)
+
     sizes = (
-        Method(
-            f"palpate-{name}",
-            f"as default, but with {size.about} at most",
-            "raw",
-            partial(train, settings=replace(settings, size=size)),
-            effort=f"{settings.steps} iterations of stages" if size.stages else "",
-        )
+        method(f"{SHIPPED}-{name}", f"{size.about} at most", replace(settings, size=size))
         for name, size in SIZES.items()
     )
     return (
         *sizes,
-        Method(
-            "default",
-            "the box's default: filters, spectrum and trained stages as held-out groups of the "
-            "training sweeps ask for",
-            "raw",
-            partial(train, settings=settings),
-            effort=f"{settings.steps} iterations of stages",
+        method(
+            SHIPPED,
+            "filters, spectrum, relations and trained stages, as held-out groups of the training "
+            "sweeps ask for",
+            settings,
         ),
-        Method(
+        method(
             PACKAGED,
-            "as default, but all see augmented copies, as of a skin put back, and filters join "
-            "stages only where that is better",
-            "raw",
-            partial(train, settings=replace(settings, reattached=True)),
-            effort=f"{settings.steps} iterations of stages",
-        ),
-        Method(
-            "filter-bank",
-            "random zero-sum filters, log mean magnitude and share above a quantile, shrinkage LDA "
-            "in closed form, int8",
-            "raw",
-            partial(train, settings=recipe.Settings(steps=0, choose=False)),
+            "as palpate, but all heads see augmented copies, as of a skin put back, and filters "
+            "join stages only where that is better",
+            replace(settings, reattached=True),
         ),
     )
 
