@@ -54,7 +54,7 @@ def _curve(kind: str, points: list[Json], kept: str, **more: Any) -> Json:
 
 
 def choice(**more: Any) -> Json:
-    """Four models with all curves. They reach the target."""
+    """Four sizes with all curves. They reach the target."""
     curves = [
         _curve(
             "window",
@@ -78,52 +78,38 @@ def choice(**more: Any) -> Json:
         ),
     ]
     made = {
-        "chosen": "compact-4k",
-        "best": "compact-10k",
+        "chosen": "pairs",
+        "best": "64",
         "accuracy": _accuracy(0.935),
-        "next": "compact-50k",
         "wanted": 0.9,
         "rungs": [
-            _model("compact-1k", 0.08, 0.812, 0.131),
-            _model("compact-4k", 0.12, 0.935, 0.008),
-            _model("compact-10k", 0.31, 0.943, 0.0),
-            _model("compact-50k", 0.9, None, 0.0, "over the budget"),
+            _model("bands", 0.08, 0.812, 0.131),
+            _model("pairs", 0.12, 0.935, 0.008),
+            _model("64", 0.31, 0.943, 0.0),
+            _model("all", 0.9, None, 0.0, "over the budget"),
         ],
-        "honest": _accuracy(0.928)
-        | {
-            "groups": {"place": _accuracy(0.928), "day": _accuracy(0.94)},
-            "chose": {"compact-4k": 4, "compact-10k": 1},
-        },
-        "smaller": {"method": "compact-1k"} | _difference(0.123),
-        "larger": {"method": "compact-10k"} | _difference(0.008),
-        "parts": [
-            {"group": "place", "values": list(range(10))},
-            {"group": "day", "values": [1, 2]},
-        ],
-        "conditions": [
-            {"name": "as recorded", "accuracy": 0.943},
-            {"name": "noise 0.3", "accuracy": 0.927},
-        ],
+        "honest": _accuracy(0.928) | {"chose": {"pairs": 4, "64": 1}},
+        "smaller": {"method": "bands"} | _difference(0.123),
+        "larger": {"method": "64"} | _difference(0.008),
+        "groups": ["place", "day"],
+        "held_out": 960,
         "confused": [{"is": "metal", "named": "plastic <smooth>", "share": 0.115}],
         "less": curves,
-        "left": _accuracy(0.93) | {"behind": _difference(0.005)},
         "bundle": {
+            "content": "relations at 3 scales, spectrum <i>",
             "kb": 12.0,
             "ms": 0.118,
             "mb": 57.0,
             "used": {"ms": 0.014, "kb": 0.024},
-            "name": "drawer",
         },
-        "scene": "drawer & co",
-        "command": "palpate-train choose --scene drawer.toml --out drawer",
+        "command": "palpate-train fit --scene drawer.toml --seed 1 --out drawer.npz",
         "set": "sim:T-REAL:1",
         "digest": "7f7b49c7",
         "sweeps": 480,
         "materials": ["metal", "plastic <smooth>", "foam"],
-        "varies": ["place", "day"],
         "budget": {"ms": 50, "kb": 500, "slower": 3},
-        "effort": 0.5,
-        "seeds": [1, 2],
+        "reattached": True,
+        "seeds": [1],
         "commit": "c0ffee",
         "machine": "abacus",
     }
@@ -131,21 +117,20 @@ def choice(**more: Any) -> Json:
 
 
 def missed() -> Json:
-    """A single model that misses the target, with no data held out and no budget."""
-    alone = [_model("compact-1k", 0.08, 0.512, 0.0)]
+    """A single size that misses the target, with no groups that vary and no budget."""
+    alone = [_model("bands", 0.08, 0.512, 0.0)]
     return choice(
-        chosen="compact-1k",
-        best="compact-1k",
-        next=None,
+        chosen="bands",
+        best="bands",
         wanted=0.99,
+        accuracy=_accuracy(0.51),
         rungs=alone,
         smaller=None,
         larger=None,
         less=[],
-        honest=_accuracy(0.51) | {"groups": {"place": _accuracy(0.51)}, "chose": {"compact-1k": 2}},
+        honest=None,
         confused=[],
-        bundle={"kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}, "name": "drawer"},
-        budget={"slower": 3},
-        varies=[],
-        conditions=[{"name": "as recorded", "accuracy": 0.512}],
+        bundle={"content": "spectrum", "kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}},
+        budget={"slower": 1},
+        groups=["recording"],
     )

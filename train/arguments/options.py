@@ -27,11 +27,13 @@ SET = (
 LOG_EVERY_S = 30
 
 
-def add_set(command: argparse.ArgumentParser, usual: str = "") -> None:
-    """Add --set, --only and --rename. usual: the default set; without it --set is required."""
+def add_set(command: argparse.ArgumentParser, usual: str = "", required: bool = True) -> None:
+    """Add --set, --only and --rename. usual: the default set; without it --set is required, unless
+    the command checks that itself (`required` is False)."""
     told = f"{SET} ({usual})" if usual else SET
+    required = required and not usual
     command.add_argument(
-        "--set", action="append", required=not usual, metavar="SET", dest="sets", help=told
+        "--set", action="append", required=required, metavar="SET", dest="sets", help=told
     )
     command.set_defaults(usual_set=usual)
     command.add_argument(

@@ -73,6 +73,7 @@ class Program:
                 parser = self.parser(words[0])
                 from train.metrics import score  # here: it imports onnxruntime
             args = parser.parse_args(words)
+            args.words = words
             score.provenance()  # read now: a later commit is not of the code that runs
             args.run(args)
             sys.stdout.flush()

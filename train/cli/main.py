@@ -21,7 +21,6 @@ PROGRAM = Program(
         },
         "models": {
             "fit": "choose a model and fit it to sweep sets",
-            "choose": "pick the smallest model that a scene needs, and pack its bundle",
             "evaluate": "train and test methods under a protocol; --list names the methods",
         },
         "bundles": {
@@ -39,8 +38,8 @@ PROGRAM = Program(
     {
         "sets": ("sets", "pull"),
         "importing": ("import",),
-        "bundles": ("fit", "export", "pack", "score", "bridge", "parity"),
-        "choose": ("choose",),
+        "fit": ("fit",),
+        "bundles": ("export", "pack", "score", "bridge", "parity"),
         "evaluation": ("evaluate",),
         "report": ("report",),
         "signing": ("sign",),

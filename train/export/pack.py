@@ -99,14 +99,16 @@ def pack(
     commit: str,
     full_scale: float | None = None,
     pitch_mm: float | None = None,
+    proven: bool = True,
 ) -> bundle.Manifest:
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is
     replaced.
 
     commit: of the code, for the manifest. full_scale: the sensor's highest raw count if that is not
     the maximum of its type. pitch_mm: distance between taxels; without it the box cannot say how
-    far a contact is from the trained positions. Raises ExportRefused if a check fails, and
-    BundleError if a label or the target cannot be used.
+    far a contact is from the trained positions. proven: measure how many broken taxels the box may
+    bridge, which takes most of the time; without it the box refuses them. Raises ExportRefused if a
+    check fails, and BundleError if a label or the target cannot be used.
     """
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
@@ -115,9 +117,9 @@ def pack(
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
             (folder / file).write_bytes(data)
         figures = judge(folder, content.held_out, logits, f"held-out {content.held_out_by}")
-        tolerance = _tolerance(content, manifest, bundle.load(folder))
-        figures |= content.figures | {bridging.FIGURES: tolerance.figures}
-        manifest = replace(manifest, figures=figures, bridging=tolerance.bridging)
+        manifest = replace(manifest, figures=figures | content.figures)
+        if proven:
+            manifest = _tolerant(content, manifest, bundle.load(folder))
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
@@ -154,18 +156,20 @@ def _manifest(
     )
 
 
-def _tolerance(
+def _tolerant(
     content: Content, manifest: bundle.Manifest, packed: bundle.Bundle
-) -> bridging.Tolerance:
-    """The broken taxels that the bundle tolerates, by heads that did not see the held-out
-    sweeps."""
+) -> bundle.Manifest:
+    """`manifest` with the broken taxels that the bundle tolerates, by heads that did not see the
+    held-out sweeps."""
     if content.unseen:
         files = _files(content.unseen)
         entries = {name: bundle.file_entry(data) for name, data in files.items()}
         text = replace(manifest, files=entries, early=None).json()
         packed = bundle.from_files(files | {bundle.MANIFEST: text}, manifest.name)
     seed = int(content.about.get("seed", 0))
-    return bridging.measure(packed, content.train, content.held_out, seed)
+    found = bridging.measure(packed, content.train, content.held_out, seed)
+    figures = manifest.figures | {bridging.FIGURES: found.figures}
+    return replace(manifest, figures=figures, bridging=found.bridging)
 
 
 def _files(content: Content) -> dict[str, bytes]:

@@ -57,6 +57,7 @@ def export(
     commit: str,
     full_scale: float | None = None,
     pitch_mm: float | None = None,
+    proven: bool = True,
 ) -> bundle.Manifest:
     """Quantize `fit`, compare its precisions, and pack it; see pack.pack.
 
@@ -78,7 +79,14 @@ def export(
         content = replace(content, model=reference, about=about | {"float_because": str(e)})
         fit = finished(fit.in_float())
     return pack(
-        _calibrated(content, fit, pitch_mm), target, name, version, commit, full_scale, pitch_mm
+        _calibrated(content, fit, pitch_mm),
+        target,
+        name,
+        version,
+        commit,
+        full_scale,
+        pitch_mm,
+        proven,
     )
 
 

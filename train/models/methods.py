@@ -50,19 +50,44 @@ MODULES = (
 
 
 @dataclass(frozen=True)
+class SkinUse:
+    """The use of the skin, as the user of `palpate-train fit` states it; our family trains for it.
+
+    reattached: the skin will be taken off and put back after the recordings; all heads then see
+    augmented copies. mains_hz: frequency of the mains, to whose hum features do not respond.
+    displaced, stretch: of recipe.augment.Augmentation; None for its default.
+    """
+
+    reattached: bool = False
+    mains_hz: float = 50.0
+    displaced: float | None = None
+    stretch: float | None = None
+
+    @property
+    def augmentation(self) -> dict[str, float]:
+        """The values that replace those of the default Augmentation, by name."""
+        stated = {"displaced": self.displaced, "stretch": self.stretch}
+        return {name: value for name, value in stated.items() if value is not None}
+
+
+AS_RECORDED = SkinUse()
+
+
+@dataclass(frozen=True)
 class Effort:
-    """The length of trainings.
+    """The length of trainings, and the use for which our family is trained.
 
     share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
     paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in bfloat16
     if the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
-    time, so that it goes on after an interruption.
+    time, so that it goes on after an interruption. use: of the skin.
     """
 
     share: float = 1.0
     paper_steps: int | None = None
     bfloat16: bool = False
     unfinished: Path | None = None
+    use: SkinUse = AS_RECORDED
 
 
 FULL_EFFORT = Effort()

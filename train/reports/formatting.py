@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import ceil
 from typing import Any
 
@@ -27,6 +27,25 @@ def estimate(shares: Sequence[float], places: int = 1) -> str:
     """A share with the ends of its interval: (0.864, 0.81, 0.903) is "86.4 % [81.0, 90.3]"."""
     mean, low, high = shares
     return f"{percent(mean, places)} [{100 * low:.{places}f}, {100 * high:.{places}f}]"
+
+
+def counted(figure: Mapping[str, float]) -> str:
+    """An accuracy with its interval and number of sweeps: "86.4 % [81.0, 90.3] of 250"."""
+    ends = [figure[name] for name in ("accuracy", "low", "high")]
+    return f"{estimate(ends)} of {figure['n']}"
+
+
+def figure_lines(figures: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """A line for each accuracy of a bundle: the answers of the box with all other outcomes, and the
+    network alone."""
+    for protocol, figure in figures.items():
+        if "wrong" in figure:
+            others = ", ".join(
+                f"{figure[name]} {name}" for name in ("wrong", "unsure", "unknown", "refused")
+            )
+            yield f"{protocol}, as the box answers: {counted(figure)}; {others}"
+        elif "accuracy" in figure:
+            yield f"{protocol}: {counted(figure)}"
 
 
 def points(difference: float, sign: bool = False) -> str:

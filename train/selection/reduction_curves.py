@@ -1,13 +1,14 @@
-"""Curves of accuracy over reduced sweeps of a scene, one for each kind of reduction.
+"""Curves of accuracy over reduced sweeps, one for each kind of reduction.
 
-For each curve, the chosen method is trained again on reduced sweeps, with the same parts, and
-compared with the whole sweeps, paired by sweep. A reduction is accepted if it and every weaker one
-lose at most one standard error; the strongest accepted reduction is kept.
+For each curve, the chosen size is fitted again to reduced sweeps and judged on the same held-out
+sweeps, paired by sweep. A reduction is accepted if it and every weaker one lose at most one
+standard error; the strongest accepted reduction is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,17 +16,21 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.data import transforms
+from train.data.sets import Dataset
 from train.data.transforms import WHOLE, Change
 from train.metrics.score import confusion
-from train.selection.nested_cv import Trials
-from train.selection.scene import Scene
-from train.selection.select import Selection
+from train.models.methods import Log
+from train.selection.dial import Judgement, Selection, difference, estimate, judge
 
 Array = NDArray[Any]
 Json = dict[str, Any]
-Step = tuple[str, float, list[Change], Change]
-"""One point of a curve: its name, the share that is left, the change for each part, and the change
-for all sweeps."""
+Step = tuple[str, float, Change]
+"""One point of a curve: its name, the share that is left, and the change."""
+REDUCTIONS = ("window", "rate", "taxels", "bits", "classes")
+"""Properties of the sweeps that can be reduced."""
+APPLIED = ("window",)
+"""The reductions with which the model is fitted. Another rate, fewer taxels or bits need another
+setting of the sensor, and only the user knows whether two materials may share a label."""
 WINDOWS, RATES, BITS = (0.75, 0.5, 0.25), (2, 4, 8), (1, 2, 3, 4)
 POINTS_BEYOND = 2
 """A curve ends at the second point that loses too much: two points show where accuracy falls."""
@@ -47,142 +52,113 @@ HOW_TO_SET = {
 }
 
 
-def most(trials: Trials, kinds: Collection[str]) -> int:
-    """The largest number of trainings for the curves of these kinds and for their joint
-    application."""
-    taxels = trials.sweeps.format.rows * trials.sweeps.format.cols
-    points = {
-        "window": len(WINDOWS),
-        "rate": len(RATES),
-        "bits": len(BITS),
-        "taxels": (taxels - 1).bit_length(),
-    }
-    return (
-        sum(1 + points[kind] for kind in kinds if kind in points)
-        * len(trials.parts)
-        * len(trials.seeds)
-    )
+@dataclass(frozen=True)
+class ReducedFits:
+    """Fits the chosen size to reduced sweeps. whole: the judgement of the whole sweeps."""
+
+    whole: Judgement
+    chosen: str
+    wanted: float
+    log: Log
+
+    def right(self, change: Change) -> Array:
+        """bool [n], the held-out sweeps that are named rightly with `change`. Raises FormatError if
+        the reduced sweeps are too short."""
+        self.log(f"with less: {change}")
+        whole, name = self.whole, self.chosen
+        sweeps, settings = change.of(whole.setup.sweeps), whole.reduced(name)
+        found = judge(sweeps, whole.setup.seed, settings, [name], self.log, whole.staged)
+        return found.right(name)
+
+    def fine(self, full: Array, less: Array) -> bool:
+        """Whether the reduced sweeps suffice: they lose little, and they reach the wanted accuracy
+        if the whole sweeps do."""
+        falls_short = less.mean() < self.wanted <= full.mean()
+        return difference(full, less, self.whole.clusters).within and not bool(falls_short)
+
+    def point(self, full: Array, less: Array, step: Step) -> Json:
+        """A point of a curve for scripts."""
+        clusters = self.whole.clusters
+        return {
+            "name": step[0],
+            "share": round(step[1], 4),
+            "accuracy": estimate(less, clusters),
+            "behind": difference(full, less, clusters).json(),
+            "fine": self.fine(full, less),
+        }
 
 
-def curves(choice: Selection, scene: Scene) -> tuple[list[Json], Change, Json]:
-    """The curves of scene.reduce, the reductions of scene.apply as one Change, and the accuracy
-    with that change."""
+def curves(choice: Selection, kinds: Collection[str], log: Log) -> tuple[list[Json], Change]:
+    """The curves of these kinds, and the reductions of APPLIED among them as one Change."""
+    fits = ReducedFits(choice.judgement, choice.chosen, choice.wanted.accuracy, log)
     found: list[Json] = []
-    strongest: dict[str, Step] = {}
-    for at, kind in enumerate(scene.reduce):
-        choice.trials.progress.left(most(choice.trials, scene.reduce[at:]))
+    applied = WHOLE
+    for kind in kinds:
         if kind == "classes":
-            found.append(classes(choice, scene.accuracy))
+            found.append(classes(fits))
             continue
-        curve, strongest[kind] = _curve(choice, scene, kind)
-        found.append(curve)
-    applied, accuracy = _together(
-        choice, scene, {kind: strongest[kind] for kind in scene.apply if kind in strongest}
-    )
-    for curve in found:
-        curve["applied"] = getattr(applied, curve["kind"], None) != getattr(
-            WHOLE, curve["kind"], None
-        )
-    return found, applied, accuracy
+        curve, change = _curve(fits, kind)
+        if kind in APPLIED:
+            applied = applied.and_then(change)
+        found.append(curve | {"applied": kind in APPLIED and change != WHOLE})
+    return found, applied
 
 
-def _curve(choice: Selection, scene: Scene, kind: str) -> tuple[Json, Step]:
-    trials, method = choice.trials, choice.final.chosen
-    full = choice.final.scores[method]
-    whole: Step = ("all", 1.0, [WHOLE] * len(trials.parts), WHOLE)
-    points, kept, beyond = [_point(trials, full, full, whole, True)], whole, 0
-    for step in STEPS[kind](trials):
+def _curve(fits: ReducedFits, kind: str) -> tuple[Json, Change]:
+    full = fits.whole.right(fits.chosen)
+    whole: Step = ("all", 1.0, WHOLE)
+    points, kept, beyond = [fits.point(full, full, whole)], whole, 0
+    for step in STEPS[kind](fits.whole.setup.sweeps):
         try:
-            scores = _scores(trials, method, step)
+            less = fits.right(step[2])
         except FormatError as e:
             points.append({"name": step[0], "share": step[1], "refused": str(e)})
             break
-        fine = _fine(trials, scene, full, scores)
-        points.append(_point(trials, full, scores, step, fine))
-        beyond += not fine
+        points.append(fits.point(full, less, step))
+        beyond += not points[-1]["fine"]
         if beyond == POINTS_BEYOND:
             break
         if not beyond:
             kept = step
-    change = kept[3]
+    change = kept[2]
     how_to_set = HOW_TO_SET[kind].format(change.rate) if change != WHOLE else ""
-    taxels = {"taxels": [list(divmod(t, trials.sweeps.format.cols)) for t in sorted(change.taxels)]}
+    cols = fits.whole.setup.sweeps.format.cols
+    taxels = {"taxels": [list(divmod(t, cols)) for t in sorted(change.taxels)]}
     return {"kind": kind, "points": points, "kept": kept[0], "set": how_to_set} | (
         taxels if change.taxels else {}
-    ), kept
+    ), change
 
 
-def _scores(trials: Trials, method: str, step: Step) -> Array:
-    trials.run(method, [(p,) for p in range(len(trials.parts))], step[2])
-    return trials.scores(method, None, step[2])
-
-
-def _fine(trials: Trials, scene: Scene, full: Array, scores: Array) -> bool:
-    """Whether the reduced sweeps suffice: they lose little, and they reach the wanted accuracy if
-    the whole sweeps do."""
-    falls_short = trials.mean(scores) < scene.accuracy <= trials.mean(full)
-    return trials.difference(full, scores).within and not falls_short
-
-
-def _point(trials: Trials, full: Array, scores: Array, step: Step, fine: bool) -> Json:
-    behind = trials.difference(full, scores).json()
-    return {
-        "name": step[0],
-        "share": round(step[1], 4),
-        "accuracy": trials.accuracy(scores),
-        "behind": behind,
-        "fine": fine,
-    }
-
-
-def _windows(trials: Trials) -> Iterator[Step]:
+def _windows(sweeps: Dataset) -> Iterator[Step]:
     for share in WINDOWS:
-        seconds = share * trials.sweeps.format.window / trials.sweeps.rate_hz
-        yield (
-            f"{seconds:.3g} s",
-            share,
-            [Change(window=share)] * len(trials.parts),
-            Change(window=share),
-        )
+        seconds = share * sweeps.format.window / sweeps.rate_hz
+        yield f"{seconds:.3g} s", share, Change(window=share)
 
 
-def _rates(trials: Trials) -> Iterator[Step]:
+def _rates(sweeps: Dataset) -> Iterator[Step]:
     for rate in RATES:
-        yield (
-            f"{trials.sweeps.rate_hz / rate:.4g} Hz",
-            1 / rate,
-            [Change(rate=rate)] * len(trials.parts),
-            Change(rate=rate),
-        )
+        yield f"{sweeps.rate_hz / rate:.4g} Hz", 1 / rate, Change(rate=rate)
 
 
-def _bits(trials: Trials) -> Iterator[Step]:
-    kind = trials.sweeps.samples.dtype
+def _bits(sweeps: Dataset) -> Iterator[Step]:
+    kind = sweeps.samples.dtype
     all_bits = 8 if kind.kind == "f" else 8 * kind.itemsize
     for bits in BITS:
-        yield (
-            f"{all_bits - bits} bits",
-            1 - bits / all_bits,
-            [Change(bits=bits)] * len(trials.parts),
-            Change(bits=bits),
-        )
+        yield f"{all_bits - bits} bits", 1 - bits / all_bits, Change(bits=bits)
 
 
-def _taxels(trials: Trials) -> Iterator[Step]:
-    """Numbers of taxels that are powers of two. The taxels are selected again without each part,
-    since their selection is part of the test."""
-    format = trials.sweeps.format
-    count = format.rows * format.cols
-    orders = [transforms.rank_taxels(trials.sweeps.take(~part.out)) for part in trials.parts]
-    overall = transforms.rank_taxels(trials.sweeps)
+def _taxels(sweeps: Dataset) -> Iterator[Step]:
+    """Numbers of taxels that are powers of two. All sweeps select the taxels, so this curve is
+    slightly too high."""
+    count = sweeps.format.rows * sweeps.format.cols
+    order = transforms.rank_taxels(sweeps)
     n = 2 ** ((count - 1).bit_length() - 1) if count > 1 else 0
     while n:
-        change = [Change(taxels=tuple(sorted(order[:n]))) for order in orders]
-        yield f"{n} taxels", n / count, change, Change(taxels=tuple(sorted(overall[:n])))
+        yield f"{n} taxels", n / count, Change(taxels=tuple(sorted(order[:n])))
         n //= 2
 
 
-STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
+STEPS: dict[str, Callable[[Dataset], Iterator[Step]]] = {
     "window": _windows,
     "rate": _rates,
     "taxels": _taxels,
@@ -190,81 +166,50 @@ STEPS: dict[str, Callable[[Trials], Iterator[Step]]] = {
 }
 
 
-def _together(choice: Selection, scene: Scene, least: dict[str, Step]) -> tuple[Change, Json]:
-    """The reductions of `least`, applied one after another; each is kept only if all kept ones
-    together still suffice."""
-    trials, method = choice.trials, choice.final.chosen
-    full = reduced = choice.final.scores[method]
-    changes, total = [WHOLE] * len(trials.parts), WHOLE
-    for name, share, each, change in least.values():
-        if change == WHOLE:
-            continue
-        both = [a.and_then(b) for a, b in zip(changes, each, strict=True)]
-        try:
-            scores = _scores(trials, method, (name, share, both, total.and_then(change)))
-        except FormatError:
-            continue
-        if _fine(trials, scene, full, scores):
-            changes, total, reduced = both, total.and_then(change), scores
-    return total, trials.accuracy(reduced) | {"behind": trials.difference(full, reduced).json()}
-
-
-def classes(choice: Selection, wanted: float) -> Json:
+def classes(fits: ReducedFits) -> Json:
     """The accuracy gained by merging materials, the most confused pair first, counted without
-    another training.
+    another fit.
 
     Pairs are proposed that are CONFUSED, and as many as are needed for the wanted accuracy. Nothing
     is applied: only the user knows whether two materials may share a label.
     """
-    trials = choice.trials
-    group, _, sweep, probability = trials.tested(choice.final.chosen)
-    label = trials.sweeps.labels[sweep]
-    names: list[tuple[str, ...]] = [(name,) for name in trials.sweeps.materials]
+    names: list[tuple[str, ...]] = [(name,) for name in fits.whole.setup.sweeps.materials]
+    label, named, total = fits.whole.labels, fits.whole.sizes[fits.chosen].named, len(names)
     points: list[Json] = []
     proposed, merged, proposing = list(names), "", True
     while True:
-        rows = _rows(trials, group, sweep, probability.argmax(1) == label)
-        accuracy, share = trials.accuracy(rows), len(names) / len(trials.sweeps.materials)
+        accuracy = estimate(named == label, fits.whole.clusters)
         points.append(
             {
                 "name": f"{len(names)}",
-                "share": round(share, 4),
+                "share": round(len(names) / total, 4),
                 "accuracy": accuracy,
                 "merged": merged,
             }
         )
         if len(names) == 2:
             break
-        confused = _confused(label, probability)
-        a, b = np.unravel_index(confused.argmax(), confused.shape)
+        confused = _confused(label, named, len(names))
+        a, b = (int(i) for i in np.unravel_index(confused.argmax(), confused.shape))
         names[a], merged = names[a] + names[b], " + ".join(names[a] + names[b])
         names.pop(b)
-        if proposing := proposing and (confused[a, b] >= CONFUSED or accuracy["mean"] < wanted):
+        wanting = accuracy["mean"] < fits.wanted
+        if proposing := proposing and (confused[a, b] >= CONFUSED or wanting):
             proposed = list(names)
-        probability[:, a] += probability[:, b]
-        probability = np.delete(probability, b, axis=1)
-        label = np.where(label == b, a, label - (label > b))
-    together = [list(merge) for merge in proposed if len(merge) > 1]
+        label, named = (np.where(x == b, a, x - (x > b)) for x in (label, named))
     return {
         "kind": "classes",
         "points": points,
         "kept": points[0]["name"],
-        "proposed": together,
+        "proposed": [list(merge) for merge in proposed if len(merge) > 1],
         "set": "",
+        "applied": False,
     }
 
 
-def _confused(label: Array, probability: Array) -> Array:
+def _confused(label: Array, named: Array, count: int) -> Array:
     """[K, K], above the diagonal: for two materials, the share of their sweeps that are taken for
     the other."""
-    counts = confusion(label, probability)
+    counts = confusion(label, np.eye(count)[named])
     size = counts.sum(1)
     return np.triu((counts + counts.T) / np.maximum(size[:, None] + size, 1), 1)
-
-
-def _rows(trials: Trials, group: Array, sweep: Array, right: Array) -> Array:
-    """`right` of all tests as scores [groups, N]."""
-    total, count = np.zeros((2, len(trials.groups), len(trials.sweeps)))
-    np.add.at(total, (group, sweep), right)
-    np.add.at(count, (group, sweep), 1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

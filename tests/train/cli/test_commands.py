@@ -140,8 +140,8 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
     ("args", "message"),
     [
         (
-            ["choose", "--scene", "none.toml", "--out", "/proc/none/b"],
-            "cannot be written to /proc/none/b",
+            ["fit", "--set", "none", "--seed", "1", "--out", "/proc/none/b.npz"],
+            "--out /proc/none/b.npz: cannot be written",
         ),
         (
             ["export", "none.npz", "--out", "/proc/none/b", "--name", "b", "--version", "1"],

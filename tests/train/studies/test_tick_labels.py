@@ -61,9 +61,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "stress": lambda: stress_report.render(stress_data.figures()),
     "matrix": lambda: plots.matrix(committed("fabrics")),
     "alignment": lambda: contact_plot.draw(committed("alignment")),
-    "choice": lambda: selection_plots.sizes(
-        choice_data.choice()["rungs"], "compact-4k", 0.9, "sizes"
-    ),
+    "choice": lambda: selection_plots.sizes(choice_data.choice()["rungs"], "pairs", 0.9, "sizes"),
     "less": lambda: selection_plots.reductions(choice_data.choice()["less"], "less"),
     "soak": lambda: soak_page.charts(committed("soak")),
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from train.data.sets import Dataset
 from train.models.linear_head import expanded_head
-from train.models.methods import FULL_EFFORT, PACKAGED, SHIPPED, Effort, Log, Method, no_log
+from train.models.methods import (
+    AS_RECORDED,
+    FULL_EFFORT,
+    PACKAGED,
+    SHIPPED,
+    Effort,
+    Log,
+    Method,
+    no_log,
+)
 from train.models.recipe import recipe
 from train.models.recipe.fitted import CompactModel
 from train.models.recipe.sizes import SIZES
@@ -49,10 +58,13 @@ def train(
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
     """`palpate`, its sizes, and the same for a skin that is taken off and put back."""
-    settings = recipe.Settings(steps=max(round(recipe.Settings().steps * effort.share), 2))
+    steps = round(recipe.Settings().steps * effort.share)
+    settings = recipe.Settings(max(steps, 2) if effort.share else 0, use=effort.use)
+    special = "" if effort.use == AS_RECORDED else repr(effort.use)
 
     def method(name: str, about: str, settings: recipe.Settings) -> Method:
         trains = f"{settings.steps} iterations of stages" if settings.size.stages else ""
+        trains += f"{', ' * bool(trains and special)}{special}"
         return Method(name, about, "raw", partial(train, settings=settings), effort=trains)
 
     sizes = (
@@ -71,7 +83,7 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
             PACKAGED,
             "as palpate, but all heads see augmented copies, as of a skin put back, and filters "
             "join stages only where that is better",
-            replace(settings, reattached=True),
+            replace(settings, use=replace(effort.use, reattached=True)),
         ),
     )
 

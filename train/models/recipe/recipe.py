@@ -36,7 +36,7 @@ from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
 from train.models.linear_head import hold_out_or_all
-from train.models.methods import Log, no_log
+from train.models.methods import AS_RECORDED, Log, SkinUse, no_log
 from train.models.recipe import bank, choice, distribution, graph, relations, spectrum
 from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ, Architecture
 from train.models.recipe.augment import (
@@ -72,21 +72,16 @@ FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
 class Settings:
     """The settings of a fit.
 
-    steps: of the training of stages; 0 for no stages. augmentation: None for the default.
-    unfinished: a file that keeps the training of stages from time to time; from it an interrupted
-    training goes on with the same bits. size: limits the content of the model. reattached: the skin
-    will be taken off and put back after the recordings; all heads then see augmented copies.
-    mains_hz: see Architecture. calibrate: whether the fit is finished with calibration and
-    contacts, which a bundle needs and
-    `evaluate` does not.
+    steps: of the training of stages; 0 for no stages. unfinished: a file that keeps the training of
+    stages from time to time; from it an interrupted training goes on with the same bits. size:
+    limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
+    calibration and contacts, which a bundle needs and `evaluate` does not.
     """
 
     steps: int = 600
-    augmentation: Augmentation | None = None
     unfinished: Path | None = None
     size: ModelSize = UNLIMITED
-    reattached: bool = False
-    mains_hz: float = MAINS_HZ
+    use: SkinUse = AS_RECORDED
     calibrate: bool = True
 
 
@@ -132,10 +127,11 @@ class Setup:
     def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
         """Raises FormatError if the window is too short."""
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
+        augmentation = replace(usual, **settings.use.augmentation)
         numbered = replace(sweeps, groups=sweeps.groups | {"index": np.arange(len(sweeps))})
         _, held, by = hold_out_or_all(numbered, seed)
         out = np.isin(np.arange(len(sweeps)), held.group("index"))
-        return cls(sweeps, seed, settings, settings.augmentation or usual, out, by, log)
+        return cls(sweeps, seed, settings, augmentation, out, by, log)
 
     @cached_property
     def copies(self) -> list[Dataset]:
@@ -154,13 +150,24 @@ class Setup:
         """The parts by which candidates are judged."""
         return inner_parts(self.sweeps)
 
-    @cached_property
-    def may_train(self) -> bool:
-        """Whether stages can be trained."""
+    def may_train(self, size: ModelSize) -> bool:
+        """Whether stages can be trained for a model of this size."""
         each = np.unique(self.sweeps.labels, return_counts=True)[1]
         enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
-        wanted = self.settings.steps and self.settings.size.stages
+        wanted = self.settings.steps and size.stages
         return bool(wanted and enough and self.by != "nothing" and find_spec("torch"))
+
+    @cached_property
+    def stages(self) -> tuple[Trunk, HeadData]:
+        """Stages trained on the sweeps that are not held out, as a trunk of their own, and their
+        features of all sweeps and copies."""
+        trunk = _trained(self)
+        return trunk, self.data(trunk)
+
+    @property
+    def judging(self) -> InnerPart:
+        """The sweeps that judge stages."""
+        return InnerPart(self.by, self.out)
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
@@ -175,13 +182,14 @@ class Setup:
 
     def scores(self, data: HeadData, parts: list[InnerPart]) -> HeldOutScores:
         """The scores of heads of these features on these parts."""
-        classes, copied = len(self.sweeps.materials), self.settings.reattached
+        classes, copied = len(self.sweeps.materials), self.settings.use.reattached
         return HeldOutScores([data] * len(parts), parts, classes, copied)
 
     def part(self, number: int) -> Log:
         """The log of one part of the fit. The third part, the stages, takes most of the time; it is
         left out if the first two suffice."""
-        return lambda line: self.log(f"part {number} of {3 if self.may_train else 2}, {line}")
+        parts = 3 if self.may_train(self.settings.size) else 2
+        return lambda line: self.log(f"part {number} of {parts}, {line}")
 
 
 @dataclass(frozen=True)
@@ -191,6 +199,17 @@ class FixedFeatures:
     trunk: Trunk
     data: HeadData
     columns: FeatureColumns
+
+    def limited(self, size: ModelSize) -> FixedFeatures:
+        """Only the features that a model of this size may see. Raises FormatError if there are
+        none."""
+        columns = self.columns.limited(size)
+        if not (columns.kinds or len(columns.bands)):
+            raise FormatError(
+                f"windows of {self.trunk.sweeps.format.window} frames are too short for a "
+                "spectrum, and this size has nothing else; use a size with filters"
+            )
+        return replace(self, columns=columns)
 
 
 @dataclass(frozen=True)
@@ -218,33 +237,41 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     materials have too few recordings to hold some out.
     """
     setup = Setup.of(sweeps, seed, settings, log)
-    fixed = features(setup)
-    heads = candidates(fixed, setup)
-    judged = judge(heads, fixed, setup)
-    stages, judged = with_stages(judged, fixed, setup)
+    return fit_size(features(setup), setup, settings.size)
+
+
+def fit_size(every: FixedFeatures, setup: Setup, size: ModelSize) -> Fit:
+    """The model of this size. Raises FormatError if the windows are too short for it."""
+    fixed = every.limited(size)
+    stages, judged = judged_size(fixed, setup, size)
     trunk, plan = pruned(fixed.trunk, stages, judged.chosen.plan)
     return finish(trunk, plan, judged, setup)
+
+
+def judged_size(
+    fixed: FixedFeatures, setup: Setup, size: ModelSize
+) -> tuple[Trunk | None, HeadChoice]:
+    """Steps 2 to 4 for a model of this size, to whose features `fixed` is limited."""
+    judged = judge(candidates(fixed, setup), fixed, setup)
+    enough = judged.scores.accuracy(judged.chosen) >= ENOUGH
+    if enough or not setup.may_train(size):
+        return None, judged
+    return with_stages(judged, fixed, setup)
 
 
 def features(setup: Setup) -> FixedFeatures:
     """Step 1: the features that need no training."""
     setup.part(1)(f"features of {len(setup.sweeps)} sweeps and {COPIES} copies of each")
-    trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.mains_hz)
+    trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.use.mains_hz)
     scales = trunk.architecture.relations
     columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
-    columns = columns.limited(setup.settings.size)
-    if not (columns.kinds or len(columns.bands)):
-        raise FormatError(
-            f"windows of {setup.sweeps.format.window} frames are too short for a spectrum, and "
-            "this size has nothing else; use a size with filters"
-        )
     return FixedFeatures(trunk, setup.data(trunk), columns)
 
 
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
     groups = any(part.group != "recording" for part in setup.parts)
-    return Candidates(fixed.columns, setup.settings.reattached, groups)
+    return Candidates(fixed.columns, setup.settings.use.reattached, groups)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
@@ -257,24 +284,19 @@ def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
 def with_stages(
     judged: HeadChoice, fixed: FixedFeatures, setup: Setup
 ) -> tuple[Trunk | None, HeadChoice]:
-    """Step 4: trained stages and the heads beside them, if the heads without stages are not good
-    enough; else None and these.
+    """Step 4: trained stages and the heads beside them; None and `judged` if these are better.
 
     If the skin will be reattached, stages and the spectrum suffice, unless held-out sweeps and
     their copies show that more is better: a displaced contact changes the responses of filters
     more. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
     that they were not trained on are named worse than without them.
     """
-    if not setup.may_train or judged.scores.accuracy(judged.chosen) >= ENOUGH:
-        return None, judged
     log, plan = setup.part(3), judged.chosen.plan
-    stages = _trained(fixed.trunk.scale, setup, log)
-    scores = setup.scores(
-        _side_by_side(setup.data(stages), fixed.data), [InnerPart(setup.by, setup.out)]
-    )
+    stages, responses = setup.stages
+    scores = setup.scores(_side_by_side(responses, fixed.data), [setup.judging])
     beside = _beside_stages(plan)
     joined = full = scores.score(beside)
-    if setup.settings.reattached:
+    if setup.settings.use.reattached:
         log("choosing: stages and the spectrum alone")
         lean = scores.score(_stages_alone(_lean_columns(fixed.columns, plan)))
         joined = full if scores.better(full, lean) else lean
@@ -325,8 +347,8 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
         "recipe": {
             "augmentation": vars(setup.augmentation),
             "steps": settings.steps,
-            "reattached": settings.reattached,
-            "mains_hz": settings.mains_hz,
+            "reattached": settings.use.reattached,
+            "mains_hz": settings.use.mains_hz,
         },
         "held_out_by": setup.by,
         "chosen": describe(trunk, plan),
@@ -387,15 +409,15 @@ def fewer_filters(
     return choice.with_fewer_filters(scores, chosen, filters, bank.LEAST_FILTERS, log)
 
 
-def _trained(scale: float, setup: Setup, log: Log) -> Trunk:
-    """Stages trained on the sweeps that are not held out, as a trunk of their own."""
+def _trained(setup: Setup) -> Trunk:
+    """See Setup.stages."""
     from train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
 
-    settings, sweeps = setup.settings, setup.sides[0]
+    settings, sweeps, scale = setup.settings, setup.sides[0], texture_scale(setup.sweeps.samples)
     recipe = stages.FitRecipe(steps=settings.steps, augmentation=setup.augmentation)
-    architecture = replace(STAGES, mains_hz=settings.mains_hz)
+    architecture = replace(STAGES, mains_hz=settings.use.mains_hz)
     weights, ranges = stages.train_stages(
-        sweeps, scale, setup.seed, recipe, log, architecture, settings.unfinished
+        sweeps, scale, setup.seed, recipe, setup.part(3), architecture, settings.unfinished
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
 

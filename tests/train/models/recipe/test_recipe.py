@@ -15,15 +15,15 @@ import pytest
 
 from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
-from train.cli import bundles
+from train.cli import fit as fit_command
 from train.cli.main import main
 from train.data import sets
 from train.data.sets import Dataset
 from train.data.splitters import inner_parts
 from train.models import checkpoint, training
-from train.models.recipe import choice, default, recipe
+from train.models.methods import SkinUse
+from train.models.recipe import choice, palpate, recipe
 from train.models.recipe import fitted as fitted_module
-from train.models.recipe.bank import Bank
 from train.models.recipe.fitted import Fit
 from train.models.recipe.recipe import Settings
 from train.onnx_tools.graph_builder import run, with_head
@@ -51,10 +51,6 @@ def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
     size = fitted.weights["int8.weight"].shape[1]
     assert columns.tolist() == list(range(size))
     assert run(fitted.trunk(), easy().samples[:2]).shape == (2, size)
-    usual = recipe.fit(easy(), 1, replace(CLOSED, choose=False))
-    assert usual.architecture.pools == 2
-    assert not usual.architecture.spectrum
-    assert not Bank.of(usual.weights).free.any()
 
 
 def fitted_by_command(folder: Path, *options: str) -> Fit:
@@ -199,7 +195,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.HeldOutScores, "better", lambda *_: better)
-    fit = recipe.fit(easy(), 1, Settings(steps=20, reattached=True))
+    fit = recipe.fit(easy(), 1, Settings(steps=20, use=SkinUse(reattached=True)))
     bands = fit.bands
     assert bands
     assert bool(fit.architecture.pools) == better
@@ -227,7 +223,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
-    monkeypatch.setattr(bundles, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(fit_command, "CACHE", tmp_path / "cache")
     monkeypatch.setattr(fitted_module, "fit_calibration", uncalibrated)
     easy().save(tmp_path / "easy.npz")
     plain, steps = training.backward, []
@@ -307,7 +303,7 @@ def test_the_method_names_materials_that_it_never_saw_last():
     numbers."""
     sweeps = easy()
     part = sweeps.take(sweeps.labels != 1)
-    model = default.train(part, part.samples, 1, settings=CLOSED)
+    model = palpate.train(part, part.samples, 1, settings=CLOSED)
     logits = model.logits(sweeps.samples)
     assert logits.shape == (len(sweeps), len(sweeps.materials))
     assert (logits.argmax(axis=1) != 1).all()

@@ -1,0 +1,300 @@
+"""The command `fit`: sweep sets to a fit, of the smallest size that suffices if there is a wish."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shlex
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from appliance.core.errors import FormatError
+from appliance.core.storage import put
+from train.arguments import numbers, options, scene_file
+from train.arguments.types import Add
+from train.data import labels
+from train.data.sets import Dataset, digest
+from train.data.transforms import WHOLE, Change
+from train.evaluation.evaluate import CACHE
+from train.evaluation.fold import fingerprint
+from train.metrics import score
+from train.models.methods import SkinUse
+from train.models.recipe import recipe
+from train.models.recipe.fitted import Fit
+from train.models.recipe.sizes import SIZES, UNLIMITED
+from train.reports import formatting, selection_report
+from train.selection import dial, reduction_curves
+from train.selection.dial import Budget, SizeWish
+
+Json = dict[str, Any]
+MAINS = (50, 60)
+"""Frequencies of the mains in Hz: public grids have no others."""
+STEPS = recipe.Settings().steps
+
+
+def register(add: Add) -> None:
+    """fit."""
+    command = add("fit", run)
+    command.set_defaults(resumes=True, parser=command)
+    options.add_set(command, required=False)
+    command.add_argument(
+        "--scene", type=Path, metavar="FILE", help="options in a file, as docs/choose/tubes.toml"
+    )
+    command.add_argument(
+        "--seed",
+        type=numbers.whole("--seed", 0),
+        required=True,
+        help="seed of the training, and of simulated sets without one",
+    )
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
+    )
+    command.add_argument(
+        "--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7"
+    )
+    command.add_argument(
+        "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
+    )
+    _add_use(command)
+    _add_dial(command)
+
+
+def _add_use(command: argparse.ArgumentParser) -> None:
+    """Options for the use of the skin."""
+    command.add_argument(
+        "--reattached",
+        action="store_true",
+        help=(
+            "the skin will be taken off and put back after the recordings: train all heads on "
+            "augmented copies of that, too"
+        ),
+    )
+    command.add_argument(
+        "--mains",
+        type=int,
+        choices=MAINS,
+        default=int(SkinUse().mains_hz),
+        metavar="HZ",
+        help=(
+            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}; the "
+            f"features ignore its hum (default {SkinUse().mains_hz:g})"
+        ),
+    )
+    command.add_argument(
+        "--row-shift",
+        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
+        metavar="SHARE",
+        dest="displaced",
+        help="share of training sweeps with a displacement of up to a row (default 0.5)",
+    )
+    command.add_argument(
+        "--stretch",
+        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
+        metavar="SHARE",
+        help="change the speed of training sweeps by up to this share (default 0)",
+    )
+
+
+def _add_dial(command: argparse.ArgumentParser) -> None:
+    """Options for the size of the model."""
+    command.add_argument(
+        "--steps",
+        type=numbers.whole("--steps", 0),
+        default=STEPS,
+        help=f"training steps of the stages (default {STEPS}; 0 for none)",
+    )
+    command.add_argument(
+        "--size",
+        choices=SIZES,
+        help="; ".join(f"{name}: at most {size.about}" for name, size in SIZES.items())
+        + " (default: no limit)",
+    )
+    _add_wish(command)
+
+
+def _add_wish(command: argparse.ArgumentParser) -> None:
+    """Options for the smallest size that suffices."""
+    for option, unit, what in (
+        ("--budget-ms", "MS", "processor time of a sweep on the board"),
+        ("--budget-kb", "KB", "size of the bundle in 1000 bytes"),
+    ):
+        command.add_argument(
+            option,
+            type=numbers.above_zero(option),
+            metavar=unit,
+            help=f"{what}: choose the smallest size that suffices within this",
+        )
+    command.add_argument(
+        "--slower",
+        type=numbers.above_zero("--slower"),
+        metavar="TIMES",
+        help="assumed time on the board as a multiple of the time here (1)",
+    )
+    command.add_argument(
+        "--accuracy",
+        type=numbers.number("--accuracy", lambda x: 0 < x <= 1, "above 0, to 1"),
+        metavar="SHARE",
+        help="choose the smallest size that reaches this on held-out sweeps",
+    )
+    command.add_argument(
+        "--reduce",
+        nargs="+",
+        choices=reduction_curves.REDUCTIONS,
+        metavar="WHAT",
+        help=(
+            f"show how much less suffices, of {', '.join(reduction_curves.REDUCTIONS)}; the fit "
+            "has the shorter window, the others need another sensor"
+        ),
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, save the fit and print its accuracy on the held-out sweeps."""
+    if args.scene:
+        words = [*scene_file.words(args.scene, args.parser), *args.words[1:]]
+        args = argparse.Namespace(**vars(args.parser.parse_args(words)) | {"words": args.words})
+    _check(args)
+    sweeps, rest = labels.check(options.load(args, args.seed)), None
+    if args.split:
+        by, share = _by_share(args.split)
+        sweeps, rest = sweeps.split(by, share, args.seed)
+    made, change, unfinished = _fitted(args, sweeps)
+    if args.rest and rest:
+        change.of(rest).save(args.rest)
+        made = replace(made, about=made.about | {"rest": str(args.rest)})
+    made.save(args.out)
+    unfinished.unlink(missing_ok=True)
+    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    _print_held_out(made)
+    if args.rest and rest:
+        command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
+        print(
+            f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; "
+            f"after export: {command}"
+        )
+    print(options.report_line(args.out, str(args.rest or "")))
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse options that do not go together, before hours of work. Raises FormatError."""
+    if not args.sets:
+        raise FormatError("no sweeps; name a set with --set, or with set in the file of --scene")
+    if args.rest and not args.split:
+        raise FormatError("--rest needs --split; without it nothing is left over")
+    if args.slower and not args.budget_ms:
+        raise FormatError("--slower needs --budget-ms; without a limit of time it changes nothing")
+    for option in ("out", "rest"):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}")
+
+
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
+    """The fit for these options, the reduction of its sweeps, and the file that keeps its training
+    until the fit is written."""
+    use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
+    unfinished = _unfinished(args, sweeps, use)
+    settings = recipe.Settings(
+        args.steps, unfinished=unfinished, size=SIZES.get(args.size, UNLIMITED), use=use
+    )
+    wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
+    if any(wish):
+        return *_chosen(args, sweeps, settings), unfinished
+    made = recipe.fit(sweeps, args.seed, settings, options.Log())
+    held_out = formatting.counted(made.about["validation"])
+    print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
+    return made, WHOLE, unfinished
+
+
+def _chosen(
+    args: argparse.Namespace, sweeps: Dataset, settings: recipe.Settings
+) -> tuple[Fit, Change]:
+    """The fit of the smallest size that suffices, on reduced sweeps if they suffice; writes the
+    page with the reasons."""
+    log = options.Log()
+    budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
+    sizes = (args.size,) if args.size else tuple(dial.FAMILY)
+    choice = dial.choose(
+        sweeps, args.seed, settings, SizeWish(budget, args.accuracy or 0.0, sizes), log
+    )
+    less, change = reduction_curves.curves(choice, args.reduce or (), log)
+    made, cost, refused = choice.fit, choice.costs[choice.chosen], ""
+    if change != WHOLE:
+        try:
+            made, cost = dial.reduced(choice, change, log)
+        except FormatError as e:
+            refused, change = str(e), WHOLE
+    result = choice.json() | {"less": less, "applied": asdict(change)}
+    result |= {"bundle": _described(made, cost, budget, refused)} | _origin(args, sweeps, budget)
+    page = args.out.with_name(f"{args.out.stem}-why") / "index.html"
+    put(page.with_name("choice.json"), (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    put(page, selection_report.page(result).encode(), parents=True)
+    print(selection_report.text(result))
+    print(f"why: {page}")
+    return replace(made, about=made.about | {"size": choice.chosen}), change
+
+
+def _described(made: Fit, cost: dial.BundleCost, budget: Budget, refused: str) -> Json:
+    used = {k: round(v, 3) for k, v in budget.used(cost).items()}
+    about = {"content": made.about["chosen"], "format": made.train.format.json(), "used": used}
+    return about | asdict(cost) | {"refused_with_less": refused}
+
+
+def _origin(args: argparse.Namespace, sweeps: Dataset, budget: Budget) -> Json:
+    """The origin of the result: command, set, commit."""
+    return {
+        "command": shlex.join(["palpate-train", *args.words]),
+        "set": sweeps.source,
+        "digest": digest(sweeps),
+        "sweeps": len(sweeps),
+        "format": sweeps.format.json(),
+        "materials": list(sweeps.materials),
+        "reattached": args.reattached,
+        "steps": args.steps,
+        "budget": {k: v for k, v in asdict(budget).items() if v != math.inf},
+        "seeds": [args.seed],
+    } | score.provenance()
+
+
+def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path:
+    """The file that keeps a training until the fit is written. Its name is a fingerprint of all
+    that the training depends on."""
+    about = [digest(sweeps), args.seed, args.size, args.steps, asdict(use)]
+    return (
+        CACHE
+        / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.stages')}.pt"
+    )
+
+
+def _print_held_out(made: Fit) -> None:
+    """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
+    --rest."""
+    if made.about["held_out_by"] == "nothing":
+        print(
+            "nothing was held out that could judge the model, so export will refuse it: "
+            f"{made.uncalibrated}"
+        )
+        return
+    by = f"held-out {made.about['held_out_by']}"
+    print(
+        f"{by}: sweeps of this set, by heads that did not see them; slightly too high, since "
+        "they also helped to choose the model"
+    )
+    if made.calibration:
+        print(*formatting.figure_lines(made.held_out_figures(by)), sep="\n")
+    else:  # too few sweeps to judge by
+        alone = formatting.counted(made.about["validation"])
+        print(
+            f"{by}, network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}"
+        )
+
+
+def _by_share(text: str) -> tuple[str, float]:
+    by, _, share = text.partition(":")
+    try:
+        return by, float(share)
+    except ValueError:
+        raise FormatError(
+            f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7"
+        ) from None
