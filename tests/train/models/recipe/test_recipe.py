@@ -21,9 +21,9 @@ from train.data import sets
 from train.data.sets import Dataset
 from train.data.splitters import inner_parts
 from train.models import checkpoint, training
-from train.models.recipe import choice, default, recipe
+from train.models.recipe import choice, palpate, recipe
 from train.models.recipe import fitted as fitted_module
-from train.models.recipe.bank import Bank
+from train.models.recipe.architectures import STAGES
 from train.models.recipe.fitted import Fit
 from train.models.recipe.recipe import Settings
 from train.onnx_tools.graph_builder import run, with_head
@@ -51,10 +51,6 @@ def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
     size = fitted.weights["int8.weight"].shape[1]
     assert columns.tolist() == list(range(size))
     assert run(fitted.trunk(), easy().samples[:2]).shape == (2, size)
-    usual = recipe.fit(easy(), 1, replace(CLOSED, choose=False))
-    assert usual.architecture.pools == 2
-    assert not usual.architecture.spectrum
-    assert not Bank.of(usual.weights).free.any()
 
 
 def fitted_by_command(folder: Path, *options: str) -> Fit:
@@ -178,8 +174,8 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     assert re.fullmatch(
         r"part 3 of 3, choosing: \d+ filters", told[-1]
     )  # fewer may do beside stages
-    assert fit.architecture.channels == recipe.STAGES.channels
-    stages = sum(recipe.STAGES.channels)
+    assert fit.architecture.channels == STAGES.channels
+    stages = sum(STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
     assert len(fit.plan.parts) > 1
     assert 0 < len(fit.held) < len(fit.train) < len(easy())
@@ -207,7 +203,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     assert fit.about["validation"]["n"] == len(fit.held)  # copies were judged, and are not counted
     if not better:
         sizes = [len(part.columns) for part in fit.plan.parts]
-        assert sizes == [channels + bands for channels in recipe.STAGES.channels]
+        assert sizes == [channels + bands for channels in STAGES.channels]
         assert all(part.copies for part in fit.plan.parts)
         logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
         assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
@@ -302,12 +298,24 @@ def test_filters_need_no_pytorch(tmp_path: Path):
     assert (tmp_path / "b" / "manifest.json").is_file()
 
 
+@pytest.mark.slow
+@pytest.mark.thorough  # fits once more
+def test_the_method_is_what_the_command_fits(fitted: Fit):
+    """Its fit has the same bits, and its logits are those of the int8 head."""
+    s = easy()
+    model = palpate.train(s, s.samples, 1, settings=CLOSED)
+    for name, values in fitted.weights.items():
+        np.testing.assert_array_equal(model.fit.weights[name], values)
+    logits = run(with_head(fitted.trunk(), *fitted.int8_head()), s.samples)
+    np.testing.assert_allclose(model.logits(s.samples), logits, atol=1e-3)
+
+
 def test_the_method_names_materials_that_it_never_saw_last():
     """A material without a training sweep gets a logit below all others; labels keep their
     numbers."""
     sweeps = easy()
     part = sweeps.take(sweeps.labels != 1)
-    model = default.train(part, part.samples, 1, settings=CLOSED)
+    model = palpate.train(part, part.samples, 1, settings=CLOSED)
     logits = model.logits(sweeps.samples)
     assert logits.shape == (len(sweeps), len(sweeps.materials))
     assert (logits.argmax(axis=1) != 1).all()
