@@ -22,9 +22,9 @@ from appliance.bundle import bundle
 from appliance.inference.classifier import softmax
 from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
+from tests.factories.trained_stages import with_stages
 from train.data import sets
 from train.export import quantized_bundle
-from train.models.recipe import stages
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import TENSOR
 
@@ -45,7 +45,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(bundle.DEFAULT, folder / "default")
     np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
     for dtype in TENSOR:
-        fitted = stages.fit_network(easy(dtype=dtype), 1, stages.FitRecipe(steps=40))
+        fitted = with_stages(easy(dtype=dtype))
         quantized_bundle.export(fitted, folder / dtype, dtype, "1", "")
         np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
     for name in INSIDE:

@@ -21,15 +21,8 @@ COSTLY = {
     "palpate-64",
     "palpate-stages",
     "palpate-256",
-    "filter-bank",
     "paper-cnn-centred",
     "tactnet2",
-    "compact-1k",
-    "compact-4k",
-    "compact-10k",
-    "compact-20k",
-    "compact-50k",
-    "compact-100k",
     "papillarray",
 }
 

@@ -65,7 +65,7 @@ FLOATS = (
 )
 CHANGES = (1, 1, 1, 2, 3)
 """Numbers of changes; each entry is equally likely."""
-QUICK = ("L-knn", "L-svm", "st-hmp", "compact-4k")
+QUICK = ("L-knn", "L-svm", "st-hmp", "palpate-64")
 """Methods that train in a second. Together they have all operators but GRU and MaxPool."""
 
 

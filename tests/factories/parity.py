@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.models.recipe import stages
+from train.data.sets import Dataset
 
 
-def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> stages.Dataset:
+def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> Dataset:
     """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates in much noise, one
     sweep a recording.
     """
@@ -20,6 +20,4 @@ def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> stages.Dataset:
         offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
     )
     groups = {"recording": np.arange(3 * n)}
-    return stages.Dataset(
-        samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close"
-    )
+    return Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close")

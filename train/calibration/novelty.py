@@ -107,7 +107,7 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 +
     fixed, F) directions.
 
-    The covariance is Ledoit and Wolf's, as in linear_head.closed_form_head. The first K - 1
+    The covariance is Ledoit and Wolf's, as in heads.fit_discriminant. The first K - 1
     directions hold everything that LDA uses. More are added until they contain the last `fixed`
     features, which were not trained (see spectrum.py): trained materials do not differ there, but
     an unknown one may. In these directions each material has its own shape.

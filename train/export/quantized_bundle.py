@@ -24,7 +24,7 @@ from train.models.methods import model_inputs
 from train.models.recipe.calibrate import Calibration
 from train.models.recipe.fitted import Fit, calibration_inputs, finished
 from train.onnx_tools import parity
-from train.onnx_tools.graph_builder import with_head
+from train.onnx_tools.graph_builder import run, with_head
 from train.onnx_tools.parity import Parity
 
 Array = NDArray[Any]
@@ -68,7 +68,7 @@ def export(
     if fit.about["held_out_by"] == "nothing":
         raise FormatError(fit.uncalibrated)
     (reference, model), about = graphs(fit), fit.about
-    if fit.architecture.channels and not fit.architecture.pools:
+    if fit.architecture.channels:
         about = about | {"torch_difference": _torch_difference(fit, reference)}
     content = Content(
         model, "raw", fit.train, fit.held, about["held_out_by"], about, contacts=fit.contacts
@@ -132,16 +132,18 @@ def _unseen(fit: Fit, calibration: Calibration) -> Calibration:
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
-    """The largest difference of a logit between PyTorch and the float graph. Raises ExportRefused
-    above MOST_TORCH_DIFFERENCE."""
+    """The largest difference of a logit between stages in PyTorch and the float graph; the other
+    features exist in the graph alone. Raises ExportRefused above MOST_TORCH_DIFFERENCE."""
     # here: a fit without trained stages is exported without PyTorch
     import torch
 
     from train.models.recipe.stages import network_of
 
-    counts = torch.from_numpy(fit.held.samples.astype(np.float32))
+    network, counts = network_of(fit), torch.from_numpy(fit.held.samples.astype(np.float32))
+    features = run(fit.trunk(int8=False), fit.held.samples)
     with torch.no_grad():
-        wanted = network_of(fit)(counts).numpy()
+        features[:, : sum(fit.architecture.channels)] = network.features(network.prepare(counts))
+    wanted = features @ fit.weights["head.weight"].T + fit.weights["head.bias"]
     difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
     if not difference <= MOST_TORCH_DIFFERENCE:
         raise ExportRefused(

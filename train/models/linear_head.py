@@ -1,8 +1,7 @@
 """Linear heads on features that a graph computes, and the sweeps that are held out to judge them.
 
-A head is fitted in closed form or by scikit-learn, to the features that the graph gives on the box.
-One temperature, found on held-out groups, calibrates its probabilities. minirocket.py and sthmp.py
-build the graphs.
+A head is fitted by scikit-learn to the features that the graph gives on the box. One temperature,
+found on held-out groups, calibrates its probabilities. minirocket.py and sthmp.py build the graphs.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
@@ -85,28 +83,6 @@ def _split(sweeps: Dataset, by: str, seed: int) -> tuple[Dataset, Dataset, str]:
             f"{sweeps.source}: split by {by!r} leaves one sweep of {material!r}; record more of it"
         )
     return train, held_out, by
-
-
-def closed_form_head(
-    features: Array, labels: Array, held_out: Array, held_out_labels: Array
-) -> tuple[Array, Array]:
-    """Weight [K, F] and bias [K], float32, of shrinkage LDA on `features` [N, F], with the
-    temperature of `held_out` [n, F].
-
-    Raises FormatError if there is only one sweep of each material, which does not show how
-    materials vary.
-    """
-    if len(labels) <= len(np.unique(labels)):
-        raise FormatError(
-            f"{len(labels)} sweeps of as many materials are too few for a linear discriminant; "
-            "record more"
-        )
-    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, labels)
-    weight, bias = lda.coef_, lda.intercept_
-    if len(weight) == 1:  # of two classes scikit-learn gives only the difference
-        weight, bias = np.vstack([0 * weight, weight]), np.append(0, bias)
-    temperature = platt_temperature(held_out @ weight.T + bias, held_out_labels)
-    return (weight / temperature).astype(np.float32), (bias / temperature).astype(np.float32)
 
 
 def train_linear_head(

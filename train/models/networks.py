@@ -54,13 +54,9 @@ class Network(nn.Module, ABC):
         )
         return logits
 
-    def head_input(self, counts: Tensor) -> Tensor:
-        """Raw counts [B, T, R, C] -> the features that the head sees [B, F]."""
-        return self.features(self.prepare(counts))
-
     def forward(self, counts: Tensor) -> Tensor:
         """Raw counts [B, T, R, C] -> logits [B, K]."""
-        logits: Tensor = self.head(self.head_input(counts))
+        logits: Tensor = self.head(self.features(self.prepare(counts)))
         return logits
 
     def fused(self) -> Self:

@@ -10,6 +10,7 @@ import numpy as np
 from appliance.sim import skin
 from train.data.sets import Dataset
 from train.models.recipe import graph, recipe
+from train.models.recipe.architectures import STAGES
 from train.models.recipe.bank import LEAST_FILTERS, Bank
 from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.quantize import quantize
@@ -22,8 +23,9 @@ def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     The first is a trunk like that of the packaged bundle in float32, with stages and the fewest
     filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.
     """
+    # here: both import PyTorch
     from train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
-    from train.models.recipe.stages import Compact  # here, as what follows: it imports PyTorch
+    from train.models.recipe.stages import StagesNetwork
 
     rng, format, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)
     counts = rng.integers(0, 256, (4, format.window, *format.shape), np.uint8)
@@ -31,10 +33,10 @@ def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
         counts, np.arange(4) % classes, skin.MATERIALS, format.rate_hz, {}, "random counts"
     )
     trunk = recipe.fixed_trunk(sweeps, seed)
-    stages = Compact(format, classes, trunk.scale, norm=False, architecture=recipe.STAGES).weights()
+    stages = StagesNetwork(format, classes, trunk.scale, norm=False).weights()
     filters = Bank.of(trunk.weights)
     filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
-    architecture = replace(recipe.STAGES, pools=2, distribution=True, spectrum=True)
+    architecture = replace(STAGES, pools=2, distribution=True, spectrum=True)
     small = graph.trunk_graph(
         format, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
     )

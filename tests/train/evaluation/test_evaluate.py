@@ -563,7 +563,7 @@ def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[s
     promised = (
         "L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm "
         "st-hmp paper-cnn "
-        "tactnet2 recurrent minirocket compact"
+        "tactnet2 recurrent minirocket palpate"
     )
     assert {line.split()[0] for line in lines} >= set(promised.split())
     assert all(len(line.split()) > 4 for line in lines)

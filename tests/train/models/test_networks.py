@@ -21,11 +21,10 @@ from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.evaluation import evaluate, fold
 from train.models import methods, training
-from train.models.linear_head import closed_form_head
 from train.models.methods import Effort, Method
 from train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
-from train.models.recipe import stages
-from train.models.recipe.stages import FitRecipe
+from train.models.recipe.stages import StagesNetwork
+from train.models.training import TrainingRecipe
 from train.onnx_tools import graph_builder
 
 NETS = (
@@ -37,7 +36,6 @@ NETS = (
     "lite",
     "edge-spectral",
 )
-NAMES = (*NETS, "compact")
 BRIEF = Effort(share=0.01, paper_steps=2)
 """Two to eight iterations, for tests that are not about accuracy."""
 
@@ -154,14 +152,14 @@ def test_adversarial_training_sees_the_worse_sweep():
     worse.backward()
     want = [p.grad.clone() for p in net.parameters()]
     net.zero_grad()
-    loss = training.backward(net, x, labels, FitRecipe(adversarial=0.1, smoothing=0.0))
+    loss = training.backward(net, x, labels, TrainingRecipe(adversarial=0.1, smoothing=0.0))
     assert loss == pytest.approx(cost.item())
     for p, gradient in zip(net.parameters(), want, strict=True):
         torch.testing.assert_close(p.grad, gradient)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 @pytest.mark.parametrize(
     ("shape", "dtype", "classes"),
     [((12, 64, 3, 3), "int16", 2), ((12, 21, 1, 1), "uint16", 3), ((12, 128, 16, 1), "float32", 3)],
@@ -177,7 +175,7 @@ def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first((*NETS, "stages")))
 def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     """Real sizes, 1500 x 4 x 4 of uint8, with random weights or the smallest training."""
     build = {
@@ -188,17 +186,17 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
         "ds-cnn": ds_cnn.build,
         "lite": lite.build,
         "edge-spectral": edge_spectral.build,
-    }.get(name)
+        "stages": lambda format, classes, _: StagesNetwork(format, classes, 0.1, norm=False),
+    }[name]
     counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        form, plain = skin.FORMAT, stages.Compact(skin.FORMAT, 6, 0.1, norm=False)
-        net = build(form, 6, counts) if build else plain
+        net = build(skin.FORMAT, 6, counts)
     check_agrees(training.NetworkModel(net.eval(), ""), counts)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 def test_what_is_easy_is_learnt(name: str):
     """Three tones are named on sweeps of another seed; the cost falls; the run is reported."""
     model = train(name, easy(), Effort(share=0.25, paper_steps=40))
@@ -215,7 +213,7 @@ def test_what_is_easy_is_learnt(name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 def test_the_same_again_for_the_same_seed(name: str):
     """It has the same bits for any random state outside, which does not change; another seed gives
     another network."""
@@ -229,7 +227,7 @@ def test_the_same_again_for_the_same_seed(name: str):
     assert not np.array_equal(train(name, s, seed=2).logits(s.samples), first)
 
 
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 def test_a_material_that_never_came_is_never_given(name: str):
     """Its logit is finite and far below, in the graph too; the others keep their places."""
     s = easy(12)
@@ -243,7 +241,7 @@ def test_a_material_that_never_came_is_never_given(name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 def test_small_sets_are_trained_whole(name: str):
     """Two recordings of one sweep each cannot be split; one position alone does not prevent a split
     by recording."""
@@ -257,19 +255,12 @@ def test_small_sets_are_trained_whole(name: str):
 
 
 @pytest.mark.slow
-def test_one_sweep_of_each_is_too_little_for_a_discriminant():
-    """It is refused with a message; augmented copies, or heads trained by gradient descent,
-    work."""
-    one, labels = np.eye(3), np.arange(3)
-    with pytest.raises(
-        FormatError, match="3 sweeps of as many materials are too few for a linear discriminant"
-    ):
-        closed_form_head(one, labels, one, labels)
-    for name in ("compact", "recurrent"):
-        check_agrees(train(name, easy(1)), easy(1).samples)
+def test_one_sweep_of_each_is_enough_for_gradient_descent():
+    """A linear discriminant would refuse it."""
+    check_agrees(train("recurrent", easy(1)), easy(1).samples)
 
 
-@pytest.mark.parametrize("name", quick_first(NAMES))
+@pytest.mark.parametrize("name", quick_first(NETS))
 def test_silence_is_no_trouble(name: str):
     """After training without any signal, logits of constant sweeps are finite and equal for all."""
     s = easy(6)
@@ -292,31 +283,9 @@ def test_probabilities_come_from_what_was_held_out():
 
 
 @pytest.mark.slow
-def test_compact_is_what_palpate_train_fits():
-    """The same network and int8 head as by `fit`, with shifted float logits, on a grid and along a
-    line."""
-    s = easy(12)
-    line = replace(s, samples=s.samples.reshape(len(s), 64, 4, 1))
-    for given in (s, line):
-        same, model = stages.fit_network(given, 1, FitRecipe(steps=6)), train("compact", given)
-        with torch.no_grad():
-            want = stages.network_of(same)(
-                torch.from_numpy(given.samples.astype(np.float32))
-            ).numpy()
-        have = model.precisions["float"].logits(given.samples)
-        np.testing.assert_allclose(have, want - want.mean(1, keepdims=True), rtol=1e-4, atol=1e-3)
-        int8 = graph_builder.run(
-            graph_builder.with_head(same.trunk(), *same.int8_head()), given.samples
-        )
-        np.testing.assert_allclose(model.logits(given.samples), int8, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_window_too_short_is_named():
-    """The compact network needs 16 frames; the other networks take any window."""
+def test_networks_take_any_window():
+    """Seven frames are enough."""
     s = made((12, 7, 2, 2), "int16")
-    with pytest.raises(FormatError, match="a window of 7 frames is too short"):
-        train("compact", s)
     for name in NETS:
         check_agrees(train(name, s), s.samples[:1])
 

@@ -15,9 +15,10 @@ from onnx import numpy_helper
 from appliance.core.errors import FormatError
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
+from tests.factories.trained_stages import with_stages
 from train.export import quantized_bundle
 from train.models.recipe import stages
-from train.models.recipe.stages import Fit, FitRecipe
+from train.models.recipe.fitted import Fit
 from train.onnx_tools import parity
 from train.onnx_tools.parity import Layer
 from train.onnx_tools.quantize import quantize
@@ -27,8 +28,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
-    """A fit with every kind of node that int8 has."""
-    return stages.fit_network(close(), 1, FitRecipe(steps=60))
+    """A fit with trained stages."""
+    return with_stages(close(), steps=60)
 
 
 def measured(fitted: Fit) -> parity.Parity:

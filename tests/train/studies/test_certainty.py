@@ -313,7 +313,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
     hums, lines = sweeps(), []
     where = Where(jobs=1, cache=tmp_path / "cache")
     first = certainty.run(
-        hums, None, "split:position=0,1,2->3", "compact-1k", where, lines.append, Effort(0.02)
+        hums, None, "split:position=0,1,2->3", "palpate-pairs", where, lines.append, Effort(0.02)
     )
     assert first["trainings"] == 4
     assert "4/4 done" in lines[-2]
@@ -323,7 +323,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
         hums,
         None,
         "split:position=0,1,2->3",
-        "compact-1k",
+        "palpate-pairs",
         replace(where, kept=True),
         lines.append,
         Effort(0.02),
@@ -336,7 +336,7 @@ def test_from_set_to_page_and_again_from_the_cache(tmp_path):
             hums,
             None,
             "split:position=0,1->2",
-            "compact-1k",
+            "palpate-pairs",
             replace(where, kept=True),
             lines.append,
             Effort(0.02),

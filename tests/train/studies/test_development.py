@@ -64,7 +64,7 @@ def test_the_page_shows_every_figure():
         "one: a force it never felt one.npz, force<=180 leave:force digest of one",
         "one: a force it never felt : real sweeps, 4 classes: trained on sweeps of all forces "
         "but one",
-        "default, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores",
+        "palpate, quick <b>, quant: seeds 1, 2; commit 0123abcd; x86_64, 2 cores",
         "QUANT 1.50",
         "QUANT float onnx 22.0 44.0",
     )
@@ -161,9 +161,9 @@ def test_a_part_of_the_results_makes_a_page():
 
     A case without a result of the project has no line.
     """
-    alone = [entry("one", "compact-50k", 0.9), entry("two", "quant", 0.7)]
+    alone = [entry("one", "palpate-stages", 0.9), entry("two", "quant", 0.7)]
     pages, pictures = development_report.render(
-        figures(results=alone, methods=["compact-50k", "quant"], times=None)
+        figures(results=alone, methods=["palpate-stages", "quant"], times=None)
     )
     text = PageReader(pages["index"]).text.replace("\N{NO-BREAK SPACE}", " ")
     assert "one: a force it never felt no peer was run 90.0 % 85.0 – 95.0 % –" in text
@@ -175,8 +175,7 @@ def test_without_a_result_of_ours_there_is_no_page(tmp_path: Path):
     """The error says what to do, and no file is written."""
     with pytest.raises(
         FormatError,
-        match="no result of default or default-reattached or filter-bank or compact-50k; "
-        "run the command",
+        match=r"no result of palpate or palpate-reattached or .*palpate-256; run the command",
     ):
         published("development", figures(results=[entry("one", "quant", 0.9)]), tmp_path)
     assert not (tmp_path / "pages").exists()
@@ -334,7 +333,7 @@ def test_a_run_is_joined_by_what_it_lacks_of_another():
         methods=["quant", "minirocket", "palpate"],
         results=others,
         left_out={
-            "default, one": "was too slow",
+            "palpate, one": "was too slow",
             "quant, two": "too short",
             "one": "not wanted",
             "one, 5 each": "no",
@@ -521,9 +520,9 @@ def test_networks_of_peers_are_trained_briefly_for_their_time():
     """The project's networks are trained in full, because their choices decide their speed."""
     brief, whole = (
         development_times._briefly(name, methods.FULL_EFFORT).effort
-        for name in ("ds-cnn", "compact-50k")
+        for name in ("ds-cnn", "palpate-stages")
     )
-    assert (brief, whole) == ("200 iterations", methods.every()["compact-50k"].effort)
+    assert (brief, whole) == ("200 iterations", methods.every()["palpate-stages"].effort)
 
 
 @pytest.mark.slow
@@ -633,7 +632,14 @@ def test_the_quick_form_writes_everything(tmp_path: Path, capsys: pytest.Capture
     assert "mean nothing" in page.read_text()
     assert (
         main(
-            [*args, "--kept", "--method", "compact-50k,L-gauss", "--out", str(tmp_path / "b.json")]
+            [
+                *args,
+                "--kept",
+                "--method",
+                "palpate-bands,L-gauss",
+                "--out",
+                str(tmp_path / "b.json"),
+            ]
         )
         == 0
     )

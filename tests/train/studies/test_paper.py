@@ -15,6 +15,7 @@ from appliance.sim.skin import MATERIALS
 from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
 from train.evaluation.evaluate import Where
+from train.models.recipe.sizes import SIZES
 from train.reports.html import picture
 from train.studies import paper_experiment, paper_report, paper_values, study
 from train.studies.command import main
@@ -454,8 +455,8 @@ def test_some_methods_are_run_again_and_the_others_stay():
 
 def test_only_methods_of_the_plan_are_run():
     """Steps without any of them are left out. An unknown method is reported."""
-    steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["default", "H-svm"])
-    assert [step.methods for step in steps] == [("H-svm",), ("default",)]
+    steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["palpate", "H-svm"])
+    assert [step.methods for step in steps] == [("H-svm",), ("palpate",)]
     with pytest.raises(
         FormatError, match="method 'quant' is not in the paper's experiment; use some of L-gauss"
     ):
@@ -466,12 +467,11 @@ def test_plans_name_methods_and_parts_that_exist():
     """In the full and the quick plan all methods of each step are known and its parts planned.
 
     Both have every bar of Figs. 4 to 7; the paper's CNN of Fig. 10 comes from cnn_curve, or from a
-    quick run. The paper's experiment leaves out the sizes of the recipe and of older networks, and
-    the methods that `development` and the chart compare.
+    quick run. The paper's experiment leaves out the sizes of the recipe, and the methods that
+    `development` compares.
     """
     known = set(paper_experiment.methods.every())
     newer = {
-        "compact",
         "multirocket-hydra",
         "quant",
         "minirocket-augmented",
@@ -486,9 +486,7 @@ def test_plans_name_methods_and_parts_that_exist():
     ):
         ran = {(part, m) for step in steps for part in step.parts for m in step.methods}
         left = known ^ {m for _, m in ran}
-        assert (
-            left == {m for m in known if m.startswith(("compact-", "palpate-"))} | {absent} | newer
-        )
+        assert left == {f"palpate-{size}" for size in SIZES} | {absent} | newer
         assert {part for part, _ in ran} == set(parts) == set(paper_report.TITLES)
         assert bars - {(part, absent) for part in parts} <= ran
 

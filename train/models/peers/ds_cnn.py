@@ -86,8 +86,7 @@ class DepthwiseSeparable(Network):
 
 
 def build(format: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact
-    network."""
+    """The network with random weights; each taxel's mean is subtracted."""
     return DepthwiseSeparable(format, classes, texture_scale(samples))
 
 

@@ -190,8 +190,7 @@ def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
 
 
 def build(format: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact
-    network."""
+    """The network with random weights; each taxel's mean is subtracted."""
     return Lite(format, classes, texture_scale(samples))
 
 

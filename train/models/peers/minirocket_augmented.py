@@ -16,13 +16,12 @@ from train.data.sets import Dataset
 from train.models.linear_head import LinearHeadModel
 from train.models.methods import Method
 from train.models.peers import minirocket
-from train.models.recipe.architectures import DEFAULT
+from train.models.recipe.architectures import STAGES
 from train.models.recipe.augment import SLOW, Augmentation, copies, default_augmentation
 
 Array = NDArray[Any]
 COPIES = 2
-"""Number of copies of each training sweep, as many as the closed-form head of the compact network
-sees."""
+"""Number of copies of each training sweep, as many as the heads of the recipe see."""
 
 
 def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
@@ -45,7 +44,7 @@ def augmentation(window: int) -> Augmentation:
     """The augmentation of our own training for a window of this many frames; that of slow sensors
     if our networks cannot take the window."""
     try:
-        return default_augmentation(DEFAULT.zero_sum(window))
+        return default_augmentation(STAGES.zero_sum(window))
     except FormatError:
         return SLOW
 

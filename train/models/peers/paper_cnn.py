@@ -204,14 +204,12 @@ def build_paper_cnn(
 def build_centred(
     format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
 ) -> Network:
-    """The paper's CNN behind a layer that subtracts each taxel's mean, as in the compact
-    network."""
+    """The paper's CNN behind a layer that subtracts each taxel's mean."""
     return ImageNetwork(format, classes, texture_scale(samples), None, layers)
 
 
 def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> Network:
-    """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted, as in the
-    compact network.
+    """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted.
 
     Dropout is off at test time, on the box and here. This is the mean field of the published Monte
     Carlo dropout; the same sweep always gets the same answer.

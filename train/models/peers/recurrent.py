@@ -22,7 +22,7 @@ STATE, PATCHES, MIN_PATCH = 64, 128, 8
 """Size of the state, number of patches that cover a window (approximately), frames of the shortest
 patch."""
 RECIPE = TrainingRecipe(steps=400)
-"""The recipe of the compact network with fewer iterations."""
+"""Half as many iterations as usual."""
 
 
 class Recurrent(Network):
@@ -77,8 +77,7 @@ def _onnx_gate_order(gates: Tensor) -> Array:
 
 
 def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> Network:
-    """The network with random weights; each taxel's mean is subtracted, as in the compact
-    network."""
+    """The network with random weights; each taxel's mean is subtracted."""
     return Recurrent(format, classes, texture_scale(samples))
 
 

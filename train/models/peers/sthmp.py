@@ -33,8 +33,9 @@ from train.onnx_tools.graph_builder import GraphBuilder, run
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
 """Sizes of a patch: frames, taxels along each axis, and frames from one patch to the next. They
-were fixed before any data was examined, at half the length of the compact network's first kernel.
-In a short window patches are half as long as the window, and no patch is wider than the grid."""
+were fixed before any data was examined, at half the length of the first kernel of the recipe's
+stages. In a short window patches are half as long as the window, and no patch is wider than the
+grid."""
 MIN_WINDOW = 8
 """Number of frames of the shortest window."""
 ATOMS, ACTIVE = 100, 4

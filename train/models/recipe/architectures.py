@@ -1,15 +1,14 @@
-"""The architectures of the compact network, by size.
+"""The architecture of a trunk: its trained stages, and the features beside them.
 
-All sizes are alike: dense strided convolutions over time with the taxels as input channels; the
-head sees the logarithm of every stage's mean responses.
+Stages are dense strided convolutions over time with the taxels as input channels; a feature is the
+logarithm of a channel's mean response.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from appliance.core.errors import FormatError
-from appliance.core.types import SweepFormat
 
 PREFIXES = 10
 """Number of prefixes of a window, after each of which the box may answer early: the first tenth,
@@ -55,22 +54,12 @@ def each_frame(window: int) -> Stage:
 
 
 @dataclass(frozen=True)
-class Cost:
-    """The cost of a network: trained numbers, and multiply-accumulates of one sweep (convolutions
-    and head)."""
-
-    weights: int
-    macs: int
-
-
-@dataclass(frozen=True)
 class Architecture:
-    """The layers of one size. channels: of each stage; kernel and stride: of the first stage for
-    long windows.
+    """The parts of a trunk. channels: of each stage, if there are any; kernel and stride: of the
+    first stage for long windows.
 
-    planned: number of stages before some were cut off, 0 if none were; without any stage the head
-    sees only the spectrum. spectrum: whether the head sees the bands of spectrum.py after the
-    stages' responses. fewest: number of stages that are never cut off. pools: pooling of the filter
+    planned: number of stages for which a trunk without stages prepares counts. spectrum: whether
+    the head sees the bands of spectrum.py after all other features. pools: pooling of the filter
     bank of bank.py: 0 without a bank, 1 by magnitudes, 2 by shares as well. distribution: whether
     the head sees the shares of distribution.py. loads: whether it sees those of loads.py.
     relations: number of scales of relations.py that it sees. mains_hz: frequency of the mains, to
@@ -82,17 +71,11 @@ class Architecture:
     stride: int = 4
     planned: int = 0
     spectrum: bool = False
-    fewest: int = 1
     pools: int = 0
     distribution: bool = False
     loads: bool = False
     relations: int = 0
     mains_hz: float = MAINS_HZ
-
-    def cut(self, depth: int, spectrum: bool = False) -> Architecture:
-        """The first `depth` stages, unchanged, with the spectrum or without."""
-        planned = max(self.planned, len(self.channels))
-        return replace(self, channels=self.channels[:depth], planned=planned, spectrum=spectrum)
 
     def stages(self, window: int) -> tuple[Stage, ...]:
         """The stages for a window of this many frames.
@@ -132,30 +115,9 @@ class Architecture:
         """
         return self._planned_stages(window)[0].stride > 1
 
-    def cost(self, format: SweepFormat, classes: int) -> Cost:
-        """The cost of convolutions and head, as they are in the graph."""
-        head = sum(self.channels) * classes
-        weights, macs, inputs = head + classes, head, format.channels
-        for stage, outputs in zip(self.stages(format.window), self.channels, strict=True):
-            taps = inputs * stage.kernel * outputs
-            weights, macs, inputs = weights + taps + outputs, macs + taps * stage.steps, outputs
-        return Cost(weights, macs)
 
-
-ARCHITECTURES = {
-    "bands": Architecture((), planned=3, spectrum=True, fewest=0),
-    "1k": Architecture((2, 6, 8), 32, 8),
-    "4k": Architecture((5, 12, 16), 32, 8),
-    "10k": Architecture((8, 20, 36), 32, 8),
-    "20k": Architecture((24, 24, 24)),
-    "50k": Architecture((40, 48, 64)),
-    "100k": Architecture((32, 72, 104)),
-}
-"""By the approximate maximum of their weights, for 1500 x 4 x 4 raw counts and six materials. The
-last is as large as its bundle may be; the first has only the spectrum and a head."""
-DEFAULT = replace(ARCHITECTURES["20k"], fewest=0)
-"""The architecture of the method `compact`: all stages may be cut off if the spectrum alone does as
-well."""
+STAGES = Architecture((40, 48, 64))
+"""The trained stages of the recipe: about 50,000 weights for 1500 x 4 x 4 raw counts."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A finished model: a trunk, its heads, its calibration, the contact positions, and the sweeps that
 all of it was fitted to.
 
-`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is not needed:
-stages.network_of gives the network of a fit.
+`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is not needed;
+stages.network_of gives the stages of a fit in PyTorch.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from train.calibration.displacement import AugmentedCopies
 from train.calibration.heads import HeadPlan
 from train.data.sets import Dataset
 from train.models.linear_head import hold_out
-from train.models.methods import Cost, Model
+from train.models.methods import Model
 from train.models.recipe import graph, spectrum
 from train.models.recipe.architectures import Architecture
 from train.models.recipe.augment import COPIES, Augmentation, copies
@@ -57,16 +57,15 @@ shares."""
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained network.
+    """A fitted trunk with its heads.
 
-    weights: the state of a fused Compact with its LDA head, the temperature folded in, and a second
-    head, `int8.weight` [K, F] and `int8.bias` [K], fitted to the features of the int8 trunk.
-    architecture: cut to the parts that the heads see. ranges: of int8; None for a float trunk
-    alone. train, held: the training sweeps and the held-out sweeps. about: JSON, how the fit was
-    made and validated. plan: fits the heads again, before a temperature. cost: (step, cross
-    entropy) of the training; the file does not keep it. calibration: of the int8 trunk if there is
-    one; None if the sweeps do not suffice, with the reason in `uncalibrated`. contacts: None until
-    the fit is `finished`.
+    weights: of the trunk, as graph.trunk_graph takes them; `head.weight` [K, F] and `head.bias`
+    [K], fitted to the features of the float trunk, and `int8.weight` and `int8.bias`, fitted to
+    those of the int8 trunk, the temperature folded into both. architecture: only the parts that the
+    heads see. ranges: of int8; None for a float trunk alone. train, held: the training sweeps and
+    the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
+    again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
+    do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
     """
 
     weights: dict[str, Array]
@@ -77,7 +76,6 @@ class Fit:
     held: Dataset
     about: Json
     plan: HeadPlan
-    cost: Cost = field(default_factory=list)
     calibration: Calibration | None = None
     uncalibrated: str = ""
     contacts: Contacts | None = None
@@ -251,19 +249,18 @@ def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
 
 
 @dataclass(frozen=True)
-class CompactModel:
+class FittedModel:
     """A fit as the box runs it.
 
     fit: its origin, with training and held-out sweeps. weight [K, F], bias [K]: its head for all
-    materials. ran: a description of the computation. cost: of the training of stages. precisions:
-    "float", the model before quantization.
+    materials. ran: a description of the computation. precisions: "float", the model before
+    quantization.
     """
 
     fit: Fit
     weight: Array
     bias: Array
     ran: str
-    cost: Cost = field(default_factory=list)
     precisions: Mapping[str, Model] = field(default_factory=dict)
 
     def features(self, inputs: Array, prefixes: bool = False) -> Array:

@@ -1,4 +1,4 @@
-"""The graphs of the compact network: `sweep` -> its features, in float and in int8.
+"""The graphs of a trunk: `sweep` -> its features, in float and in int8.
 
 Both have the same nodes. In int8 everything is an integer up to the mean responses: the first
 convolution takes bytes as they come from the sensor, because its integer taps sum to zero and no
@@ -44,7 +44,7 @@ class Prepared:
 @dataclass(frozen=True)
 class Ranges:
     """The ranges of int8. counts: of a raw count on either side of its level, which raw counts that
-    are bytes do not need. responses: of each stage, in the scaled units of the network."""
+    are bytes do not need. responses: of each stage, in units of scaled counts."""
 
     counts: float
     responses: tuple[float, ...]
@@ -68,8 +68,8 @@ def trunk_graph(
     ranges: Ranges | None = None,
     prefixes: bool = False,
 ) -> onnx.ModelProto:
-    """A fused Compact up to its features: `sweep` -> `features` float32 [1, F]; in int8 if there
-    are `ranges`. The bands of the spectrum are the last features, in float.
+    """`sweep` -> `features` float32 [1, F], part by part as in `layout`; in int8 if there are
+    `ranges`, except the spectrum, loads and relations. weights: of a Fit.
 
     prefixes: `tenths` float32 [1, PREFIXES, F] instead, the features of each prefix of the window.
     Row d depends on no frame after (d + 1) / PREFIXES of the window, as long as later frames repeat

@@ -25,7 +25,7 @@ from train.models.methods import (
     no_log,
 )
 from train.models.recipe import recipe
-from train.models.recipe.fitted import CompactModel
+from train.models.recipe.fitted import FittedModel
 from train.models.recipe.sizes import SIZES
 from train.onnx_tools.graph_builder import GraphModel, with_head
 
@@ -34,7 +34,7 @@ Array = NDArray[Any]
 
 def train(
     sweeps: Dataset, inputs: Array, seed: int, *, settings: recipe.Settings, log: Log = no_log
-) -> CompactModel:
+) -> FittedModel:
     """Fit as `palpate-train fit` does, on `inputs`, the raw counts [N, T, R, C] of `sweeps`, but
     without calibration.
 
@@ -53,7 +53,7 @@ def train(
         for name in ("head", "int8")
     }
     precisions = {"float": GraphModel(with_head(fit.trunk(int8=False), *heads["head"]))}
-    return CompactModel(fit, *heads["int8"], fit.about["chosen"], precisions=precisions)
+    return FittedModel(fit, *heads["int8"], fit.about["chosen"], precisions=precisions)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:

@@ -38,7 +38,7 @@ from train.metrics.score import interval
 from train.models.linear_head import hold_out_or_all
 from train.models.methods import AS_RECORDED, Log, SkinUse, no_log
 from train.models.recipe import bank, choice, distribution, graph, relations, spectrum
-from train.models.recipe.architectures import ARCHITECTURES, MAINS_HZ, Architecture
+from train.models.recipe.architectures import MAINS_HZ, STAGES, Architecture
 from train.models.recipe.augment import (
     COPIES,
     Augmentation,
@@ -54,8 +54,6 @@ from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
 
 Array = NDArray[Any]
-STAGES = ARCHITECTURES["50k"]
-"""The architecture of trained stages."""
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
@@ -64,7 +62,7 @@ STAGES_WEIGHT = 0.5
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on stages improve too little for their share of the
 bundle's size and time."""
-FIXED = Architecture((), planned=len(STAGES.channels), fewest=0)
+FIXED = Architecture((), planned=len(STAGES.channels))
 """A trunk without stages that prepares counts as a trunk with STAGES does."""
 
 
@@ -413,11 +411,18 @@ def _trained(setup: Setup) -> Trunk:
     """See Setup.stages."""
     from train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
 
-    settings, sweeps, scale = setup.settings, setup.sides[0], texture_scale(setup.sweeps.samples)
-    recipe = stages.FitRecipe(steps=settings.steps, augmentation=setup.augmentation)
+    settings, sweeps = setup.settings, setup.sides[0]
+    scale = texture_scale(setup.sweeps.samples)
     architecture = replace(STAGES, mains_hz=settings.use.mains_hz)
     weights, ranges = stages.train_stages(
-        sweeps, scale, setup.seed, recipe, setup.part(3), architecture, settings.unfinished
+        sweeps,
+        scale,
+        setup.seed,
+        settings.steps,
+        setup.augmentation,
+        setup.part(3),
+        architecture,
+        settings.unfinished,
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
 

@@ -1,15 +1,14 @@
-"""The spectrum that all taxels share: log band powers, in PyTorch and as ONNX nodes.
+"""The spectrum that all taxels share: log band powers, as ONNX nodes.
 
-These are fixed features beside the learned ones. Training discards features that do not separate
-the training materials; it overfits, and its features hardly show that a material is unknown. Here
-the mean of the taxels over the grid, for each axis, is cut into tenths of the window. The power in
-bands of each tenth's spectrum (Welch 1967) is a feature, as a logarithm. Each tenth is processed by
-itself, so that offsets and later frames do not matter; the hum of the mains is removed.
+These are fixed features. Training discards features that do not separate the training materials;
+it overfits, and its features hardly show that a material is unknown. Here the mean of the taxels
+over the grid, for each axis, is cut into tenths of the window. The power in bands of each tenth's
+spectrum (Welch 1967) is a feature, as a logarithm. Each tenth is processed by itself, so that
+offsets and later frames do not matter; the hum of the mains is removed.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -114,21 +113,6 @@ def _window(length: int) -> Array:
     window = np.hanning(length + 2)[1:-1, None]
     scaled: Array = window / np.sqrt((window**2).sum())
     return scaled
-
-
-@cache
-def matrices(length: int, mains: float) -> tuple[Array, Array]:
-    """Waves [length, 2 * half bins], and the matrix that averages their squares over each band,
-    float32."""
-    k = np.arange(2, length + 1)
-    phase = np.pi / length * (np.arange(length)[:, None] * k % (2 * length))
-    waves = np.hstack([np.cos(phase), np.sin(phase)]) * _window(length)
-    unwanted, edges = _unwanted(length, mains), _edges(length)
-    both = np.tile(k, 2)[:, None]
-    averaging = ((both >= edges[:-1]) & (both < edges[1:])) / np.diff(edges)
-    return (waves - unwanted @ (unwanted.T @ waves)).astype(np.float32), averaging.astype(
-        np.float32
-    )
 
 
 def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:

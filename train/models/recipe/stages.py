@@ -1,18 +1,14 @@
-"""The trained stages: the compact network in PyTorch, its training, and a fit of it alone.
+"""The trained stages: their network in PyTorch, and its training.
 
-The convolutions are trained by gradient descent on augmented sweeps. Then shrinkage LDA in closed
-form replaces the head, once for the network and once for its int8 trunk. Held-out groups decide how
-many stages the heads see, and the temperature. No random state outside is read or changed.
+The convolutions are trained by gradient descent on augmented sweeps, under a head that is dropped
+afterwards: recipe.py fits heads in closed form. No random state outside is read or changed.
 
-The sizes of the network are in architectures.py; graph.py writes its graphs, in float and in int8.
+The sizes of the stages are in architectures.py; graph.py writes their graphs, in float and in int8.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from itertools import chain, product
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,36 +19,28 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
-from appliance.inference.classifier import LEAST_PROBABILITY, softmax
-from train.calibration.heads import HeadPart, HeadPlan
 from train.data.sets import Dataset
-from train.metrics.score import accuracy_figure
-from train.models import training
-from train.models.linear_head import closed_form_head, hold_out
-from train.models.methods import Cost, Log, no_log
+from train.models.methods import Log
 from train.models.networks import Network
-from train.models.recipe import graph, spectrum
-from train.models.recipe.architectures import DEFAULT, FLOOR, NOISE_LIMIT, Architecture
-from train.models.recipe.augment import (
-    COPIES,
-    Augmentation,
-    augment,
-    copies,
-    default_augmentation,
-    texture_scale,
-)
-from train.models.recipe.fitted import Fit, finished
+from train.models.recipe.architectures import FLOOR, NOISE_LIMIT, STAGES, Architecture
+from train.models.recipe.augment import Augmentation, augment
+from train.models.recipe.fitted import Fit
 from train.models.recipe.graph import Ranges, level_frames, trunk_graph
-from train.models.training import Augment, batches, float_batches, learn, one_thread
-from train.onnx_tools.graph_builder import run, with_head
+from train.models.training import (
+    Augment,
+    TrainingRecipe,
+    batches,
+    float_batches,
+    learn,
+    one_thread,
+)
+from train.onnx_tools.graph_builder import with_head
 from train.onnx_tools.quantize import PERCENTILE, calibration_sweeps
 
 Array = NDArray[Any]
-HeadInputs = tuple[tuple[Array, Array], ...]
-"""(features of the training sweeps and their copies, features of the held-out sweeps) of the float
-and the int8 trunk."""
+TRAINING = TrainingRecipe(noise=0.0, gain=0.0)
+"""The training of stages, but for its steps; an Augmentation replaces gain and noise."""
 
 
 class ZeroSum(nn.Conv1d):
@@ -93,19 +81,7 @@ def limit_noise(x: Tensor) -> Tensor:
     return torch.where((noise > limit) & (limit > 0), x * (limit / noise), x)
 
 
-def band_powers(x: Tensor, format: SweepFormat, mains_hz: float) -> Tensor:
-    """Scaled taxels [B, R * C * A, T] -> log band powers [B, count(format)], those of the first
-    axis first."""
-    length = format.window // spectrum.SEGMENTS
-    waves, averaging = (
-        torch.from_numpy(m) for m in spectrum.matrices(length, spectrum.mains(format, mains_hz))
-    )
-    mean = x.unflatten(1, (-1, format.axes)).mean(1)[:, :, : length * spectrum.SEGMENTS]
-    cut = mean.unflatten(2, (spectrum.SEGMENTS, length))
-    return torch.log(((cut @ waves).square() @ averaging).mean(2) + spectrum.QUIET).flatten(1)
-
-
-class Compact(Network):
+class StagesNetwork(Network):
     """Strided convolutions over time with the taxels as channels; the head sees the logarithm of
     every mean response.
 
@@ -120,7 +96,7 @@ class Compact(Network):
         classes: int,
         scale: float,
         norm: bool = True,
-        architecture: Architecture = DEFAULT,
+        architecture: Architecture = STAGES,
     ) -> None:
         super().__init__(format, scale)
         self.architecture = architecture
@@ -132,7 +108,7 @@ class Compact(Network):
             nn.Conv1d(before, after, stage.kernel, stage.stride)
             for before, after, stage in zip(inputs, architecture.channels, stages, strict=False)
         )
-        if architecture.channels and architecture.zero_sum(format.window):
+        if architecture.zero_sum(format.window):
             first = stages[0]
             periods = first.kernel * architecture.mains_hz / format.rate_hz
             mains = (
@@ -144,8 +120,7 @@ class Compact(Network):
         self.norms = nn.ModuleList(
             nn.BatchNorm1d(n) if norm else nn.Identity() for n in architecture.channels
         )
-        bands = architecture.spectrum * spectrum.count(format)
-        self.head = nn.Linear(sum(architecture.channels) + bands, classes)
+        self.head = nn.Linear(sum(architecture.channels), classes)
 
     def responses(self, prepared: Tensor) -> list[Tensor]:
         """[B, R * C, T] -> for each stage its responses [B, channels, steps], which are not
@@ -158,25 +133,11 @@ class Compact(Network):
     def features(self, prepared: Tensor) -> Tensor:
         """[B, R * C, T] -> log mean responses [B, sum of channels]."""
         means = [x.mean(2) for x in self.responses(prepared)]
-        return (
-            torch.log(torch.cat(means, 1) + FLOOR)
-            if means
-            else prepared.new_zeros(len(prepared), 0)
-        )
+        return torch.log(torch.cat(means, 1) + FLOOR)
 
-    def head_input(self, counts: Tensor) -> Tensor:
-        """Raw counts [B, T, R, C] -> the features that the head sees [B, F]."""
-        prepared = self.prepare(counts)
-        parts = [self.features(prepared)]
-        if self.architecture.spectrum:
-            parts.append(
-                band_powers(limit_noise(prepared), self.format, self.architecture.mains_hz)
-            )
-        return torch.cat(parts, 1)
-
-    def fused(self) -> Compact:
+    def fused(self) -> StagesNetwork:
         """The same network for inference, with its batch norms folded into the convolutions."""
-        plain = Compact(
+        plain = StagesNetwork(
             self.format,
             self.head.out_features,
             self.scale,
@@ -188,18 +149,9 @@ class Compact(Network):
             assert isinstance(conv, nn.Conv1d)
             assert isinstance(norm, nn.BatchNorm1d)
             target.load_state_dict(fuse_conv_bn_eval(conv.eval(), norm.eval()).state_dict())
-        if self.convs:
-            first = plain.convs[0].get_parameter("weight")
-            first.data.copy_(self.first_taps(first))
+        first = plain.convs[0].get_parameter("weight")
+        first.data.copy_(self.first_taps(first))
         return plain.eval()
-
-    def cut(self, depth: int, spectrum: bool) -> Compact:
-        """The first `depth` stages of a fused network, with the spectrum or without; its head is
-        not fitted yet."""
-        architecture = self.architecture.cut(depth, spectrum)
-        less = Compact(self.format, self.head.out_features, self.scale, False, architecture)
-        less.convs.load_state_dict(self.convs[:depth].state_dict())
-        return less.eval()
 
     def first_taps(self, weight: Tensor) -> Tensor:
         """The taps that the first convolution applies for its weight."""
@@ -210,8 +162,6 @@ class Compact(Network):
     def weights(self) -> dict[str, Array]:
         """The weights that `trunk_graph` takes; of a fused network."""
         weights = {k: v.numpy() for k, v in self.state_dict().items()}
-        if not self.convs:
-            return weights
         return weights | {
             "convs.0.weight": self.first_taps(self.convs[0].get_parameter("weight")).numpy()
         }
@@ -240,183 +190,43 @@ class Compact(Network):
         return Ranges(largest, tuple(responses))
 
 
-def network_of(fit: Fit) -> Compact:
-    """The network of a fit, ready to run; the fit has no filter bank."""
+def network_of(fit: Fit) -> StagesNetwork:
+    """The stages of a fit as a network that computes their features; its head is arbitrary."""
     with torch.random.fork_rng(devices=[]):  # its first weights are drawn and overwritten
         format, classes = fit.train.format, len(fit.train.materials)
-        model = Compact(format, classes, fit.scale, False, fit.architecture)
-    state = {k: torch.from_numpy(v) for k, v in fit.weights.items() if not k.startswith("int8.")}
-    model.load_state_dict(state)
+        model = StagesNetwork(format, classes, fit.scale, False, fit.architecture)
+    prefix = "convs."
+    model.convs.load_state_dict(
+        {
+            name.removeprefix(prefix): torch.from_numpy(values)
+            for name, values in fit.weights.items()
+            if name.startswith(prefix)
+        }
+    )
     return model.eval()
-
-
-@dataclass(frozen=True)
-class FitRecipe(training.TrainingRecipe):
-    """The training of the compact network.
-
-    augmentation: of the training sweeps, None for `default_augmentation`; it replaces gain and
-    noise.
-    """
-
-    steps: int = 600
-    noise: float = 0.0
-    gain: float = 0.0
-    augmentation: Augmentation | None = None
-
-    def json(self) -> dict[str, Any]:
-        """The entry `recipe` of a fit and of the manifest of its bundle."""
-        return asdict(self)
-
-
-def fit_network(
-    sweeps: Dataset,
-    seed: int,
-    recipe: FitRecipe,
-    log: Log = no_log,
-    architecture: Architecture = DEFAULT,
-    unfinished: Path | None = None,
-) -> Fit:
-    """A finished fit of a network alone, trained on the sweeps that `hold_out` leaves. Raises
-    FormatError as `hold_out`, and if the window is too short."""
-    sides = hold_out(sweeps, seed)
-    return finished(fit_network_on(*sides, seed, recipe, log, architecture, unfinished))
-
-
-def fit_network_on(
-    train: Dataset,
-    held: Dataset,
-    by: str,
-    seed: int,
-    recipe: FitRecipe,
-    log: Log = no_log,
-    architecture: Architecture = DEFAULT,
-    unfinished: Path | None = None,
-) -> Fit:
-    """A network trained on `train`; `held` gives temperature and validation. by: the group that
-    separates the two, for the record. unfinished: see training.learn."""
-    format, bands = train.format, spectrum.count(train.format)
-    if not (architecture.channels or bands):
-        raise FormatError(
-            f"a window of {format.window} frames is too short for a spectrum; take another size"
-        )
-    augmentation = recipe.augmentation or default_augmentation(architecture.zero_sum(format.window))
-    recipe, scale = replace(recipe, augmentation=augmentation), texture_scale(train.samples)
-    with one_thread(), torch.random.fork_rng(devices=[]), torch.no_grad():
-        model, cost = _learned(train, scale, seed, recipe, log, architecture, unfinished)
-        model.architecture = replace(architecture, spectrum=bands > 0)
-        ranges = model.ranges(train.samples)
-        inputs = _head_inputs(model, ranges, train, held, copies(train, augmentation, seed, COPIES))
-        labels = np.tile(train.labels, COPIES + 1)
-        model, weights = _select_depth(model, inputs, labels, held.labels)
-        logits = features(model, held) @ weights["head.weight"].T + weights["head.bias"]
-    about = {
-        "seed": seed,
-        "recipe": recipe.json() | {"mains_hz": architecture.mains_hz},
-        "held_out_by": by,
-        "validation": accuracy_figure(int(np.sum(logits.argmax(1) == held.labels)), len(held)),
-    }
-    ranges = replace(ranges, responses=ranges.responses[: len(model.convs)])
-    plan = HeadPlan((HeadPart(tuple(range(weights["head.weight"].shape[1])), copies=True),))
-    return Fit(weights, scale, model.architecture, ranges, train, held, about, plan, cost)
 
 
 def train_stages(
     sweeps: Dataset,
     scale: float,
     seed: int,
-    recipe: FitRecipe,
+    steps: int,
+    augmentation: Augmentation,
     log: Log,
-    architecture: Architecture,
+    architecture: Architecture = STAGES,
     unfinished: Path | None = None,
-) -> tuple[dict[str, Array], graph.Ranges]:
+) -> tuple[dict[str, Array], Ranges]:
     """Stages trained on all of `sweeps`, whose counts are multiplied by `scale`: their weights as
     graph.trunk_graph takes them, and ranges for int8. unfinished: see training.learn."""
+    recipe, change = replace(TRAINING, steps=steps), augmenter(sweeps.format, augmentation)
     with one_thread(), torch.random.fork_rng(devices=[]):
-        model, _ = _learned(sweeps, scale, seed, recipe, log, architecture, unfinished)
+        torch.manual_seed(seed)
+        model = StagesNetwork(
+            sweeps.format, len(sweeps.materials), scale, architecture=architecture
+        )
+        model, _ = learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
         weights = {k: v for k, v in model.weights().items() if k.startswith("convs.")}
         return weights, model.ranges(sweeps.samples)
-
-
-def _learned(
-    sweeps: Dataset,
-    scale: float,
-    seed: int,
-    recipe: FitRecipe,
-    log: Log,
-    architecture: Architecture,
-    unfinished: Path | None,
-) -> tuple[Compact, Cost]:
-    """A fused network trained on `sweeps`, and the cost of each step. Without stages there is
-    nothing to train."""
-    assert recipe.augmentation
-    torch.manual_seed(seed)
-    model = Compact(sweeps.format, len(sweeps.materials), scale, architecture=architecture)
-    if not architecture.channels:
-        return model.fused(), []
-    change = augmenter(sweeps.format, recipe.augmentation)
-    with torch.enable_grad():
-        return learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
-
-
-def _head_inputs(
-    model: Compact, ranges: graph.Ranges, train: Dataset, held: Dataset, more: Iterable[Dataset]
-) -> HeadInputs:
-    """The features of the training sweeps with their copies, and of the held-out sweeps: (float,
-    int8)."""
-    trunk = graph.trunk_graph(
-        model.format, model.scale, model.weights(), model.architecture, ranges
-    )
-    trunks: tuple[Callable[[Dataset], Array], ...] = (
-        partial(features, model),
-        lambda sweeps: run(trunk, sweeps.samples),
-    )
-    rows = [[compute(sweeps) for compute in trunks] for sweeps in chain([train], more)]
-    return tuple(
-        (np.concatenate(of_all), compute(held))
-        for of_all, compute in zip(zip(*rows, strict=True), trunks, strict=True)
-    )
-
-
-def _select_depth(
-    model: Compact, inputs: HeadInputs, labels: Array, held_labels: Array
-) -> tuple[Compact, dict[str, Array]]:
-    """The network, cut to the features that its heads see, and all weights of a Fit.
-
-    The heads see the first stages, with the spectrum or without: the choice with the lowest cross
-    entropy on the held-out sweeps, and among equal ones the smallest. The rest is cut off, because
-    later stages overfit, and a head that was fitted to the same sweeps relies on them too much.
-    """
-    convolved, total = sum(model.architecture.channels), inputs[1][0].shape[1]
-    bands = model.architecture.spectrum * spectrum.count(model.format)
-    candidates = []
-    depths = range(min(model.architecture.fewest, len(model.convs)), len(model.convs) + 1)
-    for depth, with_bands in product(depths, (True, False) if bands else (False,)):
-        if not depth and not with_bands:
-            continue
-        columns = np.r_[
-            : sum(model.architecture.channels[:depth]), convolved : total - bands * (not with_bands)
-        ]
-        heads = [
-            closed_form_head(x[:, columns], labels, y[:, columns], held_labels) for x, y in inputs
-        ]
-        weight, bias = heads[1]
-        p = softmax(inputs[1][1][:, columns] @ weight.T + bias)[
-            np.arange(len(held_labels)), held_labels
-        ]
-        candidates.append(
-            (-np.log(np.maximum(p, LEAST_PROBABILITY)).mean(), depth, with_bands, heads)
-        )
-    _, depth, with_bands, heads = min(candidates, key=lambda candidate: candidate[0])
-    model = model.cut(depth, with_bands)
-    # a term that all materials share changes no probability, and costs float32 precision
-    head_weights = {
-        f"{name}.{k}": v - v.mean(axis=0)
-        for name, head in zip(("head", "int8"), heads, strict=True)
-        for k, v in zip(("weight", "bias"), head, strict=True)
-    }
-    model.head.weight.data = torch.from_numpy(head_weights["head.weight"])
-    model.head.bias.data = torch.from_numpy(head_weights["head.bias"])
-    return model, {k: v.numpy() for k, v in model.state_dict().items()} | head_weights
 
 
 def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
@@ -429,11 +239,3 @@ def augmenter(format: SweepFormat, augmentation: Augmentation) -> Augment:
         return torch.from_numpy(augment(x.numpy(), rows, augmentation, np.random.default_rng(seed)))
 
     return change
-
-
-@torch.no_grad()
-def features(model: Network, sweeps: Dataset) -> Array:
-    """The features of each sweep that the head sees, float32 [N, F]."""
-    return np.concatenate(
-        [model.head_input(x).numpy() for x in float_batches(sweeps.samples, batches(len(sweeps)))]
-    )

@@ -12,18 +12,17 @@ from appliance.core.errors import FormatError
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
 from train.models.peers import minirocket, minirocket_augmented
-from train.models.recipe import stages
-from train.models.recipe.architectures import DEFAULT
-from train.models.recipe.augment import SLOW, copies, default_augmentation
+from train.models.recipe.architectures import STAGES
+from train.models.recipe.augment import COPIES, SLOW, copies, default_augmentation
 
 
 def test_copies_are_augmented_as_in_our_own_training():
     """They are as many, and augmented as for the format. A window that our networks cannot take
     counts as that of a slow sensor."""
-    assert minirocket_augmented.COPIES == stages.COPIES
+    assert minirocket_augmented.COPIES == COPIES
     for window in (64, 1500):
         assert minirocket_augmented.augmentation(window) == default_augmentation(
-            DEFAULT.zero_sum(window)
+            STAGES.zero_sum(window)
         )
     assert minirocket_augmented.augmentation(12) == SLOW
 

@@ -24,6 +24,7 @@ from train.models import checkpoint, training
 from train.models.methods import SkinUse
 from train.models.recipe import choice, palpate, recipe
 from train.models.recipe import fitted as fitted_module
+from train.models.recipe.architectures import STAGES
 from train.models.recipe.fitted import Fit
 from train.models.recipe.recipe import Settings
 from train.onnx_tools.graph_builder import run, with_head
@@ -174,8 +175,8 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     assert re.fullmatch(
         r"part 3 of 3, choosing: \d+ filters", told[-1]
     )  # fewer may do beside stages
-    assert fit.architecture.channels == recipe.STAGES.channels
-    stages = sum(recipe.STAGES.channels)
+    assert fit.architecture.channels == STAGES.channels
+    stages = sum(STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
     assert len(fit.plan.parts) > 1
     assert 0 < len(fit.held) < len(fit.train) < len(easy())
@@ -203,7 +204,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     assert fit.about["validation"]["n"] == len(fit.held)  # copies were judged, and are not counted
     if not better:
         sizes = [len(part.columns) for part in fit.plan.parts]
-        assert sizes == [channels + bands for channels in recipe.STAGES.channels]
+        assert sizes == [channels + bands for channels in STAGES.channels]
         assert all(part.copies for part in fit.plan.parts)
         logits = run(with_head(fit.trunk(), *fit.int8_head()), easy().samples)
         assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
@@ -296,6 +297,18 @@ def test_filters_need_no_pytorch(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     assert "chosen: " in done.stdout
     assert (tmp_path / "b" / "manifest.json").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits once more
+def test_the_method_is_what_the_command_fits(fitted: Fit):
+    """Its fit has the same bits, and its logits are those of the int8 head."""
+    s = easy()
+    model = palpate.train(s, s.samples, 1, settings=CLOSED)
+    for name, values in fitted.weights.items():
+        np.testing.assert_array_equal(model.fit.weights[name], values)
+    logits = run(with_head(fitted.trunk(), *fitted.int8_head()), s.samples)
+    np.testing.assert_allclose(model.logits(s.samples), logits, atol=1e-3)
 
 
 def test_the_method_names_materials_that_it_never_saw_last():

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
+from tests.factories.sweep_sets import easy
 from train.data import sets
 from train.data.sets import Dataset
 from train.models import methods
-from train.models.recipe import bank, recipe
+from train.models.methods import Effort
+from train.models.recipe import bank, palpate, recipe
 from train.models.recipe.choice import FeatureColumns
+from train.models.recipe.fitted import Fit
 from train.models.recipe.sizes import SIZES, UNLIMITED, ModelSize
+from train.onnx_tools.graph_builder import run, with_head
 
 
 @cache
@@ -72,5 +77,33 @@ def test_a_size_without_filters_needs_windows_with_a_spectrum():
 
 
 def test_each_size_is_a_method():
-    """They are the points of one family."""
-    assert {f"palpate-{name}" for name in SIZES} <= methods.every().keys()
+    """They are the points of one family. The effort shortens the training of stages, where a size
+    has them."""
+    made = {m.name: m.effort for m in palpate.methods(Effort(share=0.01))}
+    assert {f"palpate-{name}" for name in SIZES} < made.keys() < methods.every().keys()
+    steps = "6 iterations of stages"
+    assert {name for name, effort in made.items() if effort == steps} == {
+        "palpate",
+        "palpate-reattached",
+        "palpate-stages",
+    }
+    assert set(made.values()) == {steps, ""}
+
+
+def test_a_fit_of_the_spectrum_alone_survives_its_file(tmp_path: Path):
+    """Its weights are those of its heads. Nothing in its graph is int8, both precisions agree, and
+    it learns an easy set."""
+    made = recipe.fit(easy(), 1, recipe.Settings(steps=0, size=SIZES["bands"]))
+    assert (made.architecture, made.bands) == (replace(recipe.FIXED, spectrum=True), 5)
+    assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
+    made.save(tmp_path / "fit.npz")
+    again = Fit.load(tmp_path / "fit.npz")
+    assert (again.architecture, again.ranges, again.bands) == (made.architecture, made.ranges, 5)
+    for prefixes in (False, True):
+        assert again.trunk(prefixes=prefixes) == made.trunk(prefixes=prefixes)
+        assert again.trunk(int8=False, prefixes=prefixes) == again.trunk(prefixes=prefixes)
+    model = with_head(again.trunk(), *again.int8_head())
+    done = {n.op_type for n in model.graph.node}
+    assert not {"Conv", "QuantizeLinear", "DequantizeLinear", "MatMulInteger"} & done
+    other = easy(seed=9)
+    assert np.mean(run(model, other.samples).argmax(1) == other.labels) > 0.9

@@ -1,5 +1,4 @@
-"""The spectrum against its definition, in PyTorch and in graphs: its response, its invariances, its
-limits."""
+"""The spectrum against its definition: its response, its invariances, its limits."""
 
 from __future__ import annotations
 
@@ -12,19 +11,17 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import torch
 
-from appliance.core.errors import FormatError
 from appliance.core.types import SweepFormat
 from appliance.sim import skin
 from tests.factories.sweep_sets import easy
-from train.models.methods import Effort
-from train.models.recipe import graph, methods, spectrum, stages
-from train.models.recipe.architectures import ARCHITECTURES, Architecture
-from train.models.recipe.stages import Compact, FitRecipe
+from train.models.recipe import graph, recipe, spectrum
+from train.models.recipe.architectures import Architecture
+from train.models.recipe.sizes import SIZES
+from train.models.recipe.stages import StagesNetwork
 from train.onnx_tools import graph_builder
 
-BARE = ARCHITECTURES["bands"]
+BARE = Architecture((), planned=3, spectrum=True)
 SMALL = Architecture((6, 8, 8), 8, 2)
 ODD = SweepFormat(2, 2, 100.0, 163, "int16")
 FORMATS = {
@@ -55,15 +52,6 @@ def trunk(
 ) -> onnx.ModelProto:
     """The graph of the spectrum alone."""
     return graph.trunk_graph(format, scale, {}, replace(BARE, mains_hz=mains_hz), prefixes=prefixes)
-
-
-def heard(
-    format: SweepFormat, counts: np.ndarray, scale: float = 0.1, mains_hz: float = 50.0
-) -> np.ndarray:
-    """The features that PyTorch's head sees of a network with only the spectrum."""
-    with torch.no_grad():
-        model = Compact(format, 3, scale, norm=False, architecture=replace(BARE, mains_hz=mains_hz))
-        return model.head_input(torch.from_numpy(counts.astype(np.float32))).numpy()
 
 
 def turned(x: np.ndarray) -> np.ndarray:
@@ -105,8 +93,8 @@ def defined(
 
 @pytest.mark.parametrize(("format", "mains"), FORMATS.values(), ids=FORMATS)
 def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool):
-    """This holds in PyTorch, in the graph, and in the graph of prefixes; the mains are removed if a
-    tenth holds two periods."""
+    """This holds in the graph and in the graph of prefixes; the mains are removed if a tenth holds
+    two periods."""
     counts = drawn(format)
     want = defined(format, counts, mains)
     rows, whole = (
@@ -116,7 +104,6 @@ def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool
     assert rows.shape == want.shape == (2, 10, spectrum.count(format))
     np.testing.assert_allclose(rows, want, atol=2e-3)
     np.testing.assert_allclose(whole, want[:, -1], atol=2e-3)
-    np.testing.assert_allclose(heard(format, counts), whole, atol=1e-3)
     if mains:
         assert np.abs(defined(format, counts, False) - want).max() > 0.1
 
@@ -131,8 +118,8 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
     want = defined(format, counts, True)
     assert turned(counts.reshape(2, 600, 16).astype(float)).min() < 0.8
     assert np.abs(defined(format, counts, True, limited=False) - want).max() > 0.3
-    np.testing.assert_allclose(heard(format, counts), want[:, -1], atol=2e-3)
-    plain = Compact(format, 3, 0.1, norm=False, architecture=SMALL).eval()
+    np.testing.assert_allclose(graph_builder.run(trunk(format), counts), want[:, -1], atol=2e-3)
+    plain = StagesNetwork(format, 3, 0.1, norm=False, architecture=SMALL).eval()
     weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
     for ranges in (None, found):
         for prefixes in (False, True):
@@ -140,7 +127,7 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
                 graph_builder.run(
                     graph.trunk_graph(format, 0.1, weights, shape, ranges, prefixes), counts
                 )
-                for shape in (SMALL.cut(3, True), SMALL)
+                for shape in (replace(SMALL, spectrum=True), SMALL)
             )
             np.testing.assert_array_equal(both[..., :-size], alone)
             np.testing.assert_allclose(
@@ -161,17 +148,15 @@ def test_the_hum_of_the_mains_changes_nothing(
     format = SweepFormat(2, 2, rate_hz, window, "float32")
     counts, rng = drawn(format), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
+    ask = trunk(format, prefixes=True, mains_hz=mains_hz)
     for hz, silent in ((mains_hz, deaf), (110 - mains_hz, False)):
         hum = strength * np.sin(
             2 * np.pi * (hz / rate_hz * np.arange(window)[:, None, None] + phase)
         )
         hummed = (counts + hum).astype(np.float32)
-        for ask in (
-            lambda format, x: heard(format, x, mains_hz=mains_hz),
-            lambda format, x: graph_builder.run(trunk(format, prefixes=True, mains_hz=mains_hz), x),
-        ):
-            apart = np.abs(ask(format, hummed) - ask(format, counts)).max(-1)
-            assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
+        before, after = (graph_builder.run(ask, x) for x in (counts, hummed))
+        apart = np.abs(after - before).max(-1)
+        assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
 
 
 def test_a_fit_that_names_no_mains_is_as_before_it_could():
@@ -205,7 +190,6 @@ def test_later_frames_and_offsets_do_not_matter():
     assert (np.abs(a[:, 4:] - b[:, 4:]).max(2) > 1e-3).all()
     np.testing.assert_array_equal(a, c)
     np.testing.assert_allclose(a, d, atol=5e-3)
-    np.testing.assert_allclose(heard(ODD, counts), heard(ODD, counts + np.int16(300)), atol=5e-3)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -215,11 +199,8 @@ def test_silence_is_finite(name: str):
     quiet = np.stack(
         [np.full((format.window, *format.shape), level, format.dtype) for level in (0, 90)]
     )
-    for have in (
-        heard(format, quiet),
-        graph_builder.run(trunk(format), quiet),
-        graph_builder.run(trunk(format, prefixes=True), quiet),
-    ):
+    for prefixes in (False, True):
+        have = graph_builder.run(trunk(format, prefixes=prefixes), quiet)
         np.testing.assert_allclose(have, np.log(1e-4), atol=1e-3)
 
 
@@ -243,18 +224,13 @@ def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
 
 
 def test_a_window_too_short_has_no_spectrum():
-    """With fewer than four frames in a tenth there are no bands, a fit has no spectrum, and the
-    size without convolutions refuses with the reason."""
+    """With fewer than four frames in a tenth there are no bands, and a fit has no spectrum."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
-    made = stages.fit_network(short, 1, FitRecipe(steps=2))
+    settings = recipe.Settings(steps=0, calibrate=False)
+    made = recipe.fit(short, 1, replace(settings, size=SIZES["64"]))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
-    assert made.architecture.channels
-    method = {m.name: m for m in methods.methods(Effort(share=0.01))}["compact-bands"]
-    with pytest.raises(
-        FormatError, match="a window of 39 frames is too short for a spectrum; take another size"
-    ):
-        method.train(short, short.samples, 1)
+    assert made.architecture.pools
     enough = replace(easy(12), samples=easy(12).samples[:, :40])
     assert spectrum.count(enough.format) == 3
-    assert method.train(enough, enough.samples, 1).logits(enough.samples).shape == (36, 3)
+    assert recipe.fit(enough, 1, replace(settings, size=SIZES["bands"])).bands == 3

@@ -1,0 +1,29 @@
+"""Fits with trained stages that take a second, whatever held-out sweeps ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from train.data.sets import Dataset
+from train.models.recipe import choice, recipe
+from train.models.recipe.fitted import Fit
+from train.models.recipe.sizes import SIZES
+
+
+@contextmanager
+def joining() -> Iterator[None]:
+    """Fits here train stages for any number of sweeps and any accuracy, and keep them."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("LEAST_SWEEPS", 1), ("LEAST_EACH", 1), ("ENOUGH", 1.01)):
+            patch.setattr(recipe, name, value)
+        patch.setattr(choice.HeldOutScores, "worse", lambda *_: False)
+        yield
+
+
+def with_stages(sweeps: Dataset, steps: int = 40) -> Fit:
+    """A fit of trained stages and the spectrum, of seed 1."""
+    with joining():
+        return recipe.fit(sweeps, 1, recipe.Settings(steps=steps, size=SIZES["stages"]))
