@@ -53,14 +53,8 @@ class DocumentPicture:
     draw: Callable[[Any], str]
 
 
-def picture_note(figures: Any) -> str:
-    """The line under a picture of an older default; "" if it shows today's default."""
-    older = provenance.of(figures).older
-    return f"*{older}*" if older else ""
-
-
 FIGURES = (
-    DocumentFigure(README, "front", "development", picture_note),
+    DocumentFigure(README, "front", "development", development_report.caption),
     DocumentFigure(SPECIFICATIONS, "bench", "bench", bench_table.table),
     DocumentFigure(ALIGN, "moved", "alignment", contact_table.sentence),
     DocumentFigure(ALIGNMENT, "in short", "alignment", contact_table.headline),
@@ -71,7 +65,7 @@ PICTURES = (
     DocumentPicture(
         "docs/front.svg",
         "development",
-        lambda figures: development_report.render(figures)[1]["front"],
+        development_report.front,
     ),
     DocumentPicture("docs/alignment/place.svg", "alignment", contact_plot.draw),
     DocumentPicture("docs/fabricslide/windows.svg", "fabrics", plots.matrix),
