@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from train.models.methods import PACKAGED, SHIPPED
 from train.reports.formatting import percent, points
 from train.studies import differences
 from train.studies.development_experiment import LINE, OURS
@@ -259,10 +258,3 @@ def relative_times(times: Iterable[Json], names: Sequence[str]) -> dict[str, str
 def ratio(value: float) -> str:
     """A ratio as a fraction or a whole number: "1/94" or "11"."""
     return f"1/{1 / value:.0f}" if value < 0.5 else f"{value:.2g}"
-
-
-def short_name(method: str) -> str:
-    """The name of a method in a picture, where all of ours have one colour."""
-    if method == PACKAGED:
-        return "packaged recipe"
-    return plain_name(method).removeprefix(f"{plain_name(SHIPPED).partition(',')[0]}, ")

@@ -29,10 +29,10 @@ from train.reports.plot_style import (
     to_svg,
 )
 from train.studies import comparison, label_places
-from train.studies.development_chart import Json, Panel, Spot, finding, plain_case, short_name
+from train.studies.development_chart import Json, Panel, Spot, finding, plain_case
 from train.studies.development_experiment import EACH, OURS
 from train.studies.label_places import Label
-from train.studies.method_names import plain_name
+from train.studies.method_names import plain_name, short_name
 from train.studies.ranks import Ranking
 
 LOOKS: tuple[Mapping[str, Any], ...] = (
@@ -52,7 +52,7 @@ BELOW = 0.35
 """The axis ends this far below the least accurate peer, as a share of the range above it."""
 LETTERS = 74
 """Most letters of a line of small text."""
-KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ▾ below   ╷ not run"
+KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ╷ not run here"
 
 
 def speed(panels: Sequence[Panel], machine: str) -> str:
@@ -62,7 +62,8 @@ def speed(panels: Sequence[Panel], machine: str) -> str:
     """
     spots = [spot.ms for panel in panels for spot in panel.spots]
     ends = min(spots) / 1.7, max(spots) * 1.7
-    lines = [KEY, *textwrap.wrap(_gaps(panels), LETTERS), *textwrap.wrap(machine, LETTERS)]
+    said = (_below(panels), _gaps(panels), machine)
+    lines = [KEY, *(line for text in said for line in textwrap.wrap(text, LETTERS))]
     each, below = HEAD + HEIGHT + FOOT, 0.17 * len(lines) + 0.08
     height = each * len(panels) + below
     figure = Figure((WIDTH, height), dpi=72)
@@ -73,6 +74,21 @@ def speed(panels: Sequence[Panel], machine: str) -> str:
     for number, line in enumerate(reversed(lines)):
         figure.text(0.012, (0.07 + 0.17 * number) / height, line, color=GREY, size=SMALL)
     return to_svg(figure, "; ".join(f"{panel.kind}: {finding(panel)}" for panel in panels))
+
+
+def _below(panels: Sequence[Panel]) -> str:
+    """The marks at the lower end of the axis, with their accuracies."""
+    parts = []
+    for panel in panels:
+        bottom, _ = _ends(panel)
+        those = [_label(spot) for spot in panel.spots if spot.mean < bottom and not spot.form]
+        if those:
+            parts.append(f"{panel.kind}: {', '.join(those)}")
+    return f"▾ less than the axis shows ({'; '.join(parts)})" if parts else ""
+
+
+def _label(spot: Spot) -> str:
+    return f"{short_name(spot.method)} {100 * spot.mean:.1f}"
 
 
 def _gaps(panels: Sequence[Panel]) -> str:
@@ -141,11 +157,9 @@ def _marks(axes: Axes, panel: Panel) -> Iterator[Label]:
             axes.plot(spot.ms, spot.mean, "o", markersize=13, markeredgewidth=1.3, **ring)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))
     for spot in order:
-        name = f"{short_name(spot.method)} {100 * spot.mean:.1f}"
-        text = "" if spot.method in named else name
+        text = "" if spot.method in named or spot.mean < bottom else _label(spot)
         named.add(spot.method)
-        y = max(spot.mean, bottom)
-        yield spot.ms, y, text, _shade(panel, spot), spot.method in OURS
+        yield spot.ms, max(spot.mean, bottom), text, _shade(panel, spot), spot.method in OURS
 
 
 def _shade(panel: Panel, spot: Spot) -> str:

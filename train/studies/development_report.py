@@ -15,7 +15,7 @@ from appliance.core.errors import FormatError
 from train.models.methods import PACKAGED
 from train.reports import html, provenance
 from train.reports.formatting import amount, estimate, exact_percent, percent, points
-from train.studies import TEMPLATES, comparison, development_plots, differences, method_names
+from train.studies import TEMPLATES, comparison, development_plots, differences
 from train.studies.comparison import ROUNDING
 from train.studies.development_chart import (
     SERIES,
@@ -32,9 +32,9 @@ from train.studies.development_chart import (
     quickest,
     ratio,
     relative_times,
-    short_name,
 )
 from train.studies.development_experiment import EACH, LINE, OURS, PEERS
+from train.studies.method_names import about, plain_name, short_name
 from train.studies.ranks import Ranking, ranking
 
 WANTED = {
@@ -161,11 +161,7 @@ def subject(table: Mapping[str, Accuracies]) -> str:
 
 def comparison_line(case: Json, row: Accuracies, ours: str, names: Sequence[str]) -> dict[str, Any]:
     """Ours beside the best peer in one test."""
-    peers = {
-        method_names.plain_name(name): row[name]
-        for name in names
-        if name not in OURS and name in row
-    }
+    peers = {plain_name(name): row[name] for name in names if name not in OURS and name in row}
     return comparison.line(plain_case(case), row[ours], peers)
 
 
@@ -193,7 +189,7 @@ def touch_curves(figures: Json, early: Json | None) -> dict[str, Any]:
             for e in figures["results"]
             if (e["case"], e["method"], e["each"]) == (case, name, 0)
         )
-        found.setdefault(plain_case(known[case]), {})[method_names.plain_name(name)] = line
+        found.setdefault(plain_case(known[case]), {})[plain_name(name)] = line
     if early and (format := WINDOW.search(early["format"])):
         window_s = int(format[2]) / float(format[1])
         parts, rule = early["early"]["always"], early["early"]["rule"]
@@ -214,7 +210,7 @@ def budgets(shown: Sequence[Panel]) -> list[list[str]]:
         for panel in shown:
             best = panel.within(ms)
             cells.append(
-                f"{method_names.plain_name(best.method)}, {best.precision}: "
+                f"{plain_name(best.method)}, {best.precision}: "
                 f"{estimate(best.accuracy)} in {amount(best.ms, 'ms')}"
                 if best
                 else "none"
@@ -297,7 +293,7 @@ def _costs(figures: Json, table: Mapping[str, Accuracies], names: Sequence[str])
         "machine": machine(figures),
         "relative": relative_times(times["entries"], names),
         "costs": [_cost(one) for one in times["entries"]],
-        "fits": [[method_names.plain_name(name), _fit_s(table, name)] for name in names],
+        "fits": [[plain_name(name), _fit_s(table, name)] for name in names],
     }
 
 
@@ -306,7 +302,7 @@ def _cost(one: Json) -> list[str]:
     counts = [f"{one[key]:,}" if one.get(key) else "–" for key in ("weights", "macs")]
     sizes = [amount(one[key], unit) if one.get(key) else "–" for key, unit in SIZES_OF]
     times = [amount(one[key], "ms") for key in ("ms_p50", "ms_p99")]
-    name = method_names.plain_name(one["method"])
+    name = plain_name(one["method"])
     return [name, one["precision"], one["runtime"], *times, *counts, *sizes]
 
 
@@ -331,7 +327,7 @@ def precisions(
             )
             int8, whole = (own, other) if form == "float" else (other, own)
             yield [
-                method_names.plain_name(name),
+                plain_name(name),
                 panel.kind,
                 *map(percent, (int8, whole)),
                 points(whole - int8),
@@ -346,8 +342,8 @@ def _words(
     plain = {case: plain_case(one) for case, one in cases.items()}
     return {
         "plain": plain,
-        "name_of": method_names.plain_name,
-        "about": {name: method_names.about(name) for name in names},
+        "name_of": plain_name,
+        "about": {name: about(name) for name in names},
         "missing": {name: [plain[case] for case in those] for name, those in missing.items()},
         "sets": [[plain[case], about_case(one), one["sweeps"]] for case, one in cases.items()],
         "files": [

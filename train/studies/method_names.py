@@ -76,3 +76,10 @@ def plain_name(method: str) -> str:
 def about(method: str) -> str:
     """A method in a line, or ""."""
     return NAMES[method][1] if method in NAMES else ""
+
+
+def short_name(method: str) -> str:
+    """The name of a method in a picture, where all of ours have one colour."""
+    if method == PACKAGED:
+        return "packaged recipe"
+    return plain_name(method).removeprefix(f"{OURS}, ")

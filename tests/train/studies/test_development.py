@@ -113,13 +113,13 @@ def test_the_picture_names_findings_methods_gaps_and_the_processor():
         "Palpate 90.0 %, 5.0 points ahead of QUANT",
         "named rightly, mean of 2 tests: real tactile sets",
         "all views 90.0",
-        "bands 70.0",
         "LITE 80.0",
         "paper’s CNN",
         "Palpate 90.0 %",
     ):
         assert text in words, text
     said = " ".join(words)
+    assert "▾ less than the axis shows (real tactile sets: bands 70.0)" in said
     assert "Hollow: not run in all tests (real tactile sets: LITE 1 of 2)" in said
     assert "a processor, one thread" in said
     assert development_report.caption(made).endswith(
@@ -249,8 +249,8 @@ def test_every_case_has_words_for_people():
 def test_methods_have_names_for_people():
     """Every described method exists. A method without a description keeps its own name."""
     assert method_names.plain_name("palpate-bands") == "Palpate, bands"
-    assert development_chart.short_name("palpate-bands") == "bands"
-    assert development_chart.short_name("palpate-reattached") == "packaged recipe"
+    assert method_names.short_name("palpate-bands") == "bands"
+    assert method_names.short_name("palpate-reattached") == "packaged recipe"
     assert (method_names.plain_name("recurrent"), method_names.about("recurrent")) == (
         "recurrent",
         "",
