@@ -86,7 +86,7 @@ class Spot:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class ChartPanel:
     """The methods on tests of one kind. cases: the tests as in the results. absent: time in ms of
     methods that were run in too few of them."""
 
@@ -150,7 +150,7 @@ def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
     return table
 
 
-def panels(figures: Json) -> list[Panel]:
+def panels(figures: Json) -> list[ChartPanel]:
     """A panel for each kind of tests that has a timed method."""
     table, timed = by_case(figures["results"]), (figures.get("times") or {"entries": []})["entries"]
     found = []
@@ -160,7 +160,7 @@ def panels(figures: Json) -> list[Panel]:
         shown = {spot.method for spot in spots}
         absent = {name: ms for name, ms in quickest(timed).items() if name not in shown}
         if spots:
-            found.append(Panel(kind, cases, tuple(spots), absent))
+            found.append(ChartPanel(kind, cases, tuple(spots), absent))
     return found
 
 
@@ -207,7 +207,7 @@ def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
     return differences.mean(groups)
 
 
-def finding(panel: Panel) -> str:
+def finding(panel: ChartPanel) -> str:
     """The panel in a sentence: our accuracy, and its distance to the best peer."""
     ours, peer = panel.ours, panel.peer
     if not ours:

@@ -29,7 +29,7 @@ from train.reports.plot_style import (
     to_svg,
 )
 from train.studies import comparison, label_places
-from train.studies.development_chart import Json, Panel, Spot, finding, plain_case
+from train.studies.development_chart import Json, ChartPanel, Spot, finding, plain_case
 from train.studies.development_experiment import EACH, OURS
 from train.studies.label_places import Label
 from train.studies.method_names import plain_name, short_name
@@ -55,7 +55,7 @@ LETTERS = 74
 KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ╷ not run here"
 
 
-def speed(panels: Sequence[Panel], machine: str) -> str:
+def speed(panels: Sequence[ChartPanel], machine: str) -> str:
     """Mean accuracy over the time of a sweep: a panel for each kind of tests, on one axis.
 
     machine: processor and threads, in words.
@@ -76,7 +76,7 @@ def speed(panels: Sequence[Panel], machine: str) -> str:
     return to_svg(figure, "; ".join(f"{panel.kind}: {finding(panel)}" for panel in panels))
 
 
-def _below(panels: Sequence[Panel]) -> str:
+def _below(panels: Sequence[ChartPanel]) -> str:
     """The marks at the lower end of the axis, with their accuracies."""
     parts = []
     for panel in panels:
@@ -91,7 +91,7 @@ def _label(spot: Spot) -> str:
     return f"{short_name(spot.method)} {100 * spot.mean:.1f}"
 
 
-def _gaps(panels: Sequence[Panel]) -> str:
+def _gaps(panels: Sequence[ChartPanel]) -> str:
     """The hollow marks: methods that were not run in every test, with the number of their tests."""
     parts = []
     for panel in panels:
@@ -102,7 +102,7 @@ def _gaps(panels: Sequence[Panel]) -> str:
     return f"Hollow: not run in all tests ({'; '.join(parts)})" if parts else ""
 
 
-def _panel(axes: Axes, panel: Panel, ends: tuple[float, float]) -> None:
+def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     """One panel with its finding as title."""
     low, high = _ends(panel)
     room = 0.09 * max(high - low, 0.02)
@@ -128,7 +128,7 @@ def _panel(axes: Axes, panel: Panel, ends: tuple[float, float]) -> None:
     label_places.write(axes, labels, _between(line) + _between(stairs))
 
 
-def _ends(panel: Panel) -> tuple[float, float]:
+def _ends(panel: ChartPanel) -> tuple[float, float]:
     """Lowest and highest accuracy on the axis. What is far below all peers is drawn at its end."""
     means = [spot.mean for spot in panel.spots]
     peers = [spot.mean for spot in panel.spots if spot.method not in OURS]
@@ -136,7 +136,7 @@ def _ends(panel: Panel) -> tuple[float, float]:
     return max(min(means), lowest - BELOW * (high - lowest)), high
 
 
-def _marks(axes: Axes, panel: Panel) -> Iterator[Label]:
+def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
     """Draw the spots; yield their names, the most important first, each method's once."""
     named: set[str] = set()
     shown = [s for s in panel.spots if not (s.method in OURS and s.form) or s in panel.front]
@@ -162,11 +162,11 @@ def _marks(axes: Axes, panel: Panel) -> Iterator[Label]:
         yield spot.ms, max(spot.mean, bottom), text, _shade(panel, spot), spot.method in OURS
 
 
-def _shade(panel: Panel, spot: Spot) -> str:
+def _shade(panel: ChartPanel, spot: Spot) -> str:
     return ACCENT if spot.method in OURS else BLACK if spot in panel.front else GREY
 
 
-def _absent(axes: Axes, panel: Panel) -> Iterator[Label]:
+def _absent(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
     """Draw a stroke on the axis at the time of each method that has no accuracy; yield their
     names."""
     low, high = axes.get_ylim()

@@ -23,7 +23,7 @@ from train.studies.development_chart import (
     UNIT,
     Accuracies,
     Json,
-    Panel,
+    ChartPanel,
     about_case,
     by_case,
     finding,
@@ -165,7 +165,7 @@ def comparison_line(case: Json, row: Accuracies, ours: str, names: Sequence[str]
     return comparison.line(plain_case(case), row[ours], peers)
 
 
-def rank(panel: Panel, table: Mapping[str, Accuracies]) -> Ranking | None:
+def rank(panel: ChartPanel, table: Mapping[str, Accuracies]) -> Ranking | None:
     """The ranking of our two recipes and of the peers that were run in every test; None for fewer
     than two."""
     names = {spot.method for spot in panel.whole} - set(LINE[:-1])
@@ -202,7 +202,7 @@ def touch_curves(figures: Json, early: Json | None) -> dict[str, Any]:
     return found
 
 
-def budgets(shown: Sequence[Panel]) -> list[list[str]]:
+def budgets(shown: Sequence[ChartPanel]) -> list[list[str]]:
     """Rows of a table: a time of a sweep, and for each panel the best model within it."""
     rows = []
     for ms in BUDGETS_MS:
@@ -222,7 +222,7 @@ def budgets(shown: Sequence[Panel]) -> list[list[str]]:
 def targets(
     table: Mapping[str, Accuracies],
     cases: Mapping[str, Json],
-    shown: Sequence[Panel],
+    shown: Sequence[ChartPanel],
     times: Sequence[Json],
 ) -> Iterator[Json]:
     """A line for each target: wanted, reached, and whether it is met."""
@@ -272,7 +272,7 @@ def time_targets(times: Sequence[Json]) -> Iterator[Json]:
             }
 
 
-def _mean_rows(shown: Sequence[Panel], names: Sequence[str]) -> list[Json]:
+def _mean_rows(shown: Sequence[ChartPanel], names: Sequence[str]) -> list[Json]:
     """For each panel the means of the methods that were run in every test."""
     rows: list[Json] = []
     for panel in shown:
@@ -307,7 +307,7 @@ def _cost(one: Json) -> list[str]:
 
 
 def precisions(
-    table: Mapping[str, Accuracies], shown: Sequence[Panel], names: Iterable[str]
+    table: Mapping[str, Accuracies], shown: Sequence[ChartPanel], names: Iterable[str]
 ) -> Iterator[list[str]]:
     """Rows of a table: for each panel and method with results in int8 and in float, the means of
     both."""

@@ -15,7 +15,7 @@ from train.models.methods import PACKAGED, SHIPPED
 from train.reports import provenance
 from train.reports.formatting import amount, estimate, percent
 from train.studies import development_chart, reports, stress_report
-from train.studies.development_chart import Panel
+from train.studies.development_chart import ChartPanel
 from train.studies.method_names import plain_name
 
 Json = Mapping[str, Any]
@@ -102,7 +102,7 @@ def _development(results: Json) -> Iterator[Quote]:
         yield Quote(f"time of a sweep: {name}", shown, (ms,), "ms", timed["format"], words=words)
 
 
-def _mean(panel: Panel, method: str, table: Mapping[str, Any]) -> Iterator[Quote]:
+def _mean(panel: ChartPanel, method: str, table: Mapping[str, Any]) -> Iterator[Quote]:
     """The mean accuracy of a method on a panel, if it was run in every test."""
     for spot in panel.whole:
         if (spot.method, spot.form) == (method, ""):

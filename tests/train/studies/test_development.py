@@ -31,7 +31,7 @@ from train.studies import (
     ranks,
 )
 from train.studies.command import main
-from train.studies.development_chart import Panel, Spot
+from train.studies.development_chart import ChartPanel, Spot
 from train.studies.study import Study, StudyCase, StudyRun, save
 
 
@@ -153,9 +153,9 @@ def box(node: ElementTree.Element) -> tuple[float, float, float, float]:
     return left, y - 8, left + width, y
 
 
-def panel(*spots: Spot) -> Panel:
+def panel(*spots: Spot) -> ChartPanel:
     """A panel of one test with these spots."""
-    return Panel("a kind", (case("one"),), spots, {})
+    return ChartPanel("a kind", (case("one"),), spots, {})
 
 
 def spot(method: str, ms: float, mean: float, form: str = "", **more: Any) -> Spot:
