@@ -29,7 +29,7 @@ from train.reports.plot_style import (
     to_svg,
 )
 from train.studies import comparison, label_places
-from train.studies.development_chart import Json, ChartPanel, Spot, finding, plain_case
+from train.studies.development_chart import ChartPanel, Json, Spot, finding, plain_case
 from train.studies.development_experiment import EACH, OURS
 from train.studies.label_places import Label
 from train.studies.method_names import plain_name, short_name
