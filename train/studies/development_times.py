@@ -36,10 +36,10 @@ TIMED = StudyCase(("sim:T-REAL/level-blind:1",))
 QUICK = StudyCase(("sim:T-REAL/level-blind:1001:3",), only=("position<=2",))
 ROUNDS = 10
 """Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
-EVERY, SHARE = 5, 0.25
-"""A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
-iterations: training does not change the time of a sweep. Ours are trained as always, because
-training chooses their size."""
+EVERY, SHARE = 5, 0.02
+"""A peer of a library is trained on every fifth sweep, a network of a peer for few iterations:
+training does not change the time of a sweep. Ours are trained as always, because training chooses
+their size."""
 
 
 def measured(

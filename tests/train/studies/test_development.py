@@ -538,7 +538,7 @@ def test_networks_of_peers_are_trained_briefly_for_their_time():
         development_times._briefly(name, methods.FULL_EFFORT).effort
         for name in ("ds-cnn", "palpate-bands")
     )
-    assert (brief, whole) == ("200 iterations", methods.every()["palpate-bands"].effort)
+    assert (brief, whole) == ("16 iterations", methods.every()["palpate-bands"].effort)
 
 
 @pytest.mark.slow
