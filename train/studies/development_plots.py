@@ -69,7 +69,7 @@ def speed(panels: Sequence[ChartPanel], machine: str) -> str:
     figure = Figure((WIDTH, height), dpi=72)
     for number, panel in enumerate(panels):
         top = height - each * number - HEAD
-        axes = add_axes(figure, 0.085, 0.97, top / height, (top - HEIGHT) / height)
+        axes = add_axes(figure, 0.11, 0.97, top / height, (top - HEIGHT) / height)
         _panel(axes, panel, ends)
     for number, line in enumerate(reversed(lines)):
         figure.text(0.012, (0.07 + 0.17 * number) / height, line, color=GREY, size=SMALL)
@@ -116,8 +116,8 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     axes.set_xlabel("← faster: processor time of a sweep", color=GREY, size=SMALL, labelpad=3)
     about = f"named rightly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
-    axes.yaxis.set_label_coords(-0.085, 1.03)
-    _text(axes, finding(panel), (-0.085, 1.03), (0, 13), BLACK, weight="bold", size=MEDIUM)
+    axes.yaxis.set_label_coords(-0.115, 1.03)
+    _text(axes, finding(panel), (-0.115, 1.03), (0, 13), BLACK, weight="bold", size=MEDIUM)
     front = [(spot.ms, spot.mean) for spot in panel.front]
     corners = [(x, y) for a, b in pairwise(front) for x, y in (a, (b[0], a[1]))]
     stairs = [*corners, *front[-1:], *((ends[1], y) for _, y in front[-1:])]
