@@ -211,7 +211,7 @@ def budgets(shown: Sequence[ChartPanel]) -> list[list[str]]:
             best = panel.within(ms)
             cells.append(
                 f"{plain_name(best.method)}, {best.precision}: "
-                f"{estimate(best.accuracy)} in {amount(best.ms, 'ms')}"
+                f"{percent(best.mean)} in {amount(best.ms, 'ms')}"
                 if best
                 else "none"
             )
@@ -229,7 +229,7 @@ def targets(
     for case, wanted in WANTED.items():
         if case in cases and (one := table[case].get(OURS[0])):
             yield {
-                "what": f"{plain_case(cases[case])}, {len(one['seeds'])} seeds",
+                "what": f"{plain_case(cases[case])}, {_seeds(one)}",
                 "target": f"≥ {exact_percent(wanted)}",
                 "met": one["mean"] >= wanted - ROUNDING,
                 "here": estimate(differences.of(one)),
@@ -252,6 +252,11 @@ def targets(
                 "here": f"{len(panel.line) - len(beaten)} of {len(panel.line)}",
             }
     yield from time_targets(times)
+
+
+def _seeds(entry: Json) -> str:
+    count = len(entry["seeds"])
+    return f"{count} seed" if count == 1 else f"{count} seeds"
 
 
 def time_targets(times: Sequence[Json]) -> Iterator[Json]:

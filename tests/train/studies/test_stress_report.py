@@ -14,7 +14,7 @@ from appliance.core.errors import FormatError
 from tests.factories import rendered, stress_data
 from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
-from train.reports import formatting, html
+from train.reports import formatting, html, provenance
 from train.studies import stress_plots, stress_report
 from train.studies.commands import measure
 from train.studies.method_names import plain_name
@@ -97,11 +97,17 @@ def test_the_matrix_shows_where_each_method_fails_and_the_box_first():
 
 
 def test_methods_of_an_earlier_run_join_if_it_was_of_the_same_sweeps():
-    """The run's own results count. Results of other sweeps are refused."""
-    run = {"methods": {"ds-cnn": 2}, "train_digest": "a", "test_digest": "b", "seeds": [1]}
-    earlier = run | {"methods": {"palpate": 1, "ds-cnn": 1}, "seeds": [2]}
+    """The run's own results count. The origin of the others stays: they may be of an older default.
+    Results of other sweeps are refused.
+    """
+    run = {"methods": {"ds-cnn": 2}, "train_digest": "a", "test_digest": "b", "shipped": "new"}
+    earlier = run | {"methods": {"palpate": 1, "ds-cnn": 1}, "shipped": "old"}
     made = measure._joined(run, earlier)
-    assert made == run | {"methods": {"palpate": 1, "ds-cnn": 2}}
+    assert made == run | {
+        "methods": {"palpate": 1, "ds-cnn": 2},
+        "earlier": [{"methods": ["palpate"], "shipped": "old"}],
+    }
+    assert "old" in provenance.of(made).bundle
     with pytest.raises(FormatError, match="have test_digest other, not b; name those of the same"):
         measure._joined(run, earlier | {"test_digest": "other"})
 

@@ -262,15 +262,20 @@ def run_stress(args: argparse.Namespace) -> None:
 
 
 def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """The result with the methods of an earlier one that it does not have itself. Raises
-    FormatError if the earlier one was of other sweeps."""
+    """The result with the methods of an earlier one that it does not have itself, and with the
+    origin of these in `earlier`. Raises FormatError if the earlier one was of other sweeps."""
     for key in ("train_digest", "test_digest"):
         if result[key] != earlier[key]:
             raise FormatError(
                 f"the results to join have {key} {earlier[key]}, not {result[key]}; "
                 "name those of the same sets"
             )
-    return result | {"methods": earlier["methods"] | result["methods"]}
+    lacks = [name for name in earlier["methods"] if name not in result["methods"]]
+    origin = {key: earlier[key] for key in score.provenance() if key in earlier}
+    return result | {
+        "methods": earlier["methods"] | result["methods"],
+        "earlier": [*earlier.get("earlier", []), {"methods": lacks} | origin],
+    }
 
 
 def _box_under_stress(
