@@ -28,7 +28,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.errors import BundleError
 from appliance.core.observer import Observer
-from appliance.core.provenance import commit
+from appliance.core.provenance import commit, processor
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.classifier import Classifier
@@ -215,15 +215,4 @@ def _machine() -> dict[str, Any]:
         "onnxruntime": ort.__version__,
     }
     machine = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
-    return machine | versions | {"processor": _processor()}
-
-
-def _processor() -> str:
-    """The name of the board or the processor; "" if there is none."""
-    board, names = Path("/proc/device-tree/model"), Path("/proc/cpuinfo")
-    if board.is_file():
-        return board.read_text().strip("\0\n ")
-    lines = names.read_text().splitlines() if names.is_file() else []
-    return next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), ""
-    )
+    return machine | versions | {"processor": processor()}

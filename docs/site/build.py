@@ -27,12 +27,11 @@ HERE = Path(__file__).resolve().parent
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
 RESULTS, SOAK = "results.md", "docs/data/soak.json"
 RESULT_PAGES = {
-    "development": "Speed and accuracy: our methods and their peers, test by test",
+    "development": "Speed against accuracy: our methods and their peers",
     "paper": "The paper's experiment, run again (simulated)",
     "stress": "Robustness: accuracy on corrupted sweeps (simulated)",
     "certainty": "Calibration, unknown materials, several sweeps, enrolment (simulated)",
     "soak": "Hours of sweeps without a pause",
-    "chart": "Earlier networks: accuracy against all costs",
 }
 """Pages of studies, by their folders, the most telling first."""
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')

@@ -80,6 +80,6 @@ def level(curve: Mapping[str, Any], severity: float) -> str:
     unit = curve["unit"]
     if unit.startswith(("share", "of ")):
         return f"{100 * severity:.2g} % {unit.removeprefix('share')}".rstrip()
-    number = f"{ceil(severity) if unit == 'taxels' else severity:.2g}"
+    number = f"{ceil(severity) if unit == 'taxels' else severity:.{2 if severity < 99.5 else 3}g}"
     unit = "bits fewer" if unit.startswith("fewer") else unit
     return f"{number} {unit.removesuffix('s') if number == '1' else unit}"

@@ -1,29 +1,30 @@
-"""The results of `development` as a chart: dots and axes, as pareto has them.
+"""Speed against accuracy, from the results of `development`: panels of tests of one kind, with the
+time and the mean accuracy of every form of every method.
 
-Times are from development_times, for which all models took turns in one process.
+development_times measures the times: all models take turns in one process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from train.reports.formatting import percent, points
 from train.studies import differences
+from train.studies.development_experiment import LINE, OURS
 from train.studies.differences import Estimate
-from train.studies.method_names import family
-from train.studies.pareto import COSTS, ChartAxis
+from train.studies.method_names import plain_name
 
 Json = Mapping[str, Any]
 Accuracies = Mapping[str, Json]
-"""Entries of one case with all training sweeps, by method."""
-MEAN = "development"
-"""Key of the mean of lines, among a dot's accuracies."""
-SHOWN = ("mean", "low", "high", "n", "seeds")
-"""Decimals of an accuracy on the chart."""
+"""Entries of one case with all training sweeps and the whole window, by method."""
 UNIT = "minirocket"
 """The method whose time is 1."""
+LEAST_SHARE = 0.5
+"""A method is on a panel if it was run in this share of its tests."""
 PROTOCOLS = {
     "leave:force": (
         "a force it never felt",
@@ -59,6 +60,164 @@ PUBLISHED = {
     "GunPoint": "a hand that draws a gun or only points",
 }
 """The published series, each in a few words."""
+TACTILE, SERIES = "real tactile sets", "published series that are not tactile"
+"""The kinds of tests that have a panel. Simulated tests have none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A method in one precision on a panel.
+
+    form: "" for the method itself, else the name of its other precision. ms: median time of a
+    sweep. accuracy: the mean over the tests that it was run in. lacks: names of the others.
+    """
+
+    method: str
+    form: str
+    precision: str
+    ms: float
+    accuracy: Estimate
+    lacks: tuple[str, ...] = ()
+
+    @property
+    def mean(self) -> float:
+        """Its mean accuracy."""
+        return self.accuracy[0]
+
+
+@dataclass(frozen=True, slots=True)
+class ChartPanel:
+    """The methods on tests of one kind. cases: the tests as in the results. absent: time in ms of
+    methods that were run in too few of them."""
+
+    kind: str
+    cases: tuple[Json, ...]
+    spots: tuple[Spot, ...]
+    absent: Mapping[str, float]
+
+    @property
+    def whole(self) -> list[Spot]:
+        """The spots of methods that were run in every test, the quickest first."""
+        return sorted((spot for spot in self.spots if not spot.lacks), key=lambda s: s.ms)
+
+    @property
+    def front(self) -> list[Spot]:
+        """The spots of all forms than which none is as quick and more accurate."""
+        best: list[Spot] = []
+        for spot in sorted(self.whole, key=lambda s: (s.ms, -s.mean)):
+            if not best or spot.mean > best[-1].mean:
+                best.append(spot)
+        return best
+
+    @property
+    def line(self) -> list[Spot]:
+        """The sizes of our family, the smallest first."""
+        own = {spot.method: spot for spot in self.whole if not spot.form}
+        return [own[name] for name in LINE if name in own]
+
+    @property
+    def ours(self) -> Spot | None:
+        """The largest of our family; None if it was not run in every test."""
+        return self.line[-1] if self.line else None
+
+    @property
+    def peer(self) -> Spot | None:
+        """The most accurate of the peers, chosen in hindsight."""
+        peers = [spot for spot in self.whole if spot.method not in OURS]
+        return max(peers, key=lambda s: s.mean, default=None)
+
+    @property
+    def dominated(self) -> list[Spot]:
+        """The sizes of our family than which a peer is quicker and more accurate."""
+        peers = [spot for spot in self.whole if spot.method not in OURS]
+        return [one for one in self.line if any(p.ms < one.ms and p.mean > one.mean for p in peers)]
+
+    def within(self, ms: float) -> Spot | None:
+        """The most accurate model that needs at most `ms`."""
+        return max((s for s in self.whole if s.ms <= ms), key=lambda s: s.mean, default=None)
+
+    def lacking(self) -> dict[str, int]:
+        """By method the number of tests that it was not run in, of the spots with gaps."""
+        return {spot.method: len(spot.lacks) for spot in self.spots if spot.lacks}
+
+
+def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
+    """Entries with all training sweeps and the whole window: {case: {method: entry}}."""
+    table: dict[str, dict[str, Json]] = {}
+    for entry in results:
+        if not entry["each"] and not entry.get("frames"):
+            table.setdefault(entry["case"], {})[entry["method"]] = entry
+    return table
+
+
+def panels(figures: Json) -> list[ChartPanel]:
+    """A panel for each kind of tests that has a timed method."""
+    table, timed = by_case(figures["results"]), (figures.get("times") or {"entries": []})["entries"]
+    found = []
+    for kind in (TACTILE, SERIES):
+        cases = tuple(case for case in figures["cases"] if kind_of(case) == kind)
+        spots = _spots(timed, table, cases)
+        shown = {spot.method for spot in spots}
+        absent = {name: ms for name, ms in quickest(timed).items() if name not in shown}
+        if spots:
+            found.append(ChartPanel(kind, cases, tuple(spots), absent))
+    return found
+
+
+def kind_of(case: Json) -> str:
+    """The kind of a test; "" for a simulated one."""
+    name = case["case"].partition(", ")[0]
+    return "" if case["simulated"] else SERIES if name in PUBLISHED else TACTILE
+
+
+def _spots(
+    timed: Iterable[Json], table: Mapping[str, Accuracies], cases: Sequence[Json]
+) -> list[Spot]:
+    """A spot for each timed form with an accuracy in enough of the cases, in the library in which
+    it is quickest."""
+    forms: dict[tuple[str, str], Json] = {}
+    for one in sorted(timed, key=lambda one: float(one["ms_p50"])):
+        forms.setdefault((one["method"], one.get("form", "")), one)
+    sets = {case["case"]: case["set"] for case in cases}
+    found = []
+    for (method, form), one in forms.items():
+        entries = {
+            case: entry
+            for case in sets
+            if (entry := _form(table.get(case, {}).get(method), form)) is not None
+        }
+        if entries and len(entries) >= LEAST_SHARE * len(sets):
+            lacks = tuple(case for case in sets if case not in entries)
+            middle = mean(entries, sets)
+            found.append(Spot(method, form, one["precision"], one["ms_p50"], middle, lacks))
+    return found
+
+
+def _form(entry: Json | None, form: str) -> Json | None:
+    """Accuracy of a method, or of its other precision `form`; None if it is missing."""
+    return entry["forms"].get(form) if entry and form else entry
+
+
+def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
+    """Mean of a method's accuracies by case, with its interval. sets: the set of each case. Errors
+    of cases on one set are correlated."""
+    groups: dict[str, list[Estimate]] = {}
+    for case, figures in entries.items():
+        groups.setdefault(sets[case], []).append(differences.of(figures))
+    return differences.mean(groups)
+
+
+def finding(panel: ChartPanel) -> str:
+    """The panel in a sentence: our accuracy, and its distance to the best peer."""
+    ours, peer = panel.ours, panel.peer
+    if not ours:
+        return "our largest size was not run in every test"
+    said = f"Palpate {percent(ours.mean)}"
+    if not peer:
+        return said
+    gap = ours.mean - peer.mean
+    word = "ahead of" if gap >= 0 else "behind"
+    return f"{said}, {points(abs(gap))} points {word} {plain_name(peer.method)}"
 
 
 def plain_case(case: Json) -> str:
@@ -77,83 +236,15 @@ def about_case(case: Json) -> str:
     )
 
 
-def axes(cases: Sequence[Json], shared: Sequence[str]) -> dict[str, ChartAxis]:
-    """An axis of accuracy for the mean of the cases `shared` (by name), if there are any, and for
-    each case."""
-    of = {case["case"]: case for case in cases}
-    mean = (
-        {
-            MEAN: ChartAxis(
-                f"mean of {len(shared)} tests on real data",
-                f"mean of {'; '.join(plain_case(of[name]) for name in shared)}",
-                chance=float(np.mean([1 / of[name]["materials"] for name in shared])),
-            )
-        }
-        if shared
-        else {}
-    )
-    return mean | {
-        name: ChartAxis(plain_case(case), about_case(case), chance=1 / case["materials"])
-        for name, case in of.items()
-    }
+def quickest(times: Iterable[Json], precision: str = "") -> dict[str, float]:
+    """Median time of a sweep in ms by method, in the precision and library in which it is quickest.
 
-
-def dots(
-    times: Iterable[Json],
-    table: Mapping[str, Accuracies],
-    cases: Sequence[Json],
-    shared: Sequence[str],
-) -> list[dict[str, Any]]:
-    """A dot for each timed method and precision, with its accuracy on each of its cases and the
-    mean over `shared`.
-
-    Only a method with all of `shared` has a mean. A method without any accuracy gets no dot.
+    precision: "" counts all of them.
     """
-    sets = {case["case"]: case["set"] for case in cases}
-    found = []
-    for one in times:
-        rows = {
-            case: _form(table.get(case, {}).get(one["method"]), one.get("form")) for case in sets
-        }
-        accuracy: dict[str, Json] = {
-            case: {key: figures[key] for key in SHOWN} for case, figures in rows.items() if figures
-        }
-        if shared and all(case in accuracy for case in shared):
-            accuracy[MEAN] = differences.entry(
-                mean({case: accuracy[case] for case in shared}, sets)
-            )
-        if accuracy:
-            found.append(
-                {
-                    **dict.fromkeys(COSTS),
-                    **one,
-                    "family": family(one["method"]),
-                    "accuracy": accuracy,
-                }
-            )
-    return found
-
-
-def _form(figures: Json | None, form: str | None) -> Json | None:
-    """Accuracy of a method, or of its other precision `form`; None if it is missing."""
-    return figures["forms"].get(form) if figures and form else figures
-
-
-def mean(entries: Mapping[str, Json], sets: Mapping[str, str]) -> Estimate:
-    """Mean of a method's accuracies by case, with its interval. sets: the set of each case. Errors
-    of cases on one set are correlated."""
-    groups: dict[str, list[Estimate]] = {}
-    for case, figures in entries.items():
-        groups.setdefault(sets[case], []).append(differences.of(figures))
-    return differences.mean(groups)
-
-
-def quickest(times: Iterable[Json]) -> dict[str, float]:
-    """Median time of a sweep in ms by method, in the precision and library in which it is
-    quickest."""
     ms: dict[str, float] = {}
     for one in times:
-        ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))
+        if precision in ("", one["precision"]):
+            ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))
     return ms
 
 

@@ -7,8 +7,11 @@ among the sets, because the simulator cannot be trusted with it (decision 10).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset, digest
@@ -16,13 +19,15 @@ from train.evaluation import evaluate
 from train.evaluation.evaluate import Plan
 from train.metrics import score
 from train.models import methods
-from train.models.methods import Effort
+from train.models.methods import PACKAGED, SHIPPED, Effort
 from train.models.recipe.sizes import SIZES
-from train.studies.chart_experiment import FABRICS, SEVEN, joined
+from train.studies.fabrics_experiment import FABRICS, FOUR, SEVEN
 from train.studies.study import NO_DATA, Study, StudyCase, StudyRun
 
 Json = dict[str, Any]
-OURS = ("palpate", "palpate-reattached", *(f"palpate-{name}" for name in SIZES))
+LINE = (*(f"{SHIPPED}-{name}" for name in SIZES), SHIPPED)
+"""The sizes of our family, from the smallest to everything."""
+OURS = (SHIPPED, PACKAGED, *LINE[:-1])
 """Our methods. The first of them with results is compared with the peers."""
 PEERS = (
     "minirocket",
@@ -32,16 +37,20 @@ PEERS = (
     "ds-cnn",
     "lite",
     "edge-spectral",
+    "H-svm",
+    "paper-cnn-centred",
 )
 EACH = (5, 10, 20)
 """Training sweeps of each material at the points of a learning curve, if a set has more of them."""
 
 
-FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
-
-
-def _fabrics(protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> StudyCase:
-    return StudyCase((FABRICS,), protocol, only, real=True, means_removed=True, curve=curve)
+def _fabrics(
+    protocol: str,
+    only: tuple[str, ...],
+    curve: tuple[int, ...] = (),
+    windows: tuple[int, ...] = (),
+) -> StudyCase:
+    return StudyCase((FABRICS,), protocol, only, True, True, curve, windows)
 
 
 def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
@@ -50,7 +59,7 @@ def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
 
 TUBES = "simulated tubes, a position out"
 CASES = {
-    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, EACH),
+    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, curve=EACH, windows=(16, 32, 64)),
     "7 fabrics, a speed out": _fabrics("leave:speed", SEVEN),
     "7 fabrics, a repetition out": _fabrics("leave:rep", SEVEN),
     "4 fabrics, a force out": _fabrics("leave:force", FOUR),
@@ -101,7 +110,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
             run.left_out[name] = NO_DATA
             continue
         cases.append(_about(name, case, sweeps))
-        for each, point in _points(name, case):
+        for each, frames, point in _points(name, case):
             if point in skipped or name in skipped:
                 run.left_out[point] = f"skipped in the run of {', '.join(names)}"
             else:
@@ -109,7 +118,8 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
                     names, (case.protocol,), run.seeds, case.means_removed, run.effort, each
                 )
                 progress = f"{number}/{len(study.cases)} {point}"
-                found += _evaluated(name, sweeps, plan, run, progress)
+                for entry in _evaluated(name, _middle(sweeps, frames), plan, run, progress):
+                    found.append(entry | ({"frames": frames} if frames else {}))
     known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
     return {
         "methods": list(names),
@@ -121,7 +131,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
 
 
 def _require_known(study: Study, names: Sequence[str]) -> None:
-    known = [point for name, case in study.cases.items() for _, point in _points(name, case)]
+    known = [point for name, case in study.cases.items() for *_, point in _points(name, case)]
     for name in names:
         if name not in known:
             raise FormatError(f"{name!r} is not a case; leave out some of {'; '.join(known)}")
@@ -145,15 +155,27 @@ def _evaluated(
         yield {"case": name, "each": plan.each, "method": method} | _entry(several)
 
 
-def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
-    """Training sweeps of each material (0 for all), and the name, of a case and of each point of
-    its curve."""
-    return [(each, _name(name, each)) for each in (0, *case.curve)]
+def _middle(sweeps: Dataset, frames: int) -> Dataset:
+    """The middle `frames` of each sweep; all of them for 0."""
+    start = (sweeps.format.window - frames) // 2
+    return replace(sweeps, samples=sweeps.samples[:, start:][:, :frames]) if frames else sweeps
 
 
-def _name(case: str, each: int) -> str:
-    """Name of a case, or of a point of its curve."""
-    return f"{case}, {each} each" if each else case
+def _points(name: str, case: StudyCase) -> list[tuple[int, int, str]]:
+    """Training sweeps of each material, frames (0 for all), and the name, of a case and of each
+    point of its curves."""
+    points = [(0, 0), *((each, 0) for each in case.curve), *((0, n) for n in case.windows)]
+    return [(*point, _name(name, *point)) for point in points]
+
+
+def _name(case: str, each: int, frames: int) -> str:
+    """Name of a case, or of a point of its curves."""
+    return f"{case}, {each} each" if each else f"{case}, {frames} frames" if frames else case
+
+
+def _place(entry: Json) -> tuple[str, int, int]:
+    """The case and the point of its curves that an entry is of."""
+    return entry["case"], entry["each"], entry.get("frames", 0)
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
@@ -165,12 +187,8 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
     made = dict(run)
     for one in earlier:
         _require_same_sweeps(made, one)
-        there = {(entry["case"], entry["each"], entry["method"]) for entry in made["results"]}
-        more = [
-            entry
-            for entry in one["results"]
-            if (entry["case"], entry["each"], entry["method"]) not in there
-        ]
+        there = {(_place(entry), entry["method"]) for entry in made["results"]}
+        more = [entry for entry in one["results"] if (_place(entry), entry["method"]) not in there]
         names = dict.fromkeys([*made["methods"], *one["methods"]])
         made |= {
             "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
@@ -182,7 +200,7 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
         done = {
             name
             for entry in made["results"]
-            for name in (f"{entry['method']}, {entry['case']}", _name(entry["case"], entry["each"]))
+            for name in (f"{entry['method']}, {entry['case']}", _name(*_place(entry)))
         }
         made["left_out"] = {
             k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done
@@ -214,6 +232,8 @@ def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
         "format": str(sweeps.format),
         "digest": digest(sweeps),
         "curve": list(case.curve),
+        "windows": list(case.windows),
+        "rate_hz": sweeps.rate_hz,
     }
 
 
@@ -231,3 +251,14 @@ def _entry(results: Sequence[Json]) -> Json:
     }
     costs = {name: max(float(result[name]) for result in results) for name in ("fit_s", "ms_p50")}
     return joined(results) | costs | {"forms": forms}
+
+
+def joined(results: Sequence[Json]) -> Json:
+    """Results of several seeds of one protocol as one: means of accuracies and of the ends of
+    intervals."""
+    shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
+    ends: Iterable[float] = np.mean(shares, axis=0)
+    return {
+        name: round(float(share), 4)
+        for name, share in zip(("mean", "low", "high"), ends, strict=True)
+    } | {"n": results[0]["window"]["total"], "seeds": sorted(r["seed"] for r in results)}

@@ -1,107 +1,128 @@
-"""Renders the pages of the study `development`.
+"""Renders the page "Speed against accuracy" from the results of the study `development`.
 
-It computes nothing but means and differences of the measured figures.
+It computes nothing but means, differences and ranks of the measured figures.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from appliance.core.errors import FormatError
+from train.models.methods import PACKAGED
 from train.reports import html, provenance
-from train.reports.formatting import estimate, exact_percent, points
-from train.studies import (
-    TEMPLATES,
-    chart_page,
-    comparison,
-    development_chart,
-    development_plots,
-    differences,
-    method_names,
-    scatter,
-)
+from train.reports.formatting import amount, estimate, exact_percent, percent, points
+from train.studies import TEMPLATES, comparison, development_plots, differences
 from train.studies.comparison import ROUNDING
 from train.studies.development_chart import (
+    SERIES,
+    TACTILE,
     UNIT,
     Accuracies,
+    ChartPanel,
     Json,
     about_case,
+    by_case,
+    finding,
+    panels,
     plain_case,
     quickest,
     ratio,
     relative_times,
 )
-from train.studies.development_experiment import EACH, OURS
+from train.studies.development_experiment import EACH, LINE, OURS, PEERS
+from train.studies.method_names import about, plain_name, short_name
+from train.studies.ranks import Ranking, ranking
 
 WANTED = {
-    "7 fabrics, a force out": 0.90,
-    "7 fabrics, a speed out": 0.93,
-    "7 fabrics, a repetition out": 0.98,
-    "4 fabrics, a direction out": 0.76,
-    "simulated tubes, a position out": 0.985,
+    "7 fabrics, a force out": 0.91,
+    "7 fabrics, a speed out": 0.94,
+    "7 fabrics, a repetition out": 0.985,
+    "4 fabrics, a direction out": 0.84,
+    "4 fabrics, a force out": 0.87,
+    "4 fabrics, a speed out": 0.90,
 }
-"""Target accuracy of ours, by case."""
-AHEAD, QUICKER, MOST_LOST, HALF = 0.01, 100, 0.005, 0.5
-"""Targets of ours: lead on the best peer's mean, speed in MiniRocket's, largest loss of int8
-against float, largest time of int8 against float."""
+"""Target accuracy of our largest size, by case."""
+NEAREST, SIZES = 0.01, 6
+"""Targets: largest distance to the best peer on published series; sizes of the family."""
+PAPER_CNN = "paper-cnn-centred"
+FASTER = (
+    ("smallest", PAPER_CNN, 80),
+    ("packaged", PAPER_CNN, 40),
+    ("packaged", UNIT, 100),
+    ("largest", UNIT, 20),
+)
+"""Targets of time: a size, the method that it is compared with, and how many times faster it is."""
+BUDGETS_MS = (0.1, 0.2, 0.5, 1.0, 10.0, 200.0)
+"""Times of a sweep for which the page names the best model."""
+SIZES_OF = (("file_kb", "KB"), ("rss_mb", "MB"))
+"""Costs of a model in bytes, with their units."""
+WINDOW = re.compile(r"at ([\d.]+) Hz, window (\d+)")
 
 
-REAL = "real and published"
-"""Name of the first mean."""
+def render(figures: Json, early: Json | None = None) -> tuple[dict[str, str], dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name.
 
-
-def render(figures: Json) -> tuple[dict[str, str], dict[str, str]]:
-    """The pages (HTML) and pictures (SVG) by name; "chart" is there if something was timed.
-
-    Raises FormatError without a result of a method of ours.
+    early: results of the study certainty, for the time of early answers. Raises FormatError without
+    a result of a method of ours.
     """
     table = by_case(figures["results"])
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
-    peers = [name for name in names if name not in OURS]
-    cases = [case for case in figures["cases"] if ours in table.get(case["case"], {})]
-    of = {case["case"]: case for case in cases}
-    means = _means(table, cases, ours, names, peers)
-    main = means[REAL]
-    times = _times(figures)
-    pages, pictures = _timed(figures, table, cases, main["shared"])
-    pictures["accuracy"] = development_plots.lines(cases, table, ours, peers)
-    curves = learning_curves(figures["results"])
-    if curves:
-        pictures["curves"] = development_plots.curves(of, curves, ours)
-    pages["index"] = html.render(
+    cases = {case["case"]: case for case in figures["cases"] if ours in table.get(case["case"], {})}
+    lines = [comparison_line(one, table[case], ours, names) for case, one in cases.items()]
+    shown = panels(figures)
+    pictures = _pictures(figures, cases, lines, early, ours)
+    page = html.render(
         "development.html.j2",
         TEMPLATES,
         header=provenance.of(figures),
         home=html.HOME,
         figures=figures,
-        quick=_quick(figures),
+        quick=bool(figures.get("quick")),
+        pictures={name: html.picture(svg) for name, svg in pictures.items()},
+        panels=[[panel.kind, finding(panel), len(panel.cases)] for panel in shown],
+        budgets=budgets(shown),
+        targets=list(targets(table, cases, shown, _times(figures)["entries"])),
         ours=ours,
         names=names,
-        means=means,
-        main=main,
-        times=times,
-        cases=of,
         table=table,
-        curves=_curve_rows(curves, names),
+        lines=lines,
+        best_of={case: line["best"] for case, line in zip(cases, lines, strict=True)},
+        shown=comparison.shown,
+        means=_mean_rows(shown, names),
+        precisions=list(precisions(table, shown, names)),
+        curves=_curve_rows(learning_curves(figures["results"]), names),
         each=EACH,
-        relative=relative_times(times["entries"], names),
-        precisions=list(precisions(table, main["shared"], names)),
-        pictures={name: html.picture(svg) for name, svg in pictures.items()},
-        costs=[_cost(one) for one in times["entries"]],
-        fits=[[method_names.plain_name(name), _fit_s(table, name)] for name in names],
-        **_beside_peers(of, table, ours, peers, main, times["entries"]),
-        **_words(of, names, _missing(table, of, names, figures["left_out"])),
+        **_costs(figures, table, names),
+        **_words(cases, names, _missing(table, cases, names, figures["left_out"])),
     )
-    return pages, pictures
+    return {"index": page}, pictures
 
 
-def _quick(figures: Json) -> bool:
-    """Whether the run was too small for figures."""
-    return bool(figures.get("quick", False))
+def front(figures: Json) -> str:
+    """The picture of README."""
+    return development_plots.speed(panels(figures), machine(figures))
+
+
+def caption(figures: Json) -> str:
+    """The text of README below the picture."""
+    older = provenance.of(figures).older
+    said = [f"{panel.kind.capitalize()}: {finding(panel)}." for panel in panels(figures)]
+    return "\n\n".join(([f"*{older}*"] if older else []) + [" ".join(said)])
+
+
+def machine(figures: Json) -> str:
+    """Processor, threads and sweep of the measured times."""
+    times = _times(figures)
+    where = times.get("processor") or figures["runs"][0]["machine"]
+    return (
+        f"{where}, one thread, all methods in turns in one process; a sweep of "
+        f"{times.get('format', 'the set')}"
+    )
 
 
 def _times(figures: Json) -> Json:
@@ -109,98 +130,23 @@ def _times(figures: Json) -> Json:
     return figures.get("times") or {"entries": [], "left_out": {}}
 
 
-def _cost(one: Json) -> list[Any]:
-    """A row of the table of times."""
-    columns = ("precision", "runtime", "ms_p50", "ms_p99")
-    return [method_names.plain_name(one["method"]), *(one[key] for key in columns)]
-
-
-def _timed(
-    figures: Json, table: Mapping[str, Accuracies], cases: Sequence[Json], shared: Sequence[str]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """The page of the chart over times, and its picture; both empty if nothing was timed."""
-    times = _times(figures)
-    dots = development_chart.dots(times["entries"], table, cases, shared)
-    if not dots:
-        return {}, {}
-    axes = development_chart.axes(cases, shared)
-    picture = scatter.chart(dots, list(axes)[:1], accuracies=axes)
-    page = chart_page.html(
-        _with_origin(dots, figures),
-        picture,
-        _quick(figures),
-        times["left_out"],
-        accuracies=axes,
-        source="development.json",
-        header=provenance.of(figures),
-    )
-    return {"chart": page}, {"front": picture}
-
-
-def _beside_peers(
-    of: Mapping[str, Json],
-    table: Mapping[str, Accuracies],
-    ours: str,
-    peers: Sequence[str],
-    main: Json,
-    times: Sequence[Json],
-) -> dict[str, Any]:
-    """Ours beside the best peer of each case, and the targets."""
-    lines = [
-        comparison.line(
-            plain_case(one),
-            table[case][ours],
-            _plain_names({name: table[case][name] for name in peers if name in table[case]}),
-        )
-        for case, one in of.items()
-    ]
-    best = {case: line["best"] for case, line in zip(of, lines, strict=True)}
-    return {
-        "lines": lines,
-        "best_of": best,
-        "shown": comparison.shown,
-        "targets": list(targets(lines, of, table, ours, main, times)),
-    }
-
-
-def _words(
-    of: Mapping[str, Json], names: Sequence[str], missing: Mapping[str, Sequence[str]]
-) -> dict[str, Any]:
-    """Names of cases and methods in words. missing: by method the cases without a result."""
-    plain = {case: plain_case(one) for case, one in of.items()}
-    return {
-        "plain": plain,
-        "name_of": method_names.plain_name,
-        "about": {name: method_names.about(name) for name in names},
-        "missing": {name: [plain[case] for case in those] for name, those in missing.items()},
-        "sets": [[plain[case], about_case(one), one["sweeps"]] for case, one in of.items()],
-        "files": [
-            [plain[case], ", ".join([one["set"], *one["only"]]), one["protocol"], one["digest"]]
-            for case, one in of.items()
-        ],
-    }
-
-
-def _with_origin(dots: Sequence[Json], figures: Json) -> list[dict[str, Any]]:
-    """The dots with commit, machine, set and seeds."""
-    commits = ", ".join(dict.fromkeys(run["commit"] for run in figures["runs"]))
-    seeds = sorted({seed for run in figures["runs"] for seed in run["seeds"]})
-    known = {
-        "commit": commits,
-        "machine": figures["runs"][0]["machine"],
-        "set": figures["times"]["set"],
-        "seeds": seeds,
-    }
-    return [{**dot, **known} for dot in dots]
-
-
-def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
-    """Entries with all training sweeps: {case: {method: entry}}."""
-    table: dict[str, dict[str, Json]] = {}
-    for entry in results:
-        if not entry["each"]:
-            table.setdefault(entry["case"], {})[entry["method"]] = entry
-    return table
+def _pictures(
+    figures: Json, cases: Mapping[str, Json], lines: Sequence[Json], early: Json | None, ours: str
+) -> dict[str, str]:
+    """All pictures that the results allow."""
+    shown, pictures = panels(figures), {}
+    if shown:
+        pictures["front"] = front(figures)
+    if beside := [line for line in lines if line["best"]]:
+        pictures["accuracy"] = development_plots.dumbbells(beside)
+    table = by_case(figures["results"])
+    if ordered := {panel.kind: one for panel in shown if (one := rank(panel, table))}:
+        pictures["ranks"] = development_plots.ranks(ordered)
+    if touched := touch_curves(figures, early):
+        pictures["touch"] = development_plots.touch(touched)
+    if curves := learning_curves(figures["results"]):
+        pictures["curves"] = development_plots.curves(cases, curves, ours)
+    return pictures
 
 
 def subject(table: Mapping[str, Accuracies]) -> str:
@@ -213,163 +159,203 @@ def subject(table: Mapping[str, Accuracies]) -> str:
     )
 
 
-def _plain_names(entries: Mapping[str, Json]) -> dict[str, Json]:
-    return {method_names.plain_name(name): one for name, one in entries.items()}
+def comparison_line(case: Json, row: Accuracies, ours: str, names: Sequence[str]) -> dict[str, Any]:
+    """Ours beside the best peer in one test."""
+    peers = {plain_name(name): row[name] for name in names if name not in OURS and name in row}
+    return comparison.line(plain_case(case), row[ours], peers)
 
 
-def _means(
-    table: Mapping[str, Accuracies],
-    cases: Sequence[Json],
-    ours: str,
-    names: Sequence[str],
-    peers: Sequence[str],
-) -> dict[str, Json]:
-    """Means over cases, by the kind of cases. A mean over the same cases as an earlier one is left
-    out."""
-    real = [case for case in cases if not case["simulated"]]
-    means: dict[str, Json] = {}
-    for what, mean in (
-        (REAL, mean_row(table, real, ours, names, peers)),
-        ("all, the simulated ones too", mean_row(table, cases, ours, names, peers)),
-        (
-            "real and published that every method has",
-            mean_row(table, real, ours, names, peers, peers),
-        ),
-    ):
-        if what == REAL or (
-            mean["shared"] and mean["shared"] not in [m["shared"] for m in means.values()]
-        ):
-            line = mean["line"] and {**mean["line"], "what": f"{len(mean['shared'])} lines: {what}"}
-            means[what] = {**mean, "line": line}
-    return means
-
-
-def mean_row(
-    table: Mapping[str, Accuracies],
-    cases: Sequence[Json],
-    ours: str,
-    names: Sequence[str],
-    peers: Sequence[str],
-    of: Sequence[str] = (),
-) -> Json:
-    """Means over the cases (`shared`) that ours and the peers `of` have, in `entries` by method,
-    and ours beside the best peer.
-
-    A method without all of these cases has no mean. Without `of`, peers and cases are those of the
-    largest table without gaps.
-    """
-    sets = {case["case"]: case["set"] for case in cases}
-    has = {
-        name: {case for case in sets if name in table[case] and ours in table[case]}
-        for name in peers
+def rank(panel: ChartPanel, table: Mapping[str, Accuracies]) -> Ranking | None:
+    """The ranking of our two recipes and of the peers that were run in every test; None for fewer
+    than two."""
+    names = {spot.method for spot in panel.whole} - set(LINE[:-1])
+    cases = [case["case"] for case in panel.cases]
+    accuracies = {
+        name: [float(table[case][name]["mean"]) for case in cases] for name in sorted(names)
     }
-    whole = of or max(
-        ([name for name in peers if has[name] >= has[peer]] for peer in peers),
-        key=lambda those: (len(those) * (lines := min(len(has[name]) for name in those)), lines),
-        default=(),
-    )
-    shared = [case for case in sets if all(name in table[case] for name in (ours, *whole))]
-    entries = {
-        name: differences.entry(
-            development_chart.mean({case: table[case][name] for case in shared}, sets)
+    return ranking(accuracies) if len(accuracies) > 1 else None
+
+
+def touch_curves(figures: Json, early: Json | None) -> dict[str, Any]:
+    """Accuracy over seconds of touch by test and method: shorter windows; and in simulation windows
+    of different length, and the early answers of the box."""
+    found: dict[str, Any] = {}
+    known = {case["case"]: case for case in figures["cases"]}
+    shorter = {(e["case"], e["method"]) for e in figures["results"] if e.get("frames")}
+    for case, name in sorted(shorter, key=lambda one: one[1] not in OURS):
+        window = int(known[case]["format"].rpartition(" ")[2])
+        line = sorted(
+            ((e.get("frames") or window) / known[case]["rate_hz"], e["mean"])
+            for e in figures["results"]
+            if (e["case"], e["method"], e["each"]) == (case, name, 0)
         )
-        for name in names
-        if shared and all(name in table[case] for case in shared)
-    }
-    beside = _plain_names({name: entries[name] for name in peers if name in entries})
-    line = comparison.line("the mean", entries[ours], beside) if shared else None
-    return {"shared": shared, "entries": entries, "line": line}
+        found.setdefault(plain_case(known[case]), {})[plain_name(name)] = line
+    if early and (format := WINDOW.search(early["format"])):
+        window_s = int(format[2]) / float(format[1])
+        parts, rule = early["early"]["always"], early["early"]["rule"]
+        found["simulated tubes: other skins than in training"] = {
+            "after a set time": [
+                (window_s * (i + 1) / len(parts), one["accuracy"]) for i, one in enumerate(parts)
+            ],
+            "early answers": [(window_s * early["early"]["share"], rule["accuracy"])],
+        }
+    return found
+
+
+def budgets(shown: Sequence[ChartPanel]) -> list[list[str]]:
+    """Rows of a table: a time of a sweep, and for each panel the best model within it."""
+    rows = []
+    for ms in BUDGETS_MS:
+        cells = []
+        for panel in shown:
+            best = panel.within(ms)
+            cells.append(
+                f"{plain_name(best.method)}, {best.precision}: "
+                f"{percent(best.mean)} in {amount(best.ms, 'ms')}"
+                if best
+                else "none"
+            )
+        rows.append([amount(ms, "ms"), *cells])
+    return rows
 
 
 def targets(
-    lines: Sequence[Json],
-    cases: Mapping[str, Json],
     table: Mapping[str, Accuracies],
-    ours: str,
-    mean: Json,
+    cases: Mapping[str, Json],
+    shown: Sequence[ChartPanel],
     times: Sequence[Json],
 ) -> Iterator[Json]:
     """A line for each target: wanted, reached, and whether it is met."""
-    judged = [line for line in lines if line["best"]]
-    if judged:
-        near = sum(not line["short"] for line in judged)
-        yield {
-            "what": "lines in which it is no more than one point below the best peer",
-            "target": f"{len(judged)} of {len(judged)}",
-            "here": f"{near} of {len(judged)}",
-            "met": near == len(judged),
-        }
-    if mean["line"] and mean["line"]["best"]:
-        yield {
-            "what": f"points ahead of {mean['line']['best']}, the best peer on the mean of "
-            f"{len(mean['shared'])} real and published lines",
-            "target": f"≥ {points(AHEAD)}",
-            "here": comparison.shown(mean["line"]["gap"]),
-            "met": mean["line"]["gap"][0] >= AHEAD - ROUNDING,
-        }
     for case, wanted in WANTED.items():
-        if case in cases:
-            one = table[case][ours]
+        if case in cases and (one := table[case].get(OURS[0])):
             yield {
-                "what": plain_case(cases[case]),
+                "what": f"{plain_case(cases[case])}, {_seeds(one)}",
                 "target": f"≥ {exact_percent(wanted)}",
                 "met": one["mean"] >= wanted - ROUNDING,
-                "here": estimate([one["mean"], one["low"], one["high"]]),
+                "here": estimate(differences.of(one)),
             }
-    for one in precisions(table, mean["shared"], [ours]):
-        yield {
-            "what": "points that int8 loses of its own float, on the mean",
-            "target": f"≤ {points(MOST_LOST)}",
-            "here": points(one["float"] - one["int8"]),
-            "met": one["float"] - one["int8"] <= MOST_LOST + ROUNDING,
-        }
-    yield from _time_targets(times, ours)
+    for panel in shown:
+        if panel.kind == SERIES and panel.ours and panel.peer:
+            gap = differences.difference(panel.ours.accuracy, panel.peer.accuracy)
+            yield {
+                "what": f"points ahead of {short_name(panel.peer.method)}, mean of {SERIES}",
+                "target": f"≥ {points(-NEAREST)}",
+                "met": gap[0] >= -NEAREST - ROUNDING,
+                "here": comparison.shown(gap),
+            }
+        elif panel.kind == TACTILE and panel.line:
+            beaten = panel.dominated
+            yield {
+                "what": f"sizes on {TACTILE} than which no peer is faster and more accurate",
+                "target": f"all of {SIZES} or more",
+                "met": not beaten and len(panel.line) >= SIZES,
+                "here": f"{len(panel.line) - len(beaten)} of {len(panel.line)}",
+            }
+    yield from time_targets(times)
 
 
-def _time_targets(times: Sequence[Json], ours: str) -> Iterator[Json]:
-    """Lines for the targets of time, if times were measured."""
-    if (quick := quickest(times)).keys() >= {ours, UNIT}:
-        share = quick[ours] / quick[UNIT]
-        yield {
-            "what": "time of a sweep, MiniRocket’s = 1",
-            "target": f"≤ 1/{QUICKER}",
-            "here": ratio(share),
-            "met": share * QUICKER <= 1,
+def _seeds(entry: Json) -> str:
+    count = len(entry["seeds"])
+    return f"{count} seed" if count == 1 else f"{count} seeds"
+
+
+def time_targets(times: Sequence[Json]) -> Iterator[Json]:
+    """Lines for the targets of time whose methods were timed. The paper's CNN counts in int8."""
+    ms, whole = quickest(times), quickest(times, "int8")
+    sizes = {name: ms[name] for name in OURS if name in ms and name != PACKAGED}
+    own = {"packaged": ms.get(PACKAGED)}
+    if sizes:
+        own |= {"smallest": min(sizes.values()), "largest": max(sizes.values())}
+    for size, peer, wanted in FASTER:
+        other, mine = (whole if peer == PAPER_CNN else ms).get(peer), own.get(size)
+        if other and mine:
+            yield {
+                "what": f"time of our {size} model, {short_name(peer)}’s = 1",
+                "target": f"≤ 1/{wanted}",
+                "met": mine * wanted <= other,
+                "here": ratio(mine / other),
+            }
+
+
+def _mean_rows(shown: Sequence[ChartPanel], names: Sequence[str]) -> list[Json]:
+    """For each panel the means of the methods that were run in every test."""
+    rows: list[Json] = []
+    for panel in shown:
+        entries = {
+            spot.method: differences.entry(spot.accuracy) for spot in panel.whole if not spot.form
         }
-    own = {one["precision"]: one["ms_p50"] for one in times if one["method"] == ours}
-    if own.keys() >= {"int8", "float"}:
-        share = own["int8"] / own["float"]
-        yield {
-            "what": "time of a sweep in int8, that of its own float = 1",
-            "target": f"≤ {HALF:g}",
-            "here": f"{share:.2f}",
-            "met": share <= HALF,
-        }
+        peers = {name: entries[name]["mean"] for name in entries if name not in OURS}
+        best = max(peers, key=lambda name: peers[name], default="")
+        rows.append({"what": panel.kind, "n": len(panel.cases), "entries": entries, "best": best})
+    return rows
+
+
+def _costs(figures: Json, table: Mapping[str, Accuracies], names: Sequence[str]) -> dict[str, Any]:
+    """Times and costs of all methods, in words."""
+    times = _times(figures)
+    return {
+        "times": times,
+        "machine": machine(figures),
+        "relative": relative_times(times["entries"], names),
+        "costs": [_cost(one) for one in times["entries"]],
+        "fits": [[plain_name(name), _fit_s(table, name)] for name in names],
+    }
+
+
+def _cost(one: Json) -> list[str]:
+    """A row of the table of costs."""
+    counts = [f"{one[key]:,}" if one.get(key) else "–" for key in ("weights", "macs")]
+    sizes = [amount(one[key], unit) if one.get(key) else "–" for key, unit in SIZES_OF]
+    times = [amount(one[key], "ms") for key in ("ms_p50", "ms_p99")]
+    name = plain_name(one["method"])
+    return [name, one["precision"], one["runtime"], *times, *counts, *sizes]
 
 
 def precisions(
-    table: Mapping[str, Accuracies], cases: Sequence[str], names: Iterable[str]
-) -> Iterator[Json]:
-    """For each method with results in int8 and in float, the means of both over its `cases`."""
-    for name in names:
-        entries = [
-            table[case][name]
-            for case in cases
-            if name in table[case] and table[case][name]["forms"]
-        ]
-        if not entries:
-            continue
-        (form,) = entries[0]["forms"]
-        own, other = (
-            float(np.mean([e["mean"] for e in those]))
-            for those in (entries, [e["forms"][form] for e in entries])
-        )
-        yield {
-            "method": name,
-            "lines": len(entries),
-            form: other,
-            "int8" if form == "float" else "float": own,
-        }
+    table: Mapping[str, Accuracies], shown: Sequence[ChartPanel], names: Iterable[str]
+) -> Iterator[list[str]]:
+    """Rows of a table: for each panel and method with results in int8 and in float, the means of
+    both."""
+    for panel in shown:
+        for name in names:
+            entries = [
+                table[case["case"]][name]
+                for case in panel.cases
+                if table[case["case"]].get(name, {}).get("forms")
+            ]
+            if not entries:
+                continue
+            (form,) = entries[0]["forms"]
+            own, other = (
+                float(np.mean([e["mean"] for e in those]))
+                for those in (entries, [e["forms"][form] for e in entries])
+            )
+            int8, whole = (own, other) if form == "float" else (other, own)
+            yield [
+                plain_name(name),
+                panel.kind,
+                *map(percent, (int8, whole)),
+                points(whole - int8),
+                str(len(entries)),
+            ]
+
+
+def _words(
+    cases: Mapping[str, Json], names: Sequence[str], missing: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Names of cases and methods in words. missing: by method the cases without a result."""
+    plain = {case: plain_case(one) for case, one in cases.items()}
+    return {
+        "plain": plain,
+        "name_of": plain_name,
+        "about": {name: about(name) for name in names},
+        "missing": {name: [plain[case] for case in those] for name, those in missing.items()},
+        "sets": [[plain[case], about_case(one), one["sweeps"]] for case, one in cases.items()],
+        "files": [
+            [plain[case], ", ".join([one["set"], *one["only"]]), one["protocol"], one["digest"]]
+            for case, one in cases.items()
+        ],
+    }
 
 
 def _missing(
@@ -378,12 +364,14 @@ def _missing(
     names: Sequence[str],
     left_out: Mapping[str, str],
 ) -> dict[str, list[str]]:
-    """By method the cases without a result and without another reason."""
+    """By method the cases without a result and without another reason; methods without any result
+    come last."""
+    every = [*names, *(name for name in PEERS if name not in names)]
     lacks = {
         name: [
             case for case in cases if name not in table[case] and f"{name}, {case}" not in left_out
         ]
-        for name in names
+        for name in every
     }
     return {name: those for name, those in lacks.items() if those}
 
@@ -393,7 +381,9 @@ def learning_curves(results: Iterable[Json]) -> dict[str, dict[str, dict[int, Js
     than one point."""
     curves: dict[str, dict[str, dict[int, Json]]] = {}
     for entry in results:
-        curves.setdefault(entry["case"], {}).setdefault(entry["method"], {})[entry["each"]] = entry
+        if not entry.get("frames"):
+            line = curves.setdefault(entry["case"], {}).setdefault(entry["method"], {})
+            line[entry["each"]] = entry
     return {
         case: lines
         for case, lines in curves.items()

@@ -1,4 +1,4 @@
-"""Time of a sweep with each method, all in turns in one process.
+"""Costs of a sweep with each method, all timed in turns in one process.
 
 A method with a graph is packed as a bundle and timed in the box's classifier, with checks and
 features. Other methods are timed in their own library, without checks.
@@ -17,24 +17,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError, FormatError
+from appliance.core.provenance import processor
 from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.export import measure
+from train.metrics import score
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 from train.studies import precisions
-from train.studies.chart_experiment import kept_folder
 from train.studies.development_experiment import OURS
+from train.studies.study import StudyCase
 
 Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
+TIMED = StudyCase(("sim:T-REAL/level-blind:1",))
+"""The sweeps that every method is trained on and timed with."""
+QUICK = StudyCase(("sim:T-REAL/level-blind:1001:3",), only=("position<=2",))
 ROUNDS = 10
-"""Rounds of timing. The slowest methods take a hundred times as long as those of the chart."""
-EVERY, SHARE = 5, 0.25
-"""A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
-iterations: training does not change the time of a sweep. Ours are trained as always, because
-training chooses their size."""
+"""Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
+EVERY, SHARE = 5, 0.02
+"""A peer of a library is trained on every fifth sweep, a network of a peer for few iterations:
+training does not change the time of a sweep. Ours are trained as always, because training chooses
+their size."""
 
 
 def measured(
@@ -46,54 +51,57 @@ def measured(
     effort: Effort = FULL_EFFORT,
     rounds: int = ROUNDS,
 ) -> Json:
-    """`entries` with `method`, `form`, `precision`, `runtime`, `ms_p50` and `ms_p99` of a sweep,
-    for graphs also `weights`, `macs` and `file_kb`, and the methods that are `left_out`.
+    """`entries` with the costs of a sweep, which docs/reference/file-formats.md describes, and the
+    methods that are `left_out`.
 
-    Bundles are cached in `cache`, as for the chart.
+    Bundles are cached in `cache`.
     """
     entries: list[Json] = []
     calls: dict[str, measure.Call] = {}
     left_out: dict[str, str] = {}
+    some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
     with tempfile.TemporaryDirectory() as work:
         progress = Progress(len(names), log)
         for method in [_briefly(name, effort) for name in names]:
             progress.begin(f"{method.name} is trained for its time")
             try:
-                for entry, call in _callable(method, sweeps, seed, cache or Path(work)):
+                for entry, call in _callable(method, sweeps, some, seed, cache or Path(work)):
                     calls[str(len(entries))] = call
                     entries.append(entry)
             except (FormatError, BundleError) as e:
                 left_out[method.name] = str(e)
         log(f"{len(calls)} models take turns")
-        some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
         took = measure.timed(calls, some, rounds)
     for entry, times in zip(entries, took.values(), strict=True):
         entry |= {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
     return {
         "set": sweeps.source,
         "format": str(sweeps.format),
+        "processor": processor(),
         "entries": entries,
         "left_out": left_out,
-    }
+    } | score.provenance()
 
 
 def _briefly(name: str, effort: Effort) -> Method:
     """The method, for a peer with SHARE of its iterations, unless the effort is smaller anyway."""
     return methods.find(
-        [name], effort if name in OURS else replace(effort, share=min(SHARE, effort.share))
+        [name],
+        effort if name in OURS else replace(effort, share=min(SHARE, effort.share), paper_steps=1),
     )[0]
 
 
 def _callable(
-    method: Method, sweeps: Dataset, seed: int, cache: Path
+    method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path
 ) -> list[tuple[Json, measure.Call]]:
-    """The method in each precision of the box, and in its own library."""
+    """The method in each precision of the box, and in its own library. some: raw counts
+    [n, T, R, C] for its memory."""
     if method.library:
-        some = sweeps.take(np.arange(0, len(sweeps), EVERY))
-        model = method.train(some, model_inputs(method.input, some), seed)
+        few = sweeps.take(np.arange(0, len(sweeps), EVERY))
+        model = method.train(few, model_inputs(method.input, few), seed)
         entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
         return [(entry | {"runs_on_box": False}, partial(_alone, model))]
-    made = precisions.packed(method, sweeps, seed, kept_folder(method, sweeps, seed, cache))
+    folder = precisions.kept_folder(method, sweeps, seed, cache)
     return [
         (
             {
@@ -105,10 +113,11 @@ def _callable(
                 "weights": one.weights,
                 "macs": one.macs,
                 "file_kb": measure.sizes(one.folder)[0] / 1000,
+                "rss_mb": measure.memory(one.folder, some)["rss_mib"],
             },
             measure.load(one.folder),
         )
-        for one in made
+        for one in precisions.packed(method, sweeps, seed, folder)
     ]
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,15 @@ from train.studies import (
     marked_text,
     matrix_table,
     plots,
+    quotes,
+    reports,
 )
 from train.studies.study import DATA, read, results_file
 
 README, ALIGN = "README.md", "docs/how-to/align.md"
 SPECIFICATIONS = "docs/reference/specifications.md"
+FIGURES_PAGE = "docs/explanation/figures.md"
 ALIGNMENT, FABRICS = "docs/alignment/README.md", "docs/fabricslide/README.md"
-MADE_BY = {"bench": "make bench"}
-"""The command that makes results which no study makes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,25 +55,23 @@ class DocumentPicture:
     draw: Callable[[Any], str]
 
 
-def picture_note(figures: Any) -> str:
-    """The line under a picture of an older default; "" if it shows today's default."""
-    older = provenance.of(figures).older
-    return f"*{older}*" if older else ""
-
-
 FIGURES = (
-    DocumentFigure(README, "front", "development", picture_note),
+    DocumentFigure(README, "front", "development", development_report.caption),
     DocumentFigure(SPECIFICATIONS, "bench", "bench", bench_table.table),
     DocumentFigure(ALIGN, "moved", "alignment", contact_table.sentence),
     DocumentFigure(ALIGNMENT, "in short", "alignment", contact_table.headline),
     DocumentFigure(ALIGNMENT, "alignment", "alignment", contact_table.table),
     DocumentFigure(FABRICS, "matrix", "fabrics", matrix_table.headline),
+    *(
+        DocumentFigure(FIGURES_PAGE, f"quotes {study}", study, partial(quotes.table, study))
+        for study in quotes.QUOTES
+    ),
 )
 PICTURES = (
     DocumentPicture(
         "docs/front.svg",
         "development",
-        lambda figures: development_report.render(figures)[1]["front"],
+        development_report.front,
     ),
     DocumentPicture("docs/alignment/place.svg", "alignment", contact_plot.draw),
     DocumentPicture("docs/fabricslide/windows.svg", "fabrics", plots.matrix),
@@ -126,7 +126,7 @@ def _of(results: str, what: str, make: Callable[[Any], str], root: Path) -> str:
     try:
         return make(read(root / file))
     except (FormatError, LookupError, TypeError, AttributeError) as e:
-        command = MADE_BY.get(results, f"python -m train.studies {results}")
+        command = reports.named([results])[0].command
         raise FormatError(
             f"{file} does not hold the figures of {what!r}: {e!r}; run `{command}`"
         ) from e

@@ -9,17 +9,18 @@ from typing import Any
 from appliance.core.errors import FormatError
 from train.evaluation import evaluate
 from train.evaluation.evaluate import Plan
-from train.studies.chart_experiment import FABRICS, SEVEN
-from train.studies.development_experiment import FOUR
 from train.studies.study import NO_DATA, StudyCase, StudyRun
 
 Json = dict[str, Any]
+FABRICS = "fabricslide/fabricslide.npz"
+SEVEN = ("direction=0", "force<=180")
+FOUR = ("material=BeigeCotton,BrownCotton,Canvas,Linen",)
 PROTOCOLS = (
     (SEVEN, ("leave:force", "leave:speed", "leave:rep")),
     (FOUR, ("leave:force", "leave:speed", "leave:direction")),
 )
-"""Two selections of the set with all combinations of their conditions, and the protocols of
-each."""
+"""The two selections of the set that have all combinations of their conditions, and the protocols
+of each."""
 SEED = 1
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from train.models import methods
 from train.models.methods import PACKAGED, SHIPPED
 from train.models.recipe.sizes import SIZES
 
@@ -69,32 +68,18 @@ NAMES = {
 }
 
 
-FAMILIES = {
-    "train.models.recipe.palpate": OURS,
-    "train.models.peers.baselines": "L and H",
-    "train.models.peers.paper_cnn": "deep networks",
-    "train.models.peers.recurrent": "deep networks",
-    "train.models.peers.minirocket": "MiniRocket",
-    "train.models.peers.minirocket_augmented": "MiniRocket",
-    "train.models.peers.aeon_peers": "aeon",
-    "train.models.peers.ds_cnn": "edge tools",
-    "train.models.peers.lite": "edge tools",
-    "train.models.peers.edge_spectral": "edge tools",
-}
-OTHERS = "related work"
-"""The origin of a method, by its module."""
-
-
 def plain_name(method: str) -> str:
     """The name of a method for people."""
     return NAMES[method][0] if method in NAMES else method
 
 
 def about(method: str) -> str:
-    """A method in a line; "" if there is no description."""
+    """A method in a line, or ""."""
     return NAMES[method][1] if method in NAMES else ""
 
 
-def family(method: str) -> str:
-    """The origin of a method: OURS for ours."""
-    return FAMILIES.get(methods.module_of(method), OTHERS) if method in methods.every() else OTHERS
+def short_name(method: str) -> str:
+    """The name of a method in a picture, where all of ours have one colour."""
+    if method == PACKAGED:
+        return "packaged recipe"
+    return plain_name(method).removeprefix(f"{OURS}, ")

@@ -13,7 +13,6 @@ from typing import Any
 from appliance.core.errors import FormatError
 from train.reports import html, provenance
 from train.studies import (
-    chart_page,
     development_report,
     paper_report,
     stress_report,
@@ -49,17 +48,17 @@ def _paper(results: Any, folder: Path) -> Rendered:
     return {"index": page}, pictures
 
 
-def _chart(results: Any, folder: Path) -> Rendered:
-    page, pictures = chart_page.render(results, box_on_hard(folder))
-    return {"index": page}, pictures
+def _development(results: Any, folder: Path) -> Rendered:
+    certainty = results_file("certainty", folder)
+    early = read(certainty, *PAGES["certainty"].keys) if certainty.exists() else None
+    return development_report.render(results, early)
 
 
 PAGES: Mapping[str, Page] = {
     "development": Page(
         ("methods", "runs", "cases", "results", "left_out"),
-        lambda results, folder: development_report.render(results),
+        _development,
     ),
-    "chart": Page((), _chart),
     "stress": Page(("methods", "box"), _single(stress_report.render)),
     "certainty": Page(("calibration", "early"), _single(uncertainty_report.render)),
     "paper": Page(("table", "results"), _paper),

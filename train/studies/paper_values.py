@@ -45,4 +45,4 @@ SEVERAL: dict[str, tuple[float | None, ...]] = {
 
 def short_name(method: str) -> str:
     """A name that fits beside a bar and above a panel."""
-    return method.removeprefix("default-")
+    return method.removeprefix("palpate-")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core import storage
+from train.data import sets
 from train.data.sets import Dataset
+from train.evaluation.fold import fingerprint
 from train.export import measure, pack
-from train.export.measure import Measurement
+from train.models import methods
 from train.models.methods import Method
 from train.models.peers import minirocket
 from train.studies import cost
@@ -51,6 +53,13 @@ class Packed:
         return f"{self.method} {self.precision}" + (
             "" if self.runtime == "onnx" else f" in {self.runtime}"
         )
+
+
+def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
+    """The folder in the cache for the bundles of a method that was trained on these sweeps."""
+    about = [sets.digest(train), method.name, method.effort, seed]
+    modules = methods.module_of(method.name), "train.studies.precisions", "train.export.pack"
+    return cache / "dots" / fingerprint(about, *modules)
 
 
 def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Packed]:
@@ -127,32 +136,3 @@ PEERS: Mapping[str, tuple[str, Callable[[Any, Dataset, int, Path], None]]] = {
     "minirocket": ("aeon", _save_aeon),
 }
 """Methods that are also measured in their own library, which the box does not have."""
-
-
-def measured(
-    models: Sequence[Packed], sweeps: Array, rounds: int = measure.ROUNDS
-) -> list[dict[str, Any]]:
-    """The cost of each of the `models` with the names of chart.json; see
-    docs/reference/file-formats.md. sweeps: raw counts [n, T, R, C].
-
-    Raises BundleError if a model does not run.
-    """
-    found = measure.measure_all([one.folder for one in models], sweeps, rounds)
-    return [_costs(one, measurement) for one, measurement in zip(models, found, strict=True)]
-
-
-def _costs(one: Packed, measurement: Measurement) -> dict[str, Any]:
-    return {
-        "method": one.method,
-        "precision": one.precision,
-        "runtime": one.runtime,
-        "weights": one.weights,
-        "macs": one.macs,
-        "file_kb": measurement.model_kb,
-        "bundle_kb": measurement.bundle_kb,
-        "rss_mb": measurement.rss_mib,
-        "ms_p50": measurement.ms_p50,
-        "ms_p99": measurement.ms_p99,
-        "touch_s": one.window_s,
-        "runs_on_box": one.runtime == "onnx" and not measurement.foreign,
-    }

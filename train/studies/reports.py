@@ -77,7 +77,6 @@ REPORTS = (
         "--test",
         "sim:T-REAL/level-blind:4-6:20",
     ),
-    _study("chart", needs=(REAL,)),
     _study("fabrics", needs=(REAL,)),
     _study("stress"),
     _study("paper"),

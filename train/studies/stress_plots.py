@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from train.evaluation.robustness import POINTS, breaks_first
+from train.reports.confusion_plot import shade
+from train.reports.formatting import level
 from train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -23,7 +25,10 @@ from train.reports.plot_style import (
     WIDTH,
     add_axes,
     set_ticks,
+    single_axes,
+    tiles,
     to_svg,
+    write,
 )
 
 Json = Mapping[str, Any]
@@ -77,6 +82,51 @@ def methods(curves: Mapping[str, Json]) -> str:
         legend,
         "share of corrupted sweeps that each method names rightly",
     )
+
+
+def matrix(columns: Mapping[str, Json]) -> str:
+    """Corruptions by methods: the severity at which five points are lost, in a deeper colour the
+    less of the tested range it takes. A point stands for a method that loses less in the whole
+    range.
+
+    columns: curves by corruption, by the name of the method; the box comes first.
+    """
+    about = {name: curve for curves in columns.values() for name, curve in curves.items()}
+    names = sorted(about, key=lambda name: _endurance(columns, name))
+    above = 1.5
+    figure, axes = single_axes(
+        above + 0.24 * len(names) + 0.05, left=0.43, right=0.93, top=above, bottom=0.05
+    )
+    for i, name in enumerate(names):
+        curve = about[name]
+        label = f"{curve['title']}, to {level(curve, curve['severities'][-1])}"
+        write(axes, -0.15, i + 0.5, label, size=SMALL, ha="right")
+        for j, curves in enumerate(columns.values()):
+            if name in curves:
+                _cell(axes, i, j, curves[name])
+    for j, method in enumerate(columns):
+        look: dict[str, Any] = {"rotation": 60, "ha": "left", "va": "bottom"}
+        write(axes, j + 0.3, -0.15, method, BLACK if j > 1 else ACCENT, SMALL, **look)
+    tiles(axes, len(names), len(columns))
+    return to_svg(figure, "severity of each corruption at which a method loses five points")
+
+
+def _reach(curve: Json) -> float:
+    """The share of the tested range that a method endures; 1 for all of it."""
+    return 1.0 if curve["falls"] is None else curve["falls"] / curve["severities"][-1]
+
+
+def _endurance(columns: Mapping[str, Json], name: str) -> float:
+    """The mean share of the range that methods endure under one corruption."""
+    return float(np.mean([_reach(curves[name]) for curves in columns.values() if name in curves]))
+
+
+def _cell(axes: Axes, i: int, j: int, curve: Json) -> None:
+    """Row i, column j: the severity on its shade."""
+    falls = curve["falls"]
+    shade(axes, i, j, 1 - _reach(curve))
+    text = "·" if falls is None else level(curve, falls).partition(" ")[0]
+    write(axes, j + 0.5, i + 0.5, text, GREY if falls is None else BLACK, SMALL)
 
 
 def shown(curves: Mapping[str, Json]) -> list[str]:

@@ -14,11 +14,12 @@ from train.evaluation.robustness import POINTS, breaks_first
 from train.reports import html, provenance
 from train.reports.formatting import exact_percent, level
 from train.studies import TEMPLATES, stress_plots
-from train.studies.method_names import about, plain_name
+from train.studies.method_names import about, plain_name, short_name
 from train.studies.stress_targets import TARGETS, at_targets
 
 Json = Mapping[str, Any]
 PACKAGED = "the packaged bundle, as the box answers"
+BOX, NETWORK = "the box, as it answers", "its network alone"
 SHOWN = 3
 """Corruptions of each method in the table of the first losses."""
 
@@ -35,9 +36,9 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
         )
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]
-    pictures = {"curves": stress_plots.methods(curves)} | (
-        {"box": stress_plots.box(box)} if box else {}
-    )
+    pictures = {"matrix": stress_plots.matrix(_columns(result))}
+    pictures |= {"curves": stress_plots.methods(curves)}
+    pictures |= {"box": stress_plots.box(box)} if box else {}
     page = html.render(
         "stress.html.j2",
         TEMPLATES,
@@ -64,6 +65,14 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
 def _with_box(curves: Json, box: Json) -> Json:
     """The curves of methods, and those of the box's right answers if there are any."""
     return {**curves, **({PACKAGED: box["rightly"]} if box else {})}
+
+
+def _columns(result: Json) -> Json:
+    """The columns of the matrix: the box as it answers, its network alone, and the methods."""
+    box = result["box"]["curves"]
+    own = {BOX: box["rightly"], NETWORK: box["network"]} if box else {}
+    methods = {short_name(name): entry["curves"] for name, entry in result["methods"].items()}
+    return own | {name: curves for name, curves in methods.items() if curves}
 
 
 def _refused(methods: Json) -> Json:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,26 +13,9 @@ from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.inference.classifier import Classifier
 from tests.factories.loud_model import loud, sweeps
-from train.cli.main import main
 from train.export import measure
-from train.export.measure import Measurement
 from train.models.peers import minirocket
-from train.studies import chart_experiment, precisions
-from train.studies.command import main as study
-
-KEYS = (
-    "method",
-    "precision",
-    "weights",
-    "macs",
-    "file_kb",
-    "rss_mb",
-    "ms_p50",
-    "ms_p99",
-    "touch_s",
-    "runs_on_box",
-)
-"""The keys of each model in chart.json, beside `accuracy`."""
+from train.studies import precisions
 
 
 def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
@@ -72,18 +54,13 @@ def test_all_take_turns():
 
 @pytest.mark.slow
 def test_a_bundle_is_measured_in_a_process_that_has_nothing_of_the_desktop(tmp_path: Path):
-    """Costs of a real bundle: the keys of chart.json, resident memory of Python with numpy and
-    onnxruntime."""
+    """Costs of a real bundle: resident memory of Python with numpy and onnxruntime."""
     made = precisions.packed(loud([]), sweeps(), 1, tmp_path / "kept")
-    (costs, _) = precisions.measured(made, sweeps().samples, 2)
-    assert set(KEYS) <= costs.keys()
-    assert costs["runs_on_box"]
-    assert 15 < costs["rss_mb"] < 150
-    assert 0 < costs["ms_p50"] <= costs["ms_p99"]
-    assert costs["file_kb"] < costs["bundle_kb"]
-    assert not precisions._costs(made[0], Measurement(1.0, 1.0, 10, 20, 400.0, ("torch",)))[
-        "runs_on_box"
-    ]
+    (found, _) = measure.measure_all([one.folder for one in made], sweeps().samples, 2)
+    assert found.foreign == ()
+    assert 15 < found.rss_mib < 150
+    assert 0 < found.ms_p50 <= found.ms_p99
+    assert found.model_kb < found.bundle_kb
 
 
 @pytest.mark.slow
@@ -126,63 +103,3 @@ def test_aeon_runs_what_was_trained(tmp_path: Path):
     answer = measure.load(tmp_path)
     assert answer(known.samples[1]) == pytest.approx(model.logits(known.samples[1:2])[0], abs=0.05)
     assert (np.random.get_state()[1] == state).all()
-
-
-@pytest.mark.slow
-@pytest.mark.thorough  # runs two commands that train
-def test_choose_and_chart_print_the_same_figures_for_the_same_bundle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Both commands pack the same bundle of a method, measure it with the same function, and take
-    size, time and memory from one record."""
-    measured: dict[str, Measurement] = {}
-    digests: dict[str, str] = {}
-    measure_all = measure.measure_all
-    command = ""
-
-    def recorded(folders: list[Path], counts: np.ndarray, rounds: int = 2) -> list[Measurement]:
-        found = measure_all(folders, counts, 2)
-        for folder, measurement in zip(folders, found, strict=True):
-            held = bundle.load(folder)
-            if (
-                held.manifest.name == "L-gauss"
-            ):  # not the one that `choose` packs at the end, under the scene's name
-                measured[command], digests[command] = measurement, held.id
-        return found
-
-    monkeypatch.setattr(measure, "measure_all", recorded)
-    (tmp_path / "scene.toml").write_text(
-        'sets = ["sim:T-REAL/level-blind:1001:3"]\nonly = ["position<=2"]\nvaries = ["position"]\n'
-        'methods = ["L-gauss"]\nreduce = []\n'
-    )
-    where = ["--jobs", "1", "--cache", str(tmp_path / "cache")]
-    command = "choose"
-    assert (
-        main(
-            [
-                "choose",
-                "--scene",
-                str(tmp_path / "scene.toml"),
-                "--out",
-                str(tmp_path / "b"),
-                *where,
-            ]
-        )
-        == 0
-    )
-    monkeypatch.setattr(
-        chart_experiment, "QUICK", replace(chart_experiment.QUICK, methods=("L-gauss",))
-    )
-    command = "chart"
-    assert study(["chart", "--quick", "--out", str(tmp_path / "chart.json"), *where]) == 0
-    (candidate,) = json.loads((tmp_path / "b-why" / "choice.json").read_text())["rungs"]
-    (dot,) = json.loads((tmp_path / "chart.json").read_text())
-    assert digests["choose"] == digests["chart"]
-    assert measured["choose"].bundle_bytes == measured["chart"].bundle_bytes
-    assert candidate["kb"] == dot["bundle_kb"] == measured["chart"].bundle_kb
-    for key, printed, record in (
-        ("choose", (candidate["ms"], candidate["mb"]), measured["choose"]),
-        ("chart", (dot["ms_p50"], dot["rss_mb"]), measured["chart"]),
-    ):
-        assert printed == (record.ms_p50, record.rss_mib), key
-    assert candidate["mb"] == pytest.approx(dot["rss_mb"], rel=0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from appliance.core.statistics import wilson
-from train.studies import differences
+from train.studies import comparison, differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():
@@ -54,3 +54,19 @@ def test_of_nothing_there_is_no_mean():
     """The mean of nothing is an error instead of a number."""
     with pytest.raises(ZeroDivisionError):
         differences.mean({})
+
+
+@pytest.mark.parametrize(
+    ("gap", "words"),
+    [
+        ((0.05, 0.01, 0.09), "ahead"),
+        ((0.05, -0.01, 0.1), "ahead, not certain"),
+        ((0.0, -0.1, 0.1), "level"),
+        ((-0.01, -0.1, 0.05), "within a point"),
+        ((-0.0101, -0.1, 0.05), "falls short, not certain"),
+        ((-0.05, -0.09, -0.01), "falls short"),
+    ],
+)
+def test_a_difference_in_words(gap: tuple[float, float, float], words: str):
+    """A difference is not certain if its interval contains 0. A point below is still near."""
+    assert comparison.verdict(gap) == words

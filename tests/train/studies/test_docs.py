@@ -22,7 +22,6 @@ from train.studies import pages, reports
 DOCS = ROOT / "docs"
 HTML = (
     *(f"{name}/index.html" for name in pages.PAGES),
-    "development/chart.html",
     "soak/index.html",
 )
 SVG = sorted(DOCS.rglob("*.svg"))

@@ -23,7 +23,7 @@ from tests.factories.paths import ROOT
 from tests.factories.study_pages import committed
 from tests.rig import soak_page
 from train.reports import formatting, html, selection_report
-from train.studies import chart_page, paper_report, scatter, stress_report, uncertainty_report
+from train.studies import paper_report, stress_report, uncertainty_report
 from train.studies.method_names import plain_name
 from train.studies.stress_targets import at_targets
 
@@ -94,16 +94,6 @@ def certainty_facts(figures: Any) -> Facts:
     yield from (
         str(figures[name]) for name in ("set", "test", "digest", "commit", "machine", "format")
     )
-
-
-def chart_facts(dots: Any) -> Facts:
-    """Each dot with its accuracies and costs, in the table for readers without scripts."""
-    for dot in dots:
-        yield dot["method"]
-        yield f"{dot['ms_p50']:,.12g} {dot['ms_p99']:,.12g} {dot['macs']:,.12g}"
-        for accuracy in dot["accuracy"].values():
-            yield three(accuracy["mean"], accuracy["low"], accuracy["high"])
-    yield f"Measured on {dots[0]['machine']}, commit {dots[0]['commit']}"
 
 
 def stress_facts(result: Any) -> Facts:
@@ -178,7 +168,6 @@ def choice_facts(choice: Any) -> Facts:
 
 
 SMALL = '"metal or plastic <smooth>" may count as one, 96.5 % of sweeps are right among 2 names'
-CHART = committed("chart")
 PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
     "paper": (
         lambda: paper_report.render(committed("paper"))[0],
@@ -188,7 +177,6 @@ PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
         lambda: uncertainty_report.render(committed("certainty"))[0],
         lambda: certainty_facts(committed("certainty")),
     ),
-    "chart": (lambda: chart_page.html(CHART, scatter.chart(CHART)), lambda: chart_facts(CHART)),
     "stress": (
         lambda: stress_report.render(committed("stress"))[0],
         lambda: stress_facts(committed("stress")),
@@ -230,8 +218,7 @@ def test_a_page_shows_every_figure_of_its_results(name: str):
     assert not re.search(r"@import|url\((?!#)|<link", page)
     assert 'name="viewport" content="width=device-width' in page
     assert "prefers-color-scheme: dark" in page
-    if name != "chart":  # the script of the chart has another table
-        assert page.count("<table") == len(re.findall(r'<div class="wide"[^>]*><table', page))
+    assert page.count("<table") == len(re.findall(r'<div class="wide"[^>]*><table', page))
 
 
 @pytest.mark.slow

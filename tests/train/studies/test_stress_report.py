@@ -14,8 +14,9 @@ from appliance.core.errors import FormatError
 from tests.factories import rendered, stress_data
 from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
-from train.reports import formatting, html
+from train.reports import formatting, html, provenance
 from train.studies import stress_plots, stress_report
+from train.studies.commands import measure
 from train.studies.method_names import plain_name
 
 OURS = plain_name("palpate")
@@ -57,6 +58,7 @@ def test_what_breaks_first_needs_the_smallest_part_of_its_range():
         ("rows", 1.0, "1 row"),
         ("deviations", 1.0, "1 deviation"),
         ("rows", 0.7, "0.7 rows"),
+        ("ms", 100.0, "100 ms"),
     ],
 )
 def test_a_severity_has_its_unit(unit: str, severity: float, shown: str):
@@ -77,6 +79,37 @@ def test_five_methods_are_drawn():
         "dead taxels",
     ]
     assert stress_report.missing(CURVES, OURS) == ["higher gain"]
+
+
+def test_the_matrix_shows_where_each_method_fails_and_the_box_first():
+    """Columns: the box, its network, then every method. A cell has the severity of the loss; a dot
+    stands for none. The corruption that is endured least is on top.
+    """
+    shown = words(stress_plots.matrix(stress_report._columns(stress_data.figures())))
+    own = ["the box, as it answers", "its network alone"]
+    columns = shown[shown.index(own[0]) :]
+    assert columns[:4] == [*own, "all views", "MiniRocket"]
+    rows = [shown[i : i + 1 + len(columns)] for i in (0, 9)]
+    assert rows == [
+        ["50 Hz hum, to 2 deviations", "0.091", "0.62", "0.62", "1.1", "0.42", "·", "0.5", "·"],
+        ["dead taxels, to 2 taxels", "1", "2", "2", "1", "2", "·", "·", "·"],
+    ]
+
+
+def test_methods_of_an_earlier_run_join_if_it_was_of_the_same_sweeps():
+    """The run's own results count. The origin of the others stays: they may be of an older default.
+    Results of other sweeps are refused.
+    """
+    run = {"methods": {"ds-cnn": 2}, "train_digest": "a", "test_digest": "b", "shipped": "new"}
+    earlier = run | {"methods": {"palpate": 1, "ds-cnn": 1}, "shipped": "old"}
+    made = measure._joined(run, earlier)
+    assert made == run | {
+        "methods": {"palpate": 1, "ds-cnn": 2},
+        "earlier": [{"methods": ["palpate"], "shipped": "old"}],
+    }
+    assert "old" in provenance.of(made).bundle
+    with pytest.raises(FormatError, match="have test_digest other, not b; name those of the same"):
+        measure._joined(run, earlier | {"test_digest": "other"})
 
 
 def test_the_box_is_shown_where_it_falls_silent_or_names_wrongly():
@@ -138,7 +171,7 @@ def test_without_a_box_and_with_nothing_that_breaks():
     figures["methods"] = {"H-svm": figures["methods"]["H-svm"]}
     page, pictures = stress_report.render(figures)
     text = PageReader(page).text
-    assert set(pictures) == {"curves"}
+    assert set(pictures) == {"matrix", "curves"}
     assert "None of 3 things that can go wrong costs it 5 percentage points" in text
     assert "As the box answers" not in text
     assert "box, rightly" not in text
@@ -155,6 +188,7 @@ def test_the_page_is_drawn_from_its_results(tmp_path: Path):
         "index.html",
         "curves.svg",
         "box.svg",
+        "matrix.svg",
     }
     assert json.loads((page.parent / "stress.json").read_text())["test_sweeps"] == 100
     assert "stress.json" in PageReader(page.read_text()).links

@@ -16,7 +16,6 @@ from matplotlib.ticker import FixedFormatter
 
 from appliance.core.types import SweepFormat
 from tests.factories import choice_data, development_data, stress_data
-from tests.factories.chart_data import DOTS
 from tests.factories.paths import ROOT
 from tests.factories.study_pages import committed
 from tests.rig import soak_page
@@ -27,7 +26,6 @@ from train.studies import (
     overview_plot,
     paper_report,
     plots,
-    scatter,
     stress_report,
     uncertainty_report,
 )
@@ -56,8 +54,6 @@ PICTURES: dict[str, Callable[[], Any]] = {
         [np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"
     ),
     "certainty": lambda: uncertainty_report.render(committed("certainty")),
-    "chart": lambda: scatter.chart(committed("chart")),
-    "small chart": lambda: scatter.chart(DOTS, ("speed", "lopo")),
     "stress": lambda: stress_report.render(stress_data.figures()),
     "matrix": lambda: plots.matrix(committed("fabrics")),
     "alignment": lambda: contact_plot.draw(committed("alignment")),

@@ -1,4 +1,4 @@
-"""The studies that compare methods: paper, development, chart, fabrics.
+"""The studies that compare methods: paper, development, fabrics.
 
 Each writes one file of results. `python -m train.studies pages` draws them.
 """
@@ -9,12 +9,10 @@ import argparse
 import os
 from pathlib import Path
 
-from appliance.core.errors import FormatError
 from train.arguments import options
 from train.arguments.types import Add
 from train.models.methods import Effort
 from train.studies import (
-    chart_experiment,
     development_experiment,
     development_times,
     fabrics_experiment,
@@ -37,16 +35,6 @@ def register(add: Add) -> None:
         help="run nothing: take the CNN's newest point from results of cnn-curve --size whole into"
         " those in --out; name all trainings",
     )
-    chart = add("chart", run_chart)
-    _add_seeds(chart)
-    chart.add_argument(
-        "--certainty",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="results of the study certainty, for the touch time of its method",
-    )
     development = add("development", run_development)
     _add_development(development)
     fabrics = add("fabrics", run_fabrics)
@@ -54,7 +42,6 @@ def register(add: Add) -> None:
     fabrics.set_defaults(method="all")
     for name, command in (
         ("paper", paper),
-        ("chart", chart),
         ("development", development),
         ("fabrics", fabrics),
     ):
@@ -166,19 +153,6 @@ def run_fabrics(args: argparse.Namespace) -> None:
     _done(run, save(args.out, found))
 
 
-def run_chart(args: argparse.Namespace) -> None:
-    """Measure and write the results. Raises FormatError if no model is left."""
-    run = _run(args, chart_experiment.QUICK_EFFORT)
-    study = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
-    touch = chart_experiment.touch_shares(args.certainty)
-    dots = chart_experiment.results(study, run, touch)
-    if not dots:
-        for name, why in run.left_out.items():
-            print(f"left out: {name}: {why}")
-        raise FormatError("no model is left to chart; see above, and run it without --kept")
-    _done(run, save(args.out, dots))
-
-
 def run_development(args: argparse.Namespace) -> None:
     """Evaluate, time and write the results; with --times after timing alone."""
     run = _run(args, development_experiment.QUICK_EFFORT)
@@ -192,8 +166,8 @@ def run_development(args: argparse.Namespace) -> None:
         earlier = [read(path, *keys) for path in args.join]
         figures = development_experiment.join(made, earlier)
     if args.times or not args.kept:
-        timed = chart_experiment.QUICK if run.quick else chart_experiment.STUDY
-        train = timed.cases[chart_experiment.TRAIN].load()
+        timed = development_times.QUICK if run.quick else development_times.TIMED
+        train = timed.load()
         assert train is not None  # it is simulated
         figures["times"] = development_times.measured(
             figures["methods"], train, 1, run.where.cache, run.log, run.effort

@@ -27,7 +27,7 @@ from train.export import bundle_stress
 from train.metrics import score
 from train.models import methods
 from train.studies import alignment, broken_taxels, certainty, references, sim_calibration
-from train.studies.study import results_file, save
+from train.studies.study import read, results_file, save
 
 STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
@@ -185,6 +185,14 @@ def _add_stress(add: Add) -> None:
     )
     _add_out(command, "stress")
     command.add_argument(
+        "--join",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="results of an earlier run on the same sets, whose methods join those of this one",
+    )
+    command.add_argument(
         "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
     )
     options.add_effort(command)
@@ -248,7 +256,26 @@ def run_stress(args: argparse.Namespace) -> None:
         "format": str(train.format),
         "seeds": list(seeds),
     } | score.provenance()
+    for path in args.join:
+        result = _joined(result, read(path, "methods", "train_digest", "test_digest"))
     print(save(args.out, result))
+
+
+def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """The result with the methods of an earlier one that it does not have itself, and with the
+    origin of these in `earlier`. Raises FormatError if the earlier one was of other sweeps."""
+    for key in ("train_digest", "test_digest"):
+        if result[key] != earlier[key]:
+            raise FormatError(
+                f"the results to join have {key} {earlier[key]}, not {result[key]}; "
+                "name those of the same sets"
+            )
+    lacks = [name for name in earlier["methods"] if name not in result["methods"]]
+    origin = {key: earlier[key] for key in score.provenance() if key in earlier}
+    return result | {
+        "methods": earlier["methods"] | result["methods"],
+        "earlier": [*earlier.get("earlier", []), {"methods": lacks} | origin],
+    }
 
 
 def _box_under_stress(
