@@ -280,14 +280,17 @@ def show(name: str, right: dict[str, list[Array]], clusters: Sequence[Array]) ->
 
 
 def measure(trials: Sequence[SpeedTrial], steps: int, seed: int) -> None:
-    """Print the rows of trials of one name together."""
+    """Print the accuracy of each fold, and the rows of all trials, which have one name."""
     right: dict[str, list[Array]] = {row: [] for row in ROWS}
     clusters: list[Array] = []
     for number, trial in enumerate(trials):
-        for fold in trial.folds:
+        for index, fold in enumerate(trial.folds):
             done = SpatialFold(trial, fold, steps, seed)
-            for row, answers in done.right().items():
-                right[row].append(answers)
+            answers = done.right()
+            shares = (f"{row} {100 * answers[row].mean():.1f}" for row in ROWS)
+            print(f"  fold {index}, {len(done.test)} sweeps: {', '.join(shares)} %", flush=True)
+            for row in ROWS:
+                right[row].append(answers[row])
             clusters.append(done.test.group("recording") + (number << 20))
     show(trials[0].name, right, clusters)
 
