@@ -145,7 +145,7 @@ class SpatialFold:
         are beside all others where they are not worse."""
         data, tested = self._joined(self.fixed.data), self.fixed.trunk.features(self.test)
         plans = self._plans(data)
-        if self.setup.may_train:
+        if self.setup.may_train(self.setup.settings.size):
             data, tested, plans = self._with_stages(data, tested, plans)
         at_speed, at_mean = (
             np.hstack([tested, bands])
@@ -200,9 +200,9 @@ class SpatialFold:
     ) -> tuple[HeadData, Array, dict[str, ScoredPlan]]:
         """All three with the features of trained stages, which come first, and their
         discriminant."""
-        trunk = recipe._trained(self.fixed.trunk.scale, self.setup, no_log)
-        data = recipe._side_by_side(self.setup.data(trunk), data)
-        scores = self._scores(data, [InnerPart(self.setup.by, self.setup.out)])
+        trunk, responses = self.setup.stages
+        data = recipe._side_by_side(responses, data)
+        scores = self._scores(data, [self.setup.judging])
         chosen = {}
         for name, plan in plans.items():
             beside = recipe._beside_stages(plan.plan)

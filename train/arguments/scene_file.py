@@ -1,6 +1,6 @@
 """Reads a scene.toml: options of a command in a file, one key for each option.
 
-docs/choose/tubes.toml is an example. What the command line states as well counts there.
+docs/choose/tubes.toml is an example. An option of the command line replaces that of the file.
 """
 
 from __future__ import annotations

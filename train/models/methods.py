@@ -75,12 +75,12 @@ AS_RECORDED = SkinUse()
 
 @dataclass(frozen=True)
 class Effort:
-    """The length of trainings, and the use for which our family is trained.
+    """The length of trainings, and the use of the skin.
 
     share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
     paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in bfloat16
     if the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
-    time, so that it goes on after an interruption. use: of the skin.
+    time, so that it goes on after an interruption. use: of the skin, for our family.
     """
 
     share: float = 1.0

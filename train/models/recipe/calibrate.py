@@ -70,7 +70,7 @@ class Calibration:
     weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
     class_mean_temperature: of logits that the box computes from class means. steps: heads of the
     early answers, with their temperatures. limit: largest squared distance of a known material, see
-    novelty. displacement: for displaced contacts; None if there were no copies to fit it to.
+    novelty. displacement: for displaced contacts; None without copies.
     """
 
     embedding: Embedding

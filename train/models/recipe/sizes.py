@@ -1,7 +1,7 @@
 """The sizes of the recipe, from the spectrum alone to everything.
 
-A size limits the content of a model. Held-out groups choose within it, as they do without a limit,
-so a model is smaller where a smaller one suffices.
+A size limits the content of a model. Held-out groups choose within this limit, so a model may be
+smaller than its size.
 """
 
 from __future__ import annotations

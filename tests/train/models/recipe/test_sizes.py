@@ -1,4 +1,4 @@
-"""The sizes of the recipe: what a model may contain at most."""
+"""The sizes of the recipe limit the content of a model."""
 
 from __future__ import annotations
 
