@@ -24,12 +24,14 @@ from train.studies import (
     matrix_table,
     plots,
     quotes,
+    recipe_page,
     reports,
 )
 from train.studies.study import DATA, read, results_file
 
 README, ALIGN = "README.md", "docs/how-to/align.md"
 SPECIFICATIONS = "docs/reference/specifications.md"
+RECIPE = "docs/recipe.md"
 FIGURES_PAGE = "docs/explanation/figures.md"
 ALIGNMENT, FABRICS = "docs/alignment/README.md", "docs/fabricslide/README.md"
 
@@ -61,6 +63,7 @@ FIGURES = (
     DocumentFigure(ALIGN, "moved", "alignment", contact_table.sentence),
     DocumentFigure(ALIGNMENT, "in short", "alignment", contact_table.headline),
     DocumentFigure(ALIGNMENT, "alignment", "alignment", contact_table.table),
+    DocumentFigure(RECIPE, "recipe", "recipe", recipe_page.table),
     DocumentFigure(FABRICS, "matrix", "fabrics", matrix_table.headline),
     *(
         DocumentFigure(FIGURES_PAGE, f"quotes {study}", study, partial(quotes.table, study))
@@ -73,6 +76,7 @@ PICTURES = (
         "development",
         development_report.front,
     ),
+    DocumentPicture("docs/recipe.svg", "recipe", recipe_page.draw),
     DocumentPicture("docs/alignment/place.svg", "alignment", contact_plot.draw),
     DocumentPicture("docs/fabricslide/windows.svg", "fabrics", plots.matrix),
     DocumentPicture(

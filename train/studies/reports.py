@@ -78,6 +78,7 @@ REPORTS = (
         "sim:T-REAL/level-blind:4-6:20",
     ),
     _study("fabrics", needs=(REAL,)),
+    _study("recipe", needs=(REAL,), folds=False),
     _study("stress"),
     _study("paper"),
     ResultFile("overview", "overview.svg", ("train.studies", "overview")),

@@ -1,4 +1,4 @@
-"""The studies that compare methods: paper, development, fabrics.
+"""The studies that compare methods or views: paper, development, fabrics, recipe.
 
 Each writes one file of results. `python -m train.studies pages` draws them.
 """
@@ -17,6 +17,7 @@ from train.studies import (
     development_times,
     fabrics_experiment,
     paper_experiment,
+    recipe_views,
 )
 from train.studies.pages import PAGES
 from train.studies.study import StudyRun, read, results_file, save
@@ -44,6 +45,7 @@ def register(add: Add) -> None:
         ("paper", paper),
         ("development", development),
         ("fabrics", fabrics),
+        ("recipe", add("recipe", run_recipe)),
     ):
         _add_run(command, name)
 
@@ -54,7 +56,7 @@ def _add_run(command: argparse.ArgumentParser, name: str) -> None:
     command.add_argument(
         "--out", type=Path, default=file, metavar="FILE", help=f"file of results ({file})"
     )
-    if name != "fabrics":
+    if name in ("paper", "development"):
         command.add_argument(
             "--quick",
             action="store_true",
@@ -151,6 +153,12 @@ def run_fabrics(args: argparse.Namespace) -> None:
     earlier = read(args.out) if args.out.exists() else ()
     found = fabrics_experiment.results(options.names(args), run, earlier)
     _done(run, save(args.out, found))
+
+
+def run_recipe(args: argparse.Namespace) -> None:
+    """Measure and write the results."""
+    run = _run(args)
+    _done(run, save(args.out, recipe_views.results(run)))
 
 
 def run_development(args: argparse.Namespace) -> None:

@@ -1,0 +1,97 @@
+"""The study `recipe`: the cost of views, the views of sets, and their table and picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from train.data import sets
+from train.evaluation.evaluate import Where
+from train.export import measure
+from train.models.recipe.architectures import Architecture
+from train.studies import recipe_page, recipe_views
+from train.studies.study import StudyCase, StudyRun
+
+RESULTS: dict[str, Any] = {
+    "views": [
+        {"view": name, "features": 10 + i, "us": 20.5 + i, "bytes": 3000 + i}
+        for i, name in enumerate((*recipe_page.VIEWS, "few relations"))
+    ],
+    "sets": [
+        {"set": "7 fabrics", "views": ["spectrum", "stages"], "chosen": "…"},
+        {"set": "tubes", "views": ["spectrum"], "chosen": "…"},
+    ],
+}
+
+
+@pytest.mark.slow
+def test_each_view_has_a_cost_of_its_own(monkeypatch: pytest.MonkeyPatch):
+    """All views are timed in turns in graphs with the features of one view; more lags of relations
+    are more features."""
+    turns = []
+    timed = measure.timed
+
+    def once(calls: Any, sweeps: np.ndarray) -> dict[str, np.ndarray]:
+        turns.append(list(calls))
+        return timed(calls, sweeps, 1, 1)
+
+    monkeypatch.setattr(measure, "timed", once)
+    sweeps = sets.load("sim:T-REAL/level-blind:1001:1")
+    short = replace(sweeps, samples=sweeps.samples[:12, :400], labels=sweeps.labels[:12], groups={})
+    found = {view["view"]: view for view in recipe_views.costs(short)}
+    assert turns == [list(found)]
+    assert set(recipe_page.VIEWS) | {"few relations"} == set(found)
+    assert all(view["us"] > 0 for view in found.values())
+    assert found["loads"]["features"] >= 16
+    assert found["filters"]["features"] * 2 == found["shares"]["features"]
+    assert found["few relations"]["features"] < found["relations"]["features"]
+    assert found["loads"]["bytes"] < found["stages"]["bytes"]
+
+
+@pytest.mark.slow
+def test_each_set_is_fitted_once(monkeypatch: pytest.MonkeyPatch):
+    """Cases of the same sweeps are one set; a set that is not there is left out with the reason."""
+    tubes = StudyCase(("sim:T-REAL/level-blind:1001:2",), only=("position<=2",))
+    cases = {"tubes, a": tubes, "tubes, b": tubes, "fabrics, a": StudyCase(("x",), real=True)}
+    monkeypatch.setattr(recipe_views, "CASES", cases)
+    run = StudyRun(Where(), lambda line: None)
+    (one,) = recipe_views.choices(run)
+    assert (one["set"], one["real"], one["sweeps"]) == ("tubes", False, 36)
+    assert one["views"]
+    assert list(run.left_out) == ["fabrics"]
+
+
+def test_views_are_read_from_the_trunk():
+    """Each part of an architecture is a view; a trunk of the spectrum has one."""
+    assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
+    every = Architecture((4,), 8, 2, 0, True, 2, True, True, 3)
+    assert recipe_views.views_of(every) == list(recipe_page.VIEWS)
+
+
+def test_the_table_has_a_row_for_each_view_with_its_sets():
+    """Cost, condition and sets of each view; a view that no set has says so."""
+    head, line, *rows = recipe_page.table(RESULTS).split("\n")
+    assert head.count("|") == line.count("|") == rows[0].count("|") == 7
+    assert [row.split("|")[1].strip() for row in rows] == list(recipe_page.VIEWS)
+    assert "| 13, 23.5 µs, 3 KB |" in rows[3]
+    assert rows[3].endswith("| 2 of 2: 7 fabrics, tubes |")
+    assert rows[-1].endswith("| 1 of 2: 7 fabrics |")
+    assert rows[0].endswith("| no set |")
+
+
+def test_the_picture_has_every_view_with_its_time():
+    """From raw counts to the sum of logits."""
+    svg = recipe_page.draw(RESULTS)
+    for text in (*recipe_page.VIEWS, "23.5 µs", "raw counts", "sum of logits"):
+        assert f">{text}</text>" in svg, text
+
+
+def test_results_without_a_view_are_refused():
+    """The table needs the cost of each view."""
+    with pytest.raises(KeyError, match="stages"):
+        recipe_page.table(
+            {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
+        )

@@ -1,0 +1,116 @@
+"""The table and the picture of the recipe's views, from the results of the study `recipe`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from train.reports.formatting import amount
+from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, MEDIUM, SMALL, WIDTH, to_svg, write
+
+Json = Mapping[str, Any]
+VIEWS = {
+    "filters": (
+        "log mean magnitude of random integer filters",
+        "texture: which patterns in time and across taxels occur how strongly",
+        "usually; as few filters as suffice",
+    ),
+    "shares": (
+        "share of each filter's responses above a threshold",
+        "stick and slip: rare strong responses, which a mean hides",
+        "beside the filters, in every second discriminant",
+    ),
+    "distribution": (
+        "shares of counts and of their differences above thresholds, of each taxel",
+        "roughness and friction of fast and slow skins",
+        "unless held-out sweeps are named better without it",
+    ),
+    "spectrum": (
+        "log power in bands, averaged over taxels",
+        "vibration; it carries over to a skin that was put back",
+        "unless held-out sweeps are named better without it",
+    ),
+    "relations": (
+        "deviations of taxels and correlations of their pairs, over up to six lags",
+        "how taxels move together: a new force, speed or direction",
+        "only if held-out groups show a gain, and several taxels exist",
+    ),
+    "loads": (
+        "mean count of each taxel",
+        "hardness, which the level shows",
+        "only if held-out groups show a gain; never with means removed",
+    ),
+    "stages": (
+        "log mean responses of three trained convolutions",
+        "patterns that no fixed filter has",
+        "from 25 sweeps of each material on, unless held-out sweeps are named worse",
+    ),
+}
+"""Features, purpose and condition of each view."""
+LOW, HIGH = 0.0, 3.1
+
+
+def table(results: Json) -> str:
+    """A row for each view: features, purpose, cost, condition, sets."""
+    costs = {view["view"]: view for view in results["views"]}
+    rows = [
+        "| view | features | what it is for | alone: features, time, bytes | when chosen | on |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, (features, purpose, when) in VIEWS.items():
+        cost = costs[name]
+        spent = (
+            f"{cost['features']}, {amount(cost['us'], 'µs')}, {amount(cost['bytes'] / 1e3, 'KB')}"
+        )
+        sets = [one["set"] for one in results["sets"] if name in one["views"]]
+        on = f"{len(sets)} of {len(results['sets'])}: {', '.join(sets)}" if sets else "no set"
+        rows.append(f"| {name} | {features} | {purpose} | {spent} | {when} | {on} |")
+    return "\n".join(rows)
+
+
+def draw(results: Json) -> str:
+    """The way from raw counts to the answer, with the time of each view."""
+    figure = Figure((WIDTH, WIDTH * 0.42))
+    page = figure.add_axes((0, 0, 1, 1))
+    page.set(xlim=(0, 10), ylim=(LOW, HIGH))
+    page.axis("off")
+    costs = {view["view"]: view["us"] for view in results["views"]}
+    middle, height = HIGH / 2, 0.34
+    _box(page, 0.75, middle, 1.3, 0.8, "raw counts\n[T, R, C]", BLACK)
+    step = (HIGH - 0.2) / len(VIEWS)
+    for i, name in enumerate(VIEWS):
+        y = HIGH - 0.1 - (i + 0.5) * step
+        _arrow(page, (1.4, middle), (2.25, y))
+        _box(page, 3.15, y, 1.8, height, name, ACCENT)
+        write(page, 4.15, y, amount(costs[name], "µs"), GREY, SMALL, ha="left")
+        _arrow(page, (4.85, y), (5.6, middle))
+    _box(page, 6.5, middle, 1.8, 0.8, "discriminants\nin closed form", BLACK)
+    _arrow(page, (7.4, middle), (8.2, middle))
+    _box(page, 9.05, middle, 1.7, 0.8, "sum of logits\nprobability", BLACK)
+    write(page, 6.5, middle - 0.75, "held-out groups choose\nthe views of each", GREY, SMALL)
+    return to_svg(figure, "The views of the recipe between raw counts and the answer")
+
+
+def _box(page: Axes, x: float, y: float, width: float, height: float, text: str, edge: str) -> None:
+    page.add_patch(
+        FancyBboxPatch(
+            (x - width / 2, y - height / 2),
+            width,
+            height,
+            boxstyle="round,pad=0,rounding_size=0.08",
+            fc=FAINT,
+            ec=edge,
+            lw=1,
+        )
+    )
+    write(page, x, y, text, BLACK, MEDIUM)
+
+
+def _arrow(page: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
+    page.add_patch(
+        FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=7, color=GREY, lw=0.8)
+    )
