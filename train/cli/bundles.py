@@ -1,4 +1,4 @@
-"""The commands that make and judge bundles: fit, export, pack, score, parity, bridge."""
+"""The commands that make and judge bundles: fit, export, pack, score, parity, bridge, widen."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import labels
+from train.data import labels, sets
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
-from train.export import bridging, bundle_score, measure, pack, quantized_bundle
+from train.export import bridging, bundle_score, measure, nuisances, pack, quantized_bundle
 from train.models import methods
 from train.models.recipe import recipe
 from train.models.recipe.architectures import MAINS_HZ
@@ -39,7 +39,7 @@ STEPS = recipe.Settings().steps
 
 
 def register(add: Add) -> None:
-    """fit, export, pack, score, parity, bridge."""
+    """fit, export, pack, score, parity, bridge, widen."""
     _add_fit(add)
     _add_bundles(add)
     score = add("score", run_score)
@@ -49,6 +49,12 @@ def register(add: Add) -> None:
     bridge = add("bridge", run_bridge)
     bridge.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(bridge)
+    widen = add("widen", run_widen)
+    widen.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    widen.add_argument(
+        "--trained-on", required=True, metavar="SET", help="its training sweeps, which are altered"
+    )
+    options.add_set(widen)
     parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
@@ -310,6 +316,13 @@ def run_bridge(args: argparse.Namespace) -> None:
     print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
 
 
+def run_widen(args: argparse.Namespace) -> None:
+    """Measure how altered sweeps differ from known ones, and write it into the bundle."""
+    manifest = nuisances.write(args.bundle, sets.load(args.trained_on), options.load(args))
+    print(nuisances.text(manifest.figures))
+    print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
+
+
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:
     return args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
 
@@ -323,6 +336,7 @@ def _print(manifest: Manifest, out: Path) -> None:
         print(f"no-contact cannot be detected: {why}")
     _print_figures(manifest.figures)
     print(bridging.text(manifest))
+    print(nuisances.text(manifest.figures))
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()
