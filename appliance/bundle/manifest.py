@@ -56,11 +56,14 @@ class Early:
     """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
 
     least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
-    number of steps in a row, including the newest, that must give the same label.
+    number of steps in a row, including the newest, that must give the same label, and be of a known
+    material. limits: [D], largest squared distance of a known material at each step; () if unknown
+    materials are not detected before the end of a sweep, then `Manifest.json` omits it.
     """
 
     least: tuple[float, ...]
     agree: int
+    limits: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.least or not all(_positive(p) for p in self.least):
@@ -69,6 +72,12 @@ class Early:
             )
         if type(self.agree) is not int or self.agree < 1:
             raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
+        if self.limits and not (
+            len(self.limits) == len(self.least) and all(map(_positive, self.limits))
+        ):
+            raise BundleError(
+                f"early.limits {list(self.limits)} must be numbers above 0, one for each step"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +102,15 @@ class DisplacementRule:
 
     limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
     are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
-    a single displaced sweep is never ok.
+    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep is not
+    named, because no training copy is displaced as far; None if unknown, then `Manifest.json` omits
+    it.
     """
 
     limit: float
     temperature: float
     unsure: float
+    farthest_mm: float | None = None
 
     def __post_init__(self) -> None:
         _check_positive(self, "moved")
@@ -106,7 +118,8 @@ class DisplacementRule:
 
 def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
-        if not _positive(value := getattr(rule, name)):
+        value = getattr(rule, name)
+        if not _positive(value) and (name, value) != ("farthest_mm", None):
             raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
 
 
@@ -193,6 +206,9 @@ class Manifest:
         for name in ("unloaded", "speeds", "bridging"):
             if not values[name]:
                 del values[name]
+        for name, added in (("early", "limits"), ("moved", "farthest_mm")):
+            if values[name] and not values[name][added]:
+                del values[name][added]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property
@@ -238,6 +254,8 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
         )
+    if manifest.early and manifest.early.limits and not manifest.known:
+        raise BundleError("manifest has `early.limits` without `known`; export the bundle again")
     if manifest.displacement and not (manifest.known and manifest.contact):
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"

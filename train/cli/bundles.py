@@ -25,7 +25,16 @@ from train.data import labels, sets
 from train.data.sets import Dataset, digest
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
-from train.export import bridging, bundle_score, measure, nuisances, pack, quantized_bundle
+from train.export import (
+    bridging,
+    bundle_score,
+    displacement_limit,
+    early_checks,
+    measure,
+    nuisances,
+    pack,
+    quantized_bundle,
+)
 from train.models import methods
 from train.models.recipe import recipe
 from train.models.recipe.architectures import MAINS_HZ
@@ -317,10 +326,25 @@ def run_bridge(args: argparse.Namespace) -> None:
 
 
 def run_widen(args: argparse.Namespace) -> None:
-    """Measure how altered sweeps differ from known ones, and write it into the bundle."""
-    manifest = nuisances.write(args.bundle, sets.load(args.trained_on), options.load(args))
-    print(nuisances.text(manifest.figures))
+    """Measure how altered and unfinished sweeps differ from known ones, and write it into the
+    bundle."""
+    given = args.bundle, sets.load(args.trained_on), options.load(args)
+    manifest = nuisances.write(*given)
+    if manifest.early:
+        manifest = early_checks.write(*given)
+    manifest = displacement_limit.write(args.bundle, given[1])
+    _print_checks(manifest)
     print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
+
+
+def _print_checks(manifest: Manifest) -> None:
+    """Print how the bundle tells altered, unfinished and displaced sweeps from unknown
+    materials."""
+    if manifest.known:
+        print(nuisances.text(manifest.figures))
+    for text in (early_checks.text(manifest), displacement_limit.text(manifest)):
+        if text:
+            print(text)
 
 
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:
@@ -336,7 +360,7 @@ def _print(manifest: Manifest, out: Path) -> None:
         print(f"no-contact cannot be detected: {why}")
     _print_figures(manifest.figures)
     print(bridging.text(manifest))
-    print(nuisances.text(manifest.figures))
+    _print_checks(manifest)
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()

@@ -34,11 +34,11 @@ from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
 from train.data.readers import counted
 from train.data.sets import Dataset
-from train.export import bridging, bundle_score, nuisances
+from train.export import bridging, bundle_score, displacement_limit, early_checks, nuisances
 from train.metrics.answers import REFUSED, UNKNOWN
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
-from train.onnx_tools.graph_builder import run, slim
+from train.onnx_tools.graph_builder import run, run_output, slim
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
@@ -108,9 +108,10 @@ def pack(
     far a contact is from the trained positions. Raises ExportRefused if a check fails, and
     BundleError if a label or the target cannot be used.
     """
-    content = _widened(content)
+    content = _early_checked(_widened(content))
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
+    manifest = displacement_limit.limited(manifest, content.train)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
@@ -150,6 +151,18 @@ def _widened(content: Content) -> Content:
         return widened
     classes = replace(apart.classes, shapes=found.shapes[0])
     return replace(widened, unseen=replace(content.unseen, known=known, classes=classes))
+
+
+def _early_checked(content: Content) -> Content:
+    """`content` whose early answers need a known material; see early_checks."""
+    if not (content.early and content.classes):
+        return content
+    classes, limits = early_checks.measure(content.model, content.train, content.held_out)
+    return replace(
+        content,
+        early=replace(content.early, limits=limits),
+        classes=replace(content.classes, early=classes),
+    )
 
 
 def _manifest(
@@ -283,12 +296,7 @@ def _unknown(content: Content, sweeps: Dataset) -> Array:
 
 def _embedded(content: Content, samples: Array) -> Array:
     """The embeddings [n, r] of raw counts [n, T, R, C]."""
-    embedding = onnx.ModelProto()
-    embedding.CopyFrom(content.model)
-    kept = [output for output in embedding.graph.output if output.name == "embedding"]
-    del embedding.graph.output[:]
-    embedding.graph.output.extend(kept)
-    return run(embedding, samples)
+    return run_output(content.model, "embedding", samples)
 
 
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:

@@ -22,9 +22,7 @@ def sweeps(rng: Generator, each: int = 60, **moves: NDArray[np.float64]) -> Alte
     labels = np.repeat(np.arange(3), each)
     z = MEANS[labels] + rng.standard_normal((3 * each, 4))
     source = np.arange(len(z))
-    copies = {
-        name: (z + rng.random((len(z), 1)) * move, source) for name, move in moves.items()
-    }
+    copies = {name: (z + rng.random((len(z), 1)) * move, source) for name, move in moves.items()}
     return AlteredSweeps(z, labels, copies)
 
 
