@@ -19,6 +19,7 @@ from appliance.signal import features
 from appliance.signal.broken_taxels import Bridging
 from appliance.signal.contact import ContactPositions
 from appliance.signal.slide import SpeedRange
+from appliance.signal.vibration import SlideLimits
 from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
@@ -146,6 +147,7 @@ class Manifest:
     speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
     bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
         omits it.
+    sliding: least vibration of a slide, by label; None if unknown, then `json` omits it.
     """
 
     name: str
@@ -166,6 +168,7 @@ class Manifest:
     unloaded: tuple[float, ...] = ()
     speeds: SpeedRange | None = None
     bridging: Bridging | None = None
+    sliding: SlideLimits | None = None
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -203,7 +206,7 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        for name in ("unloaded", "speeds", "bridging"):
+        for name in ("unloaded", "speeds", "bridging", "sliding"):
             if not values[name]:
                 del values[name]
         for name, added in (("early", "limits"), ("moved", "farthest_mm")):
@@ -265,6 +268,11 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
             "export the bundle again"
+        )
+    if manifest.sliding and len(manifest.sliding.least) > len(manifest.labels):
+        raise BundleError(
+            f"manifest has {len(manifest.sliding.least)} limits in `sliding` for "
+            f"{len(manifest.labels)} labels; export the bundle again"
         )
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(

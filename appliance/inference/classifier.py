@@ -28,6 +28,7 @@ from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
 from appliance.signal.contact import Displacement, displacement
 from appliance.signal.slide import Slide, SlideMeter
+from appliance.signal.vibration import PARTS, vibration
 from appliance.signal.window_check import Finding
 
 if TYPE_CHECKING:
@@ -290,6 +291,8 @@ class Classifier(Observer):
             return self._verdict(sweep, finding, touch=touch)
         if far := self._too_far(touch.displacement):
             return self._verdict(sweep, Finding(Status.UNKNOWN, far, degraded), touch=touch)
+        if rests := self._rests(sweep, int(scores.argmax())):
+            return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
             earlier = FusedSweeps(sweep.object)
@@ -371,6 +374,19 @@ class Classifier(Observer):
         if mean is None or m.contact is None or m.thresholds.contact is None:
             return Touched(slide=slide)
         return Touched(displacement(mean, self.tare, m.thresholds.contact, m.contact), slide)
+
+    def _rests(self, sweep: Sweep, label: int) -> str:
+        """A message if the finger rests in a part of the window so far, where a slide over the
+        label with this number vibrates more; else ""."""
+        m, taxels = self.bundle.manifest, sweep.frames.taxels
+        parts = PARTS * len(taxels) // m.format.window
+        if m.sliding is None or not parts or len(taxels) < 2 * parts:
+            return ""
+        found = m.sliding.resting(vibration(taxels, self.tare, parts), label)
+        if not found:
+            return ""
+        where = " ".join(map(str, found))
+        return f"hardly any vibration in part {where} of {PARTS}, less than {m.labels[label]} gives"
 
     def _too_far(self, displaced: Displacement) -> str:
         """A message if the contact is displaced further than any training copy, else ""."""

@@ -32,7 +32,7 @@ EACH, STEPS = 200, 10
 
 
 @dataclass(frozen=True)
-class Scene:
+class SweepDraw:
     """Draws sweeps of the materials at trained placements in a world."""
 
     world: skin.World
@@ -60,16 +60,16 @@ class Scene:
         return str(self.rng.choice([m for m in skin.MATERIALS if m != material]))
 
 
-Make = Callable[[Scene, str], Counts]
+Make = Callable[[SweepDraw, str], Counts]
 """Raw counts [T, R, C], not yet rounded, of a scene and a material."""
 
 
-def rests(scene: Scene, material: str) -> Counts:
+def rests(scene: SweepDraw, material: str) -> Counts:
     """A window of a finger that rests."""
     return scene.touch(material, 1.0, 0.0)
 
 
-def level(scene: Scene, material: str) -> Counts:
+def level(scene: SweepDraw, material: str) -> Counts:
     """The mean load of a slide [1, R, C]."""
     return scene.slide(material).mean(axis=0, keepdims=True)
 
@@ -79,51 +79,51 @@ def strength(x: Counts) -> float:
     return float(np.sqrt(x.var(axis=0).mean()))
 
 
-def added(base: Make, wave: Callable[[Scene], Counts], share: float) -> Make:
+def added(base: Make, wave: Callable[[SweepDraw], Counts], share: float) -> Make:
     """`base` and a wave of `share` deviations of a slide."""
 
-    def make(scene: Scene, material: str) -> Counts:
+    def make(scene: SweepDraw, material: str) -> Counts:
         size = share * strength(scene.slide(material))
         return base(scene, material) + size * wave(scene)
 
     return make
 
 
-def sine(hz: float) -> Callable[[Scene], Counts]:
+def sine(hz: float) -> Callable[[SweepDraw], Counts]:
     """A sine on all taxels, of deviation 1."""
 
-    def wave(scene: Scene) -> Counts:
+    def wave(scene: SweepDraw) -> Counts:
         turns = hz * SECONDS + scene.rng.random()
         return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * turns))
 
     return wave
 
 
-def chirp(scene: Scene) -> Counts:
+def chirp(scene: SweepDraw) -> Counts:
     """A sine that rises from 5 to 300 Hz, of deviation 1."""
     turns = 5 * SECONDS + (300 - 5) / (2 * N / RATE) * SECONDS**2
     return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * turns))
 
 
-def square(scene: Scene) -> Counts:
+def square(scene: SweepDraw) -> Counts:
     """A square wave of 10 Hz."""
     return np.sign(np.sin(2 * np.pi * (10 * SECONDS + scene.rng.random())))
 
 
-def white(scene: Scene) -> Counts:
+def white(scene: SweepDraw) -> Counts:
     """White noise of each taxel."""
     return scene.rng.standard_normal((N, 4, 4))
 
 
-def common_white(scene: Scene) -> Counts:
+def common_white(scene: SweepDraw) -> Counts:
     """White noise that all taxels share."""
     return scene.rng.standard_normal((N, 1, 1))
 
 
-def coloured(power: float) -> Callable[[Scene], Counts]:
+def coloured(power: float) -> Callable[[SweepDraw], Counts]:
     """Noise that all taxels share, of deviation 1, whose power falls with the frequency."""
 
-    def wave(scene: Scene) -> Counts:
+    def wave(scene: SweepDraw) -> Counts:
         bins = np.fft.rfft(scene.rng.standard_normal(N))
         bins[1:] /= np.arange(1, len(bins)) ** (power / 2)
         bins[0] = 0
@@ -133,25 +133,25 @@ def coloured(power: float) -> Callable[[Scene], Counts]:
     return wave
 
 
-def clicks(scene: Scene) -> Counts:
+def clicks(scene: SweepDraw) -> Counts:
     """Short pulses at random times, of deviation 1."""
     found = (scene.rng.random((N, 1, 1)) < 0.01) * 1.0
     return found / max(found.std(), 1e-9)
 
 
-def taps(scene: Scene, material: str) -> Counts:
+def taps(scene: SweepDraw, material: str) -> Counts:
     """A finger that taps five times a second."""
     load = np.maximum(np.sin(2 * np.pi * (5 * SECONDS + scene.rng.random())), 0)
     return rests(scene, material) * load
 
 
-def rocks(scene: Scene, material: str) -> Counts:
+def rocks(scene: SweepDraw, material: str) -> Counts:
     """A finger that rests and rocks to and fro once a second."""
     lean = 0.3 * np.sin(2 * np.pi * (SECONDS + scene.rng.random()))
     return rests(scene, material) * (1 + lean * np.linspace(-1, 1, 4)[:, None])
 
 
-def presses(scene: Scene, material: str) -> Counts:
+def presses(scene: SweepDraw, material: str) -> Counts:
     """A finger that rests and presses more and more."""
     return rests(scene, material) * np.linspace(0.4, 1.2, N)[:, None, None]
 
@@ -159,7 +159,7 @@ def presses(scene: Scene, material: str) -> Counts:
 def lifted(first: float, last: float) -> Make:
     """A slide that is lifted between two shares of the window."""
 
-    def make(scene: Scene, material: str) -> Counts:
+    def make(scene: SweepDraw, material: str) -> Counts:
         x, idle = scene.slide(material), skin.idle(N, scene.rng, scene.world)
         off = (first * N <= TIMES) & (last * N > TIMES)
         return np.where(off, idle, x)
@@ -167,7 +167,7 @@ def lifted(first: float, last: float) -> Make:
     return make
 
 
-def flutters(scene: Scene, material: str) -> Counts:
+def flutters(scene: SweepDraw, material: str) -> Counts:
     """A slide that is lifted half of each fifth of a second."""
     idle = skin.idle(N, scene.rng, scene.world)
     return np.where(SECONDS % 0.2 < 0.1, scene.slide(material), idle)
@@ -178,7 +178,7 @@ def part(rest: float, slid: float) -> Make:
     return lambda scene, material: scene.touch(material, rest, slid)
 
 
-def pauses(scene: Scene, material: str) -> Counts:
+def pauses(scene: SweepDraw, material: str) -> Counts:
     """A slide that rests between a quarter and three quarters of the window."""
     x, still = scene.slide(material), rests(scene, material)
     return np.where((N // 4 <= TIMES) & (3 * N // 4 > TIMES), still, x)
@@ -192,7 +192,7 @@ def gained(gain: float) -> Make:
 def shaken(share: float) -> Make:
     """A slide with a share of its vibration, around the same load."""
 
-    def make(scene: Scene, material: str) -> Counts:
+    def make(scene: SweepDraw, material: str) -> Counts:
         x = scene.slide(material)
         middle = x.mean(axis=0, keepdims=True)
         return middle + share * (x - middle)
@@ -210,45 +210,45 @@ def rows_off(rows: float) -> Make:
     return lambda scene, material: scene.touch(material, 0.0, 1.0, rows * skin.PITCH_MM)
 
 
-def permuted(scene: Scene, material: str) -> Counts:
+def permuted(scene: SweepDraw, material: str) -> Counts:
     """A slide whose taxels are confused."""
     order = scene.rng.permutation(16)
     return scene.slide(material).reshape(N, 16)[:, order].reshape(N, 4, 4)
 
 
-def mosaic(scene: Scene, material: str) -> Counts:
+def mosaic(scene: SweepDraw, material: str) -> Counts:
     """Taxels of sixteen slides of different materials."""
     names = scene.rng.permutation(np.tile(skin.MATERIALS, 3))[:16]
     parts = [scene.slide(str(name)).reshape(N, 16)[:, i] for i, name in enumerate(names)]
     return np.stack(parts, axis=1).reshape(N, 4, 4)
 
 
-def halves(scene: Scene, material: str) -> Counts:
+def halves(scene: SweepDraw, material: str) -> Counts:
     """Half of a slide over a material, half of a slide over another one."""
     return np.where(TIMES * 2 < N, scene.slide(material), scene.slide(scene.other(material)))
 
 
-def mixed(scene: Scene, material: str) -> Counts:
+def mixed(scene: SweepDraw, material: str) -> Counts:
     """The mean of two slides over different materials."""
     return (scene.slide(material) + scene.slide(scene.other(material))) / 2
 
 
-def interleaved(scene: Scene, material: str) -> Counts:
+def interleaved(scene: SweepDraw, material: str) -> Counts:
     """Frames of two slides over different materials in turn."""
     return np.where(TIMES % 2, scene.slide(material), scene.slide(scene.other(material)))
 
 
-def shuffled(scene: Scene, material: str) -> Counts:
+def shuffled(scene: SweepDraw, material: str) -> Counts:
     """The frames of a slide in random order."""
     return scene.slide(material)[scene.rng.permutation(N)]
 
 
-def held(scene: Scene, material: str) -> Counts:
+def held(scene: SweepDraw, material: str) -> Counts:
     """A slide of which each tenth frame is repeated ten times."""
     return scene.slide(material)[::10].repeat(10, axis=0)
 
 
-def phases(scene: Scene, material: str) -> Counts:
+def phases(scene: SweepDraw, material: str) -> Counts:
     """A slide whose taxels keep their spectra and get random phases."""
     bins = np.fft.rfft(scene.slide(material), axis=0)
     turns = np.exp(2j * np.pi * scene.rng.random(bins.shape))
@@ -256,24 +256,24 @@ def phases(scene: Scene, material: str) -> Counts:
     return np.fft.irfft(bins * turns, N, axis=0)
 
 
-def one_taxel(scene: Scene, material: str) -> Counts:
+def one_taxel(scene: SweepDraw, material: str) -> Counts:
     """A slide that loads one taxel."""
     x, keep = skin.idle(N, scene.rng, scene.world).astype(float), scene.rng.integers(4, size=2)
     x[:, keep[0], keep[1]] = scene.slide(material)[:, keep[0], keep[1]]
     return x
 
 
-def random_bytes(scene: Scene, material: str) -> Counts:
+def random_bytes(scene: SweepDraw, material: str) -> Counts:
     """Random bytes."""
     return scene.rng.integers(0, 256, (N, 4, 4)).astype(float)
 
 
-def random_frames(scene: Scene, material: str) -> Counts:
+def random_frames(scene: SweepDraw, material: str) -> Counts:
     """Random bytes, the same on all taxels."""
     return scene.rng.integers(0, 256, (N, 1, 1)) * np.ones((1, 4, 4))
 
 
-def walks(scene: Scene, material: str) -> Counts:
+def walks(scene: SweepDraw, material: str) -> Counts:
     """A random walk of each taxel around the load of a slide."""
     steps = scene.rng.standard_normal((N, 4, 4)).cumsum(axis=0)
     return level(scene, material) + steps / 4
@@ -340,7 +340,7 @@ KINDS: dict[str, tuple[Make, bool]] = {
 
 def window(name: str, world: skin.World, number: int) -> tuple[NDArray[np.uint8], str]:
     """The raw counts [T, R, C] of a sweep of a kind, and the label that is right, "" for none."""
-    scene = Scene(world, np.random.default_rng([number, *name.encode()]))
+    scene = SweepDraw(world, np.random.default_rng([number, *name.encode()]))
     make, named = KINDS[name]
     material = skin.MATERIALS[number % len(skin.MATERIALS)]
     counts = np.clip(np.rint(make(scene, material) * np.ones((N, 4, 4))), 0, 255)

@@ -34,6 +34,7 @@ from train.export import (
     nuisances,
     pack,
     quantized_bundle,
+    sliding,
 )
 from train.models import methods
 from train.models.recipe import recipe
@@ -332,7 +333,8 @@ def run_widen(args: argparse.Namespace) -> None:
     manifest = nuisances.write(*given)
     if manifest.early:
         manifest = early_checks.write(*given)
-    manifest = displacement_limit.write(args.bundle, given[1])
+    displacement_limit.write(args.bundle, given[1])
+    manifest = sliding.write(args.bundle, given[1])
     _print_checks(manifest)
     print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
 
@@ -342,8 +344,8 @@ def _print_checks(manifest: Manifest) -> None:
     materials."""
     if manifest.known:
         print(nuisances.text(manifest.figures))
-    for text in (early_checks.text(manifest), displacement_limit.text(manifest)):
-        if text:
+    for part in (early_checks, displacement_limit, sliding):
+        if text := part.text(manifest):
             print(text)
 
 

@@ -34,7 +34,14 @@ from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
 from train.data.readers import counted
 from train.data.sets import Dataset
-from train.export import bridging, bundle_score, displacement_limit, early_checks, nuisances
+from train.export import (
+    bridging,
+    bundle_score,
+    displacement_limit,
+    early_checks,
+    nuisances,
+    sliding,
+)
 from train.metrics.answers import REFUSED, UNKNOWN
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
@@ -111,7 +118,7 @@ def pack(
     content = _early_checked(_widened(content))
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
-    manifest = displacement_limit.limited(manifest, content.train)
+    manifest = sliding.limited(displacement_limit.limited(manifest, content.train), content.train)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():

@@ -74,6 +74,7 @@ def test_distances_have_the_shape_of_each_step():
 
 
 def test_an_embedding_that_is_no_number_is_unknown():
+    """Distances that are not numbers lie within no limit."""
     classes = bundle.EarlyClasses(*toy_bundle.early_arrays().values())
     known = EarlyDistances(classes, (4.0,) * 3).known(np.full((3, 2), np.nan))
     assert not known.any()
@@ -104,11 +105,13 @@ def test_a_bundle_with_incomplete_checks_is_refused(tmp_path: Path, more: dict, 
 
 @pytest.mark.parametrize("limits", [(4.0,), (4.0, 0.0, 4.0), (4.0, "4", 4.0)])
 def test_limits_out_of_range_are_refused(limits: tuple):
+    """Too few limits, 0, and text."""
     with pytest.raises(BundleError, match=r"early.limits .* one for each step"):
         Early((0.6, 0.6, 0.6), 2, limits)
 
 
 def test_limits_need_the_limit_of_whole_sweeps(tmp_path: Path):
+    """A bundle without `known` has no embedding."""
     with pytest.raises(BundleError, match=r"`early.limits` without `known`"):
         toy(tmp_path, known=None)
 
@@ -141,5 +144,6 @@ def test_a_contact_is_named_up_to_the_farthest_displacement(tmp_path: Path):
 
 
 def test_the_farthest_displacement_is_a_length():
+    """0 is out of range."""
     with pytest.raises(BundleError, match=r"moved.farthest_mm 0 must be a number above 0"):
         replace(toy_bundle.DISPLACEMENT, farthest_mm=0)

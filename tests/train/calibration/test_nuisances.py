@@ -32,8 +32,8 @@ def rng() -> Generator:
 
 
 def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
-    """Held-out copies are within the limit, and a stranger in a direction that no alteration
-    reaches is as far beyond it as before."""
+    """Held-out copies are within the limit, and an unknown material in a direction that no
+    alteration reaches is as far beyond it as before."""
     scatters = Scatters.of(sweeps(rng, hum=HUM), MEANS)
     rule = choose(scatters, sweeps(rng, hum=HUM), MEANS)
     assert rule
@@ -42,8 +42,8 @@ def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
     assert after > 0.95
     assert rule.passed[1] <= rule.passed[0] + 0.01
     shapes = rule.shapes(scatters).astype(np.float64)
-    stranger = MEANS[0] + [0, 0, 0, 8]
-    assert shaped_distances(stranger - MEANS, shapes).min() > 1.5 * rule.limit
+    unknown = MEANS[0] + [0, 0, 0, 8]
+    assert shaped_distances(unknown - MEANS, shapes).min() > 1.5 * rule.limit
 
 
 def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Generator):
@@ -69,6 +69,7 @@ def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
 
 
 def test_a_material_without_copies_has_the_scatter_of_the_others(rng: Generator):
+    """The copies are of two of three materials."""
     given = sweeps(rng, hum=HUM)
     z, source = given.copies["hum"]
     few = given.labels[source] != 2

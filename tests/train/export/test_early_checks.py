@@ -93,6 +93,7 @@ def test_an_older_bundle_gets_the_check_and_keeps_its_answers(older: Path):
 
 
 def test_a_bundle_without_early_answers_is_refused(older: Path):
+    """The manifest or the model lacks them."""
     loaded = bundle.load(older)
     manifest = replace(loaded.manifest, early=None)
     model = onnx.load_from_string(loaded.model)

@@ -97,7 +97,8 @@ def test_what_cannot_be_widened_is_refused(tmp_path: Path, spoil, sweeps: Datase
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
-def test_a_bundle_that_knows_no_strangers_is_refused(tmp_path: Path):
+def test_a_bundle_that_detects_no_unknown_materials_is_refused(tmp_path: Path):
+    """It has no `known`."""
     files = toy_bundle.files(format=FORMAT)
     manifest = json.loads(files[bundle.MANIFEST])
     manifest["known"] = None
