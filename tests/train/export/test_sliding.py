@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
@@ -15,11 +16,13 @@ from train.data import sets
 from train.export import sliding
 
 
-def test_limits_come_from_training_sweeps():
+def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
     """No part of a training sweep rests by them. A part that does not change gives no limits, nor
-    do sweeps of other materials."""
+    do sweeps of other materials, or nine of each."""
     train = sets.load("sim:T-REAL/level-blind:41:1")
     bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
+    assert sliding.limited(bare, train) is bare
+    monkeypatch.setattr(sliding, "FEWEST", 9)
     found = sliding.limited(bare, train)
     assert found.sliding
     assert len(found.sliding.least) == 6
