@@ -85,9 +85,9 @@ def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
     return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
 
 
-def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
-    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels,
-    or has a number out of range."""
+def check_classes(arrays: Mapping[str, NDArray[Any]], n: int, steps: int) -> None:
+    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels
+    and `steps` early answers, or has a number out of range."""
     rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
     rows = {
         "means": (n, rank),
@@ -98,13 +98,16 @@ def check_classes(arrays: Mapping[str, NDArray[Any]], n: int) -> None:
         "moved_turn": (rank, rank),
         "moved_means": (n, rank),
         "moved_shapes": (n, 0, 0),
+        "early_means": (steps, n, rank),
+        "early_shapes": (steps, rank, rank),
     }
-    kinds = {"sweeps": "int64", "shapes": "float16", "moved_shapes": "float16"}
+    halves = dict.fromkeys(("shapes", "moved_shapes", "early_shapes"), "float16")
+    kinds = {"sweeps": "int64"} | halves
     for name, wanted in rows.items():
-        if name not in arrays:
+        if name not in arrays or (name.startswith("early_") and not steps):
             continue
         values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
-        if name.endswith("shapes") and len(shape) == 3 and shape[1] <= rank:
+        if name in ("shapes", "moved_shapes") and len(shape) == 3 and shape[1] <= rank:
             wanted = (n, shape[1], shape[1])
         if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
             raise BundleError(

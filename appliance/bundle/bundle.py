@@ -8,6 +8,7 @@ as `features`. All scaling is inside the graph. Its outputs by name:
 - `logits` float32 [1, K0] for the K0 labels of training;
 - `early` float32 [1, D, K0], optional: row d (from 0) holds the logits after (d + 1) / (D + 1) of
   the window;
+- `early_embedding` float32 [1, D, r], optional: the embedding after each of these steps;
 - `embedding` float32 [1, r], optional: a linear projection in which the sweeps of each material
   have covariance 1.
 
@@ -30,7 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle import arrays, enrolled
-from appliance.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClasses
+from appliance.bundle.contents import (
+    AddedLabels,
+    Bundle,
+    Classes,
+    DisplacedClasses,
+    EarlyClasses,
+)
 from appliance.bundle.enrolled import ENROLMENT
 from appliance.bundle.manifest import (
     GOLDEN,
@@ -73,6 +80,7 @@ __all__ = [
     "DisplacedClasses",
     "DisplacementRule",
     "Early",
+    "EarlyClasses",
     "Known",
     "Manifest",
     "Thresholds",
@@ -245,10 +253,12 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
     displaced = (
         [f"moved_{name}" for name in DisplacedClasses.__slots__] if manifest.displacement else []
     )
-    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced)
+    steps = len(manifest.early.limits) if manifest.early else 0
+    early = [f"early_{name}" for name in EarlyClasses.__slots__] if steps else []
+    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced, *early)
     held.setdefault("spread", np.ones(n, np.float32))
     held.setdefault("shapes", np.zeros((n, 0, 0), np.float16))
-    arrays.check_classes(held, n)
+    arrays.check_classes(held, n, steps)
     sweeps = held["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
         raise BundleError(
@@ -267,4 +277,5 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
         held["spread"],
         held["shapes"],
         DisplacedClasses(*(held[name] for name in displaced)) if displaced else None,
+        EarlyClasses(*(held[name] for name in early)) if early else None,
     )

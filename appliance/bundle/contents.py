@@ -28,6 +28,15 @@ class DisplacedClasses:
 
 
 @dataclass(frozen=True, slots=True)
+class EarlyClasses:
+    """The classes after each of D steps of an unfinished sweep. means: float32 [D, K, r]. shapes:
+    float16 [D, r, r] of all materials together, see Classes."""
+
+    means: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+
+
+@dataclass(frozen=True, slots=True)
 class Classes:
     """Content of means.npz: the class means in the embedding, in the order of the labels.
 
@@ -41,6 +50,7 @@ class Classes:
         identity for an enrolled label; b = 0 if the file has no such array.
     displaced: the same for sweeps whose contact is displaced, None if the manifest has no rule for
         these.
+    early: of unfinished sweeps, None if the manifest has no limits for these.
     """
 
     means: NDArray[np.float32]
@@ -49,16 +59,19 @@ class Classes:
     spread: NDArray[np.float32]
     shapes: NDArray[np.float16]
     displaced: DisplacedClasses | None = None
+    early: EarlyClasses | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of means.npz by name. In the file the arrays of `displaced` are named
-        moved_*."""
-        own = {name: getattr(self, name) for name in self.__slots__ if name != "displaced"}
-        return own | (
-            {f"moved_{name}": getattr(self.displaced, name) for name in self.displaced.__slots__}
-            if self.displaced
-            else {}
-        )
+        """The arrays of means.npz by name. In the file the arrays of `displaced` are named moved_*,
+        those of `early` early_*."""
+        parts = {"moved": self.displaced, "early": self.early}
+        own = ("means", "bias", "sweeps", "spread", "shapes")
+        return {name: getattr(self, name) for name in own} | {
+            f"{prefix}_{name}": getattr(part, name)
+            for prefix, part in parts.items()
+            if part
+            for name in part.__slots__
+        }
 
 
 @dataclass(frozen=True, slots=True)

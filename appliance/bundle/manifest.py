@@ -19,6 +19,7 @@ from appliance.signal import features
 from appliance.signal.broken_taxels import Bridging
 from appliance.signal.contact import ContactPositions
 from appliance.signal.slide import SpeedRange
+from appliance.signal.vibration import SlideLimits
 from appliance.signal.window_check import WindowLimits
 
 SCHEMA = 4
@@ -56,11 +57,14 @@ class Early:
     """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
 
     least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
-    number of steps in a row, including the newest, that must give the same label.
+    number of steps in a row, including the newest, that must give the same label, and be of a known
+    material. limits: [D], largest squared distance of a known material at each step; () if unknown
+    materials are not detected before the end of a sweep, then `Manifest.json` omits it.
     """
 
     least: tuple[float, ...]
     agree: int
+    limits: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.least or not all(_positive(p) for p in self.least):
@@ -69,6 +73,12 @@ class Early:
             )
         if type(self.agree) is not int or self.agree < 1:
             raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
+        if self.limits and not (
+            len(self.limits) == len(self.least) and all(map(_positive, self.limits))
+        ):
+            raise BundleError(
+                f"early.limits {list(self.limits)} must be numbers above 0, one for each step"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +103,15 @@ class DisplacementRule:
 
     limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
     are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
-    a single displaced sweep is never ok.
+    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep is not
+    named, because no training copy is displaced as far; None if unknown, then `Manifest.json` omits
+    it.
     """
 
     limit: float
     temperature: float
     unsure: float
+    farthest_mm: float | None = None
 
     def __post_init__(self) -> None:
         _check_positive(self, "moved")
@@ -106,7 +119,8 @@ class DisplacementRule:
 
 def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
-        if not _positive(value := getattr(rule, name)):
+        value = getattr(rule, name)
+        if not _positive(value) and (name, value) != ("farthest_mm", None):
             raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
 
 
@@ -133,6 +147,7 @@ class Manifest:
     speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
     bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
         omits it.
+    sliding: least vibration of a slide, by label; None if unknown, then `json` omits it.
     """
 
     name: str
@@ -153,6 +168,7 @@ class Manifest:
     unloaded: tuple[float, ...] = ()
     speeds: SpeedRange | None = None
     bridging: Bridging | None = None
+    sliding: SlideLimits | None = None
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -190,9 +206,12 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        for name in ("unloaded", "speeds", "bridging"):
+        for name in ("unloaded", "speeds", "bridging", "sliding"):
             if not values[name]:
                 del values[name]
+        for name, added in (("early", "limits"), ("moved", "farthest_mm")):
+            if values[name] and not values[name][added]:
+                del values[name][added]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property
@@ -238,6 +257,8 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
         )
+    if manifest.early and manifest.early.limits and not manifest.known:
+        raise BundleError("manifest has `early.limits` without `known`; export the bundle again")
     if manifest.displacement and not (manifest.known and manifest.contact):
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
@@ -247,6 +268,11 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
             "export the bundle again"
+        )
+    if manifest.sliding and len(manifest.sliding.least) > len(manifest.labels):
+        raise BundleError(
+            f"manifest has {len(manifest.sliding.least)} limits in `sliding` for "
+            f"{len(manifest.labels)} labels; export the bundle again"
         )
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(

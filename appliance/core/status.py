@@ -30,6 +30,7 @@ class Status(StrEnum):
     ABORTED = "aborted"
     RECORDED = "recorded"
     CONFLICT = "conflict"
+    NO_SLIDE = "no-slide"
 
     @property
     def classified(self) -> bool:
@@ -60,6 +61,7 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.EDGES_LOST: "trigger edges were lost; check the GPIO lines of the trigger",
         Status.ABORTED: "by command, or because the box was stopping",
         Status.RECORDED: "sweeps are recorded, not classified",
+        Status.NO_SLIDE: "the finger rests in a part of the window; slide through all of it",
         Status.CONFLICT: "it contradicts the sweeps before it; signal NEW OBJECT for each object",
     }
 )

@@ -26,15 +26,16 @@ from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
-from appliance.signal.contact import displacement
+from appliance.signal.contact import Displacement, displacement
 from appliance.signal.slide import Slide, SlideMeter
+from appliance.signal.vibration import PARTS, vibration
 from appliance.signal.window_check import Finding
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
 
 
-_NONE, _NO_SLIDE = np.empty(0), Slide()
+_NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
 all others."""
@@ -71,9 +72,9 @@ def _degraded(finding: Finding) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Touched:
-    """Where and how the finger touched in a sweep. displacement: as in Verdict."""
+    """Where and how the finger touched in a sweep."""
 
-    displacement: str = ""
+    displacement: Displacement = _IN_PLACE
     slide: Slide = _NO_SLIDE
 
 
@@ -191,11 +192,15 @@ class Classifier(Observer):
         Frames that have not arrived yet may have any value; rows that depend on them are
         meaningless.
         """
-        return self._run(("early",), taxels)[0]
+        return self.unfinished(taxels, "early")[0]
 
-    def prepare_early(self) -> None:
-        """Open the session of the early heads now, so that the first sweep does not wait for it."""
-        self._model.prepare("early")
+    def unfinished(self, taxels: NDArray[Any], *outputs: str) -> list[NDArray[np.float32]]:
+        """As `early`, with other outputs of the model that have a row for each step."""
+        return self._run(outputs, taxels)
+
+    def prepare(self, *outputs: str) -> None:
+        """Open the session of these outputs now, so that the first sweep does not wait for it."""
+        self._model.prepare(*outputs)
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model
@@ -252,7 +257,7 @@ class Classifier(Observer):
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
         touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
-        displaced = bool(touch.displacement)
+        displaced = bool(touch.displacement.text)
         logits, novelty = self._classify(sweep.frames.taxels, displaced)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
@@ -284,6 +289,10 @@ class Classifier(Observer):
         if math.isnan(scores[0]):  # all are NaN or none; float32 counts can overflow the network
             finding = Finding(Status.UNKNOWN, "the model gives no number", degraded)
             return self._verdict(sweep, finding, touch=touch)
+        if far := self._too_far(touch.displacement):
+            return self._verdict(sweep, Finding(Status.UNKNOWN, far, degraded), touch=touch)
+        if rests := self._rests(sweep, int(scores.argmax())):
+            return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
             earlier = FusedSweeps(sweep.object)
@@ -297,7 +306,7 @@ class Classifier(Observer):
         self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
         fused = self._fuse(kept)
         status, rule = Status.OK, self.bundle.manifest.displacement
-        least = rule.unsure if touch.displacement and rule else 0
+        least = rule.unsure if touch.displacement.text and rule else 0
         if fused.max() < max(self.min_probability, least):
             final = 0 < self._ends.max_sweeps <= len(kept)
             status = Status.UNDECIDED if final else Status.UNSURE
@@ -366,6 +375,26 @@ class Classifier(Observer):
             return Touched(slide=slide)
         return Touched(displacement(mean, self.tare, m.thresholds.contact, m.contact), slide)
 
+    def _rests(self, sweep: Sweep, label: int) -> str:
+        """A message if the finger rests in a part of the window so far, where a slide over the
+        label with this number vibrates more; else ""."""
+        m, taxels = self.bundle.manifest, sweep.frames.taxels
+        parts = PARTS * len(taxels) // m.format.window
+        if m.sliding is None or not parts or len(taxels) < 2 * parts:
+            return ""
+        found = m.sliding.resting(vibration(taxels, self.tare, parts), label)
+        if not found:
+            return ""
+        where = " ".join(map(str, found))
+        return f"hardly any vibration in part {where} of {PARTS}, less than {m.labels[label]} gives"
+
+    def _too_far(self, displaced: Displacement) -> str:
+        """A message if the contact is displaced further than any training copy, else ""."""
+        rule = self.bundle.manifest.displacement
+        if not (rule and rule.farthest_mm and displaced.mm > rule.farthest_mm):
+            return ""
+        return f"named up to {rule.farthest_mm:.1f} mm"
+
     def _verdict(
         self,
         sweep: Sweep,
@@ -397,7 +426,7 @@ class Classifier(Observer):
             detail=self._detail(finding, touch),
             share=sweep.share,
             own=own,
-            displacement=touch.displacement,
+            displacement=touch.displacement.text,
             degraded=finding.degraded,
             after=after,
             speed_mm_s=sweep.speed_mm_s,
@@ -411,5 +440,5 @@ class Classifier(Observer):
         trained = self.bundle.manifest.speeds
         uncertain = finding.status in (Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN)
         untrained = trained.outside(touch.slide) if trained and uncertain else ""
-        texts = touch.displacement, untrained, finding.detail, _degraded(finding)
+        texts = touch.displacement.text, untrained, finding.detail, _degraded(finding)
         return "; ".join(filter(None, texts))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import BundleError
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier, softmax
+from appliance.inference.novelty import EarlyDistances
 
 if TYPE_CHECKING:
     from appliance.bundle.manifest import Early
@@ -47,32 +48,43 @@ class EarlyExit:
             )
         self._classifier, self._manifest, self._rule = classifier, manifest, manifest.early
         self.steps = len(self._rule.least)
-        classifier.prepare_early()
+        classes, limits = classifier.bundle.classes, self._rule.limits
+        self._distances = (
+            EarlyDistances(classes.early, limits) if classes and classes.early else None
+        )
+        self._outputs = ("early", *("early_embedding",) * (self._distances is not None))
+        classifier.prepare(*self._outputs)
 
     def __call__(self, sweep: Sweep) -> Verdict | None:
         """The verdict on a sweep with share < 1, or None if the rest of the sweep is needed; then
         the sweep is not counted.
 
         The frames are checked like a whole window: broken taxels are bridged, and a faulty sweep is
-        not answered early. For the graph the window is completed by repeating the last frame; the
-        heads up to this step do not depend on the repeated frames.
+        not answered early, nor one whose material is unknown at one of the steps that must agree,
+        if the bundle has limits for these. For the graph the window is completed by repeating the
+        last frame; the heads up to this step do not depend on the repeated frames.
         """
         sweep, finding = self._classifier.repaired(sweep)
         if finding.status is not Status.OK:
             return None
-        scores = self._scores(sweep)
-        if not decides(scores, self._rule):
+        scores, known = self._scores(sweep)
+        if not (decides(scores, self._rule) and known[-self._rule.agree :].all()):
             return None
         return self._classifier.conclude_if_ok(sweep, scores[-1], finding.degraded)
 
     def scores(self, sweep: Sweep) -> NDArray[np.float64]:
         """Probabilities float64 [d, K] at the steps that a sweep with share < 1 has reached."""
-        return self._scores(self._classifier.repaired(sweep)[0])
+        return self._scores(self._classifier.repaired(sweep)[0])[0]
 
-    def _scores(self, sweep: Sweep) -> NDArray[np.float64]:
-        """As `scores`, of a sweep whose broken taxels were bridged."""
+    def _scores(self, sweep: Sweep) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """As `scores`, of a sweep whose broken taxels were bridged; and whether its material is
+        known at each step, bool [d]."""
         taxels = sweep.frames.taxels
         rest = self._manifest.format.window - len(taxels)
         step = round(sweep.share * (self.steps + 1))  # counted from 1
-        logits = self._classifier.early(np.concatenate([taxels, taxels[-1:].repeat(rest, axis=0)]))
-        return softmax(logits[:step])
+        whole = np.concatenate([taxels, taxels[-1:].repeat(rest, axis=0)])
+        logits, *embedded = self._classifier.unfinished(whole, *self._outputs)
+        known = np.ones(step, bool)
+        if self._distances:
+            known = self._distances.known(embedded[0][:step])
+        return softmax(logits[:step]), known

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle.bundle import Classes
+from appliance.bundle.bundle import Classes, EarlyClasses
 from appliance.bundle.manifest import DisplacementRule, Known
 
 Array = NDArray[np.float64]
@@ -30,6 +30,30 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     own = np.einsum("...kb,kbc->...kc", away[..., common:], shapes)
     result: Array = (away[..., :common] ** 2).sum(axis=-1) + (own**2).sum(axis=-1)
     return result
+
+
+class EarlyDistances:
+    """Finds unknown materials in unfinished sweeps. limits: [D], largest squared distance of a
+    known material at each step."""
+
+    def __init__(self, classes: EarlyClasses, limits: Sequence[float]) -> None:
+        self._means, self._shapes = (
+            part.astype(np.float64) for part in (classes.means, classes.shapes)
+        )
+        self._limits = np.array(limits)
+
+    def known(self, z: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether the material is known at each of the first d steps, bool [d]. z: embeddings
+        [d, r] after these steps."""
+        known: NDArray[np.bool_] = self.nearest(z) <= self._limits[: len(z)]
+        return known
+
+    def nearest(self, z: NDArray[Any]) -> Array:
+        """Squared distances float64 [d] to the nearest material, see `known`."""
+        d = len(z)
+        away = (z[:, None] - self._means[:d]) @ self._shapes[:d]  # [d, K, r]
+        nearest: Array = (away**2).sum(axis=2).min(axis=1)
+        return nearest
 
 
 class ClassDistances:

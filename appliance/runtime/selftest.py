@@ -24,6 +24,8 @@ from appliance.signal.slide import SlideMeter
 
 UNPROVEN = "broken taxels are refused: export it again to measure how many can be bridged"
 """Text of a bundle without `bridging`."""
+UNCHECKED = "early answers do not detect unknown materials: export it again"
+"""Text of a bundle with early answers, but without limits for them."""
 LISTEN_S = 1.0
 """Time for which frames of the skin are counted."""
 MOST_READING = 0.5
@@ -61,6 +63,7 @@ def check(
         return (
             f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}; "
             + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
+            + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
         )
 
     def golden() -> str:

@@ -152,16 +152,24 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """The displacement of a contact from the trained positions: its length, and a description, for
+    example "moved 2.1 mm too far towards row 4"; 0 and "" for a contact in place."""
+
+    mm: float = 0.0
+    text: str = ""
+
+
 def displacement(
     mean: NDArray[np.float64],
     tare: NDArray[np.float64],
     contact: float,
     positions: ContactPositions,
-) -> str:
-    """The displacement of a sweep's contact from the trained positions, for example "moved 2.1 mm
-    too far towards row 4"; "" if there is none. mean: counts [R, C] or [R, C, A] of its window.
-    tare, contact: as for `centre`."""
+) -> Displacement:
+    """The displacement of a sweep's contact. mean: counts [R, C] or [R, C, A] of its window. tare,
+    contact: as for `centre`."""
     found = centre_of(normal(mean, 0), normal(tare, 0), contact)
     if found is None or positions.within(offset := positions.offset(found)):
-        return ""
-    return f"moved {advice(offset, tare.shape[:2])}"
+        return Displacement()
+    return Displacement(float(np.hypot(*offset)), f"moved {advice(offset, tare.shape[:2])}")

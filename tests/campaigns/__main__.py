@@ -196,6 +196,12 @@ CAMPAIGNS = {
         _module("tests.campaigns.objects"),
         nice=True,
     ),
+    "junk": Campaign(
+        "count the answers to sweeps that no one can name, early ones too (docs/decisions/0024)",
+        _module("tests.campaigns.junk"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
     "slide-speed": Campaign(
         "measure how well the speed of a slide is measured from the counts (docs/decisions/0021)",
         _module("tests.campaigns.slide_speed"),

@@ -21,6 +21,7 @@ from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference import classifier
 from appliance.inference.classifier import Classifier, Touched
 from appliance.inference.objects import contradicts
+from appliance.signal.contact import Displacement
 from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
 
@@ -136,7 +137,8 @@ def answers(
         for n, (_, own, object) in enumerate(given, 1):
             times = n * PERIOD_NS, n * PERIOD_NS + SLIDE_NS
             sweep = Sweep(n, *times, Status.OK, Frames.empty(model.format), object=object)
-            v = own if not len(own.own) else it.conclude(sweep, own.own, Touched(own.displacement))
+            moved = Displacement(text=own.displacement)
+            v = own if not len(own.own) else it.conclude(sweep, own.own, Touched(moved))
             named.append(v.label if v.status is Status.OK else "")
     return named
 

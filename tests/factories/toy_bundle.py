@@ -66,8 +66,8 @@ def model(
     scale: float = 0.1,
     labels: int = 3,
 ) -> bytes:
-    """The graph. Each early row d is (d + 1) times the logits. Further outputs are copies of the
-    logits.
+    """The graph. Each early row d is (d + 1) times the logits, each row of early_embedding the
+    embedding. Further outputs are copies of the logits.
     """
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
@@ -84,6 +84,8 @@ def model(
         "bias": bias / np.float32(KNOWN.temperature),
         "one": np.array([1, 1, labels]),
         "steps": np.arange(1, steps + 1, dtype=np.float32)[None, :, None],
+        "each": np.ones((1, steps, 1), np.float32),
+        "place": np.array([1, 1, 2]),
     }
     nodes = [
         node("Cast", ["sweep"], ["float"], to=1),
@@ -95,6 +97,12 @@ def model(
         node("Mul", ["row", "steps"], ["early"]),
     ]
     shapes = {"logits": [1, labels], "embedding": [1, 2], "early": [1, steps, labels]}
+    if "early_embedding" in outputs:
+        nodes += [
+            node("Reshape", ["embedding", "place"], ["z"]),
+            node("Mul", ["z", "each"], ["early_embedding"]),
+        ]
+        shapes["early_embedding"] = [1, steps, 2]
     for name in set(outputs) - shapes.keys():
         nodes.append(node("Identity", ["logits"], [name]))
     value = onnx.helper.make_tensor_value_info
@@ -135,6 +143,15 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
         "sweeps": np.zeros(3, np.int64),
         "spread": np.ones(3, np.float32),
     } | changes
+
+
+def early_arrays(steps: int = 3) -> dict[str, np.ndarray]:
+    """Further arrays of means.npz, for unfinished sweeps: at each step the materials lie where they
+    do at the end, with variance 1."""
+    return {
+        "early_means": np.tile(MEANS, (steps, 1, 1)),
+        "early_shapes": np.tile(np.eye(2, dtype=np.float16), (steps, 1, 1)),
+    }
 
 
 def displaced_arrays() -> dict[str, np.ndarray]:

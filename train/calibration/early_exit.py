@@ -14,13 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from appliance.bundle.bundle import Early
-from train.calibration.novelty import embed_present, parts
+from appliance.bundle.bundle import Early, EarlyClasses
+from appliance.inference.novelty import EarlyDistances
+from train.calibration.novelty import embed_present, limit, parts
 from train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
 """Probabilities that a rule may require, the strictest first."""
+FLAT = 1e-6
+"""Least variance of a direction, relative to the mean variance of all directions."""
 AGREE = (1, 2, 3)
 """Numbers of successive steps that a rule may require to agree."""
 ABSENT = -1e4
@@ -29,6 +32,8 @@ MAX_LOSS = 0.005
 """Share of sweeps whose right answer may become wrong by an early answer."""
 MIN_SWEEPS = 40
 """Smallest number of sweeps to find a rule on."""
+KEPT = 0.97
+"""Share of known sweeps within the limit of each step. A sweep beyond it is answered later."""
 MAX_SHARE = 0.95
 """Largest mean share of the window that a rule may need."""
 
@@ -68,6 +73,27 @@ class EarlyRule:
     share: float = 1.0
     lost: float = 0.0
     n: int = 0
+
+
+def early_classes(z: Array, labels: Array) -> EarlyClasses:
+    """Class means and scatter after each step, from embeddings z [N, D, r] of sweeps of all
+    materials. The scatter is that of all materials together."""
+    classes = int(labels.max()) + 1
+    means = np.stack([z[labels == k].mean(axis=0) for k in range(classes)], axis=1)  # [D, K, r]
+    away, r = z - means.swapaxes(0, 1)[labels], z.shape[2]
+    covariances = np.einsum("ndr,nds->drs", away, away) / len(away)
+    spread = np.trace(covariances, axis1=1, axis2=2)[:, None, None] / r
+    flat = np.maximum(FLAT * spread, FLAT) * np.eye(r)
+    shapes = np.linalg.cholesky(np.linalg.inv(covariances + flat))
+    return EarlyClasses(means.astype(np.float32), shapes.astype(np.float16))
+
+
+def early_limits(classes: EarlyClasses, z: Array) -> tuple[float, ...]:
+    """The limits of each step that keep KEPT of sweeps of known materials, from embeddings z [n, D,
+    r] of sweeps that `classes` have not seen."""
+    distances = EarlyDistances(classes, (0.0,) * z.shape[1])
+    nearest = np.stack([distances.nearest(sweep) for sweep in z])
+    return tuple(limit(step, KEPT) for step in nearest.T)
 
 
 def heads(z: Array, labels: Array, classes: int) -> Heads:

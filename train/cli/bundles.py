@@ -1,4 +1,4 @@
-"""The commands that make and judge bundles: export, pack, score, parity, bridge."""
+"""The commands that make and judge bundles: export, pack, score, parity, bridge, widen."""
 
 from __future__ import annotations
 
@@ -17,15 +17,25 @@ from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import labels
-from train.export import bridging, bundle_score, measure, pack, quantized_bundle
+from train.data import labels, sets
+from train.export import (
+    bridging,
+    bundle_score,
+    displacement_limit,
+    early_checks,
+    measure,
+    nuisances,
+    pack,
+    quantized_bundle,
+    sliding,
+)
 from train.models import methods
 from train.models.recipe.fitted import Fit
 from train.reports import formatting
 
 
 def register(add: Add) -> None:
-    """export, pack, score, parity, bridge."""
+    """export, pack, score, parity, bridge, widen."""
     _add_bundles(add)
     score = add("score", run_score)
     score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
@@ -34,6 +44,12 @@ def register(add: Add) -> None:
     bridge = add("bridge", run_bridge)
     bridge.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(bridge)
+    widen = add("widen", run_widen)
+    widen.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    widen.add_argument(
+        "--trained-on", required=True, metavar="SET", help="its training sweeps, which are altered"
+    )
+    options.add_set(widen)
     parity = add(
         "parity",
         lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
@@ -136,6 +152,29 @@ def run_bridge(args: argparse.Namespace) -> None:
     print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
 
 
+def run_widen(args: argparse.Namespace) -> None:
+    """Measure how altered and unfinished sweeps differ from known ones, and write it into the
+    bundle."""
+    given = args.bundle, sets.load(args.trained_on), options.load(args)
+    manifest = nuisances.write(*given)
+    if manifest.early:
+        manifest = early_checks.write(*given)
+    displacement_limit.write(args.bundle, given[1])
+    manifest = sliding.write(args.bundle, given[1])
+    _print_checks(manifest)
+    print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
+
+
+def _print_checks(manifest: Manifest) -> None:
+    """Print how the bundle tells altered, unfinished and displaced sweeps from unknown
+    materials."""
+    if manifest.known:
+        print(nuisances.text(manifest.figures))
+    for part in (early_checks, displacement_limit, sliding):
+        if text := part.text(manifest):
+            print(text)
+
+
 def _packing(args: argparse.Namespace) -> tuple[Path, str, str, str, float | None, float | None]:
     return args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
 
@@ -150,6 +189,7 @@ def _print(manifest: Manifest, out: Path) -> None:
     for line in formatting.figure_lines(manifest.figures):
         print(line)
     print(bridging.text(manifest))
+    _print_checks(manifest)
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()

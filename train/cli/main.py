@@ -30,6 +30,7 @@ PROGRAM = Program(
             "bridge": (
                 "measure how many broken taxels a bundle tolerates, and write it into its manifest"
             ),
+            "widen": "let altered sweeps of a bundle's materials count as known ones",
             "parity": "show what int8 changes in a model's answers, and in each tensor",
             "report": "write a page about a bundle: its answers to a set, its limits, its cost",
             "sign": "sign a bundle, so that boxes take it",
@@ -39,7 +40,7 @@ PROGRAM = Program(
         "sets": ("sets", "pull"),
         "importing": ("import",),
         "fit": ("fit",),
-        "bundles": ("export", "pack", "score", "bridge", "parity"),
+        "bundles": ("export", "pack", "score", "bridge", "widen", "parity"),
         "evaluation": ("evaluate",),
         "report": ("report",),
         "signing": ("sign",),

@@ -222,6 +222,23 @@ def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
     """Measure the bundle in `folder` on `sweeps` of a sound skin, best of none that it has seen,
     and write the result into its manifest; its other files stay as they are.
 
+    Raises FormatError as `measurable`.
+    """
+    loaded = measurable(folder, sweeps)
+    found = measure(loaded, sweeps, sweeps, seed)
+    figures = found.figures | {"set": sweeps.source, "digest": digest(sweeps)}
+    manifest = replace(
+        loaded.manifest,
+        bridging=found.bridging,
+        figures=loaded.manifest.figures | {FIGURES: figures},
+    )
+    put(folder / MANIFEST, manifest.json())
+    return manifest
+
+
+def measurable(folder: Path, sweeps: Dataset) -> Bundle:
+    """The bundle in `folder`, to measure it on `sweeps` and to write the result into it.
+
     Raises FormatError if the sweeps are of another format or of materials that it lacks, or if the
     bundle is signed or has enrolled materials, which hold for the manifest as it is.
     """
@@ -237,12 +254,4 @@ def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
             f"{folder} has {', '.join(bound)}, made for its manifest as it is; measure the bundle "
             "before it is signed"
         )
-    found = measure(loaded, sweeps, sweeps, seed)
-    figures = found.figures | {"set": sweeps.source, "digest": digest(sweeps)}
-    manifest = replace(
-        loaded.manifest,
-        bridging=found.bridging,
-        figures=loaded.manifest.figures | {FIGURES: figures},
-    )
-    put(folder / MANIFEST, manifest.json())
-    return manifest
+    return loaded

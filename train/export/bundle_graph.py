@@ -23,6 +23,8 @@ from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 Add = Callable[..., str]
+STEPS = "early_embedding"
+"""Name of the output with the embeddings of unfinished sweeps."""
 DIRECTIONS, TURN, OFFSET = "embedding.axes", "embedding.turn", "embedding.offset"
 """Names of a model's matrices; see novelty.Embedding."""
 
@@ -36,7 +38,8 @@ def bundle_graph(
     """The model of a bundle, from a trunk (float or int8): `sweep` -> `features` float32 [1, F].
 
     prefixes: the same trunk with the output `tenths` [1, D + 1, F]. Outputs: `logits` [1, K];
-    `early` [1, D, K] if there are prefixes and a rule; `embedding` [1, r] if `known`.
+    `early` [1, D, K] if there are prefixes and a rule; `embedding` [1, r] if `known`;
+    `early_embedding` [1, D, r] if both.
     """
     model, steps = onnx.ModelProto(), None
     model.CopyFrom(trunk)
@@ -56,6 +59,8 @@ def bundle_graph(
     if steps is not None:
         _early(add, steps, _embedded(add, embedding, tenths[0], axis=2, output="head.each"))
         outputs["early"] = [1, len(steps.weight), len(bias)]
+        if known:
+            outputs[STEPS] = [1, len(steps.weight), len(embedding.offset)]
     if known:
         _embedded(add, embedding, whole, axis=1, output="embedding")
         outputs["embedding"] = [1, len(embedding.offset)]
@@ -70,7 +75,7 @@ def _early(add: Add, steps: Heads, z: str) -> None:
     """The output `early` [1, D, K] from embeddings z [1, D + 1, r]."""
     count = len(steps.weight)
     # [1, D, r] -> [D, 1, r]: a head for each row
-    rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output="head.first")
+    rows = add("Slice", z, np.array([0]), np.array([count]), np.array([1]), output=STEPS)
     rows = add("Transpose", rows, output="head.rows", perm=[1, 0, 2])
     weight = _sixteen_bits(add, steps.weight, "early.weight")
     rows = add("MatMul", rows, weight, output="head.steps")

@@ -7,13 +7,13 @@ model.
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import platform
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,7 +24,7 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
+from appliance.bundle import arrays, bundle
 from appliance.core import provenance, storage
 from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
@@ -34,11 +34,18 @@ from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
 from train.data.readers import counted
 from train.data.sets import Dataset
-from train.export import bridging, bundle_score
+from train.export import (
+    bridging,
+    bundle_score,
+    displacement_limit,
+    early_checks,
+    nuisances,
+    sliding,
+)
 from train.metrics.answers import REFUSED, UNKNOWN
 from train.models.linear_head import hold_out
 from train.models.methods import Method, Model, model_inputs
-from train.onnx_tools.graph_builder import run, slim
+from train.onnx_tools.graph_builder import run, run_output, slim
 
 Array = NDArray[Any]
 MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
@@ -110,8 +117,10 @@ def pack(
     bridge, which takes most of the time; without it the box refuses them. Raises ExportRefused if a
     check fails, and BundleError if a label or the target cannot be used.
     """
+    content = _early_checked(_widened(content))
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
+    manifest = sliding.limited(displacement_limit.limited(manifest, content.train), content.train)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
@@ -123,6 +132,46 @@ def pack(
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
+
+
+def _widened(content: Content) -> Content:
+    """`content` with a check of unknown materials that knows how altered sweeps differ; see
+    nuisances."""
+    apart = content.unseen or content
+    if not (content.known and content.classes and apart.classes):
+        return content
+    spaces = [
+        (partial(_embedded, of), of.classes.means)
+        for of in ([apart, content] if content.unseen else [content])
+        if of.classes
+    ]
+    seed = int(content.about.get("seed", 0))
+    found = nuisances.measure(content.train, content.held_out, *spaces, seed=seed)
+    if found is None:
+        return content
+    known = replace(content.known, limit=found.limit)
+    widened = replace(
+        content,
+        known=known,
+        classes=replace(content.classes, shapes=found.shapes[-1]),
+        figures=content.figures | {nuisances.FIGURES: found.figures},
+    )
+    if not content.unseen:
+        return widened
+    classes = replace(apart.classes, shapes=found.shapes[0])
+    return replace(widened, unseen=replace(content.unseen, known=known, classes=classes))
+
+
+def _early_checked(content: Content) -> Content:
+    """`content` whose early answers need a known material; see early_checks."""
+    if not (content.early and content.classes):
+        return content
+    classes, limits = early_checks.measure(content.model, content.train, content.held_out)
+    return replace(
+        content,
+        early=replace(content.early, limits=limits),
+        classes=replace(content.classes, early=classes),
+    )
 
 
 def _manifest(
@@ -184,9 +233,7 @@ def _files(content: Content) -> dict[str, bytes]:
 
 def means_file(classes: bundle.Classes) -> bytes:
     """The file means.npz."""
-    packed = io.BytesIO()
-    np.savez_compressed(packed, allow_pickle=False, **classes.arrays())
-    return packed.getvalue()
+    return arrays.packed(**classes.arrays())
 
 
 def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, Any]:
@@ -241,7 +288,9 @@ def logits_of_means(content: Content, sweeps: Dataset) -> Array:
     """Logits [N, K] that the box computes from class means once a label is enrolled, before
     temperature scaling."""
     assert content.classes
-    logits: Array = _embedded(content, sweeps) @ content.classes.means.T + content.classes.bias
+    logits: Array = (
+        _embedded(content, sweeps.samples) @ content.classes.means.T + content.classes.bias
+    )
     return logits
 
 
@@ -251,18 +300,14 @@ def _unknown(content: Content, sweeps: Dataset) -> Array:
     if not (content.known and content.classes):
         return np.zeros(len(sweeps), bool)
     means, shapes = (a.astype(np.float64) for a in (content.classes.means, content.classes.shapes))
-    distances = shaped_distances(_embedded(content, sweeps)[:, None] - means, shapes)
+    distances = shaped_distances(_embedded(content, sweeps.samples)[:, None] - means, shapes)
     beyond: Array = distances.min(axis=1) > content.known.limit
     return beyond
 
 
-def _embedded(content: Content, sweeps: Dataset) -> Array:
-    embedding = onnx.ModelProto()
-    embedding.CopyFrom(content.model)
-    kept = [output for output in embedding.graph.output if output.name == "embedding"]
-    del embedding.graph.output[:]
-    embedding.graph.output.extend(kept)
-    return run(embedding, sweeps.samples)
+def _embedded(content: Content, samples: Array) -> Array:
+    """The embeddings [n, r] of raw counts [n, T, R, C]."""
+    return run_output(content.model, "embedding", samples)
 
 
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:

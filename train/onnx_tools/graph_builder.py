@@ -347,6 +347,16 @@ class GraphModel:
         return self.model
 
 
+def run_output(model: onnx.ModelProto, name: str, inputs: Array) -> Array:
+    """As `run`, for one of several outputs of `model`: float32 [n, ...]."""
+    made = onnx.ModelProto()
+    made.CopyFrom(model)
+    kept = [output for output in made.graph.output if output.name == name]
+    del made.graph.output[:]
+    made.graph.output.extend(kept)
+    return run(made, inputs)
+
+
 def run(model: onnx.ModelProto, inputs: Array) -> Array:
     """The output of `model`, float32 [n, size], for each of `inputs` (raw counts or features), in
     the same kind of session as on the box."""

@@ -346,10 +346,14 @@ def _gives(
     patterns: dict[str, ShapePattern] = {
         "logits": (1, trained),
         "early": (1, len(early.least) if early else None, trained),
+        "early_embedding": (1, len(early.least) if early else None, rank),
         "embedding": (1, rank),
     }
     needed = (
-        {"logits"} | ({"early"} if early else set()) | ({"embedding"} if manifest.known else set())
+        {"logits"}
+        | ({"early"} if early else set())
+        | ({"early_embedding"} if early and early.limits else set())
+        | ({"embedding"} if manifest.known else set())
     )
     asked = f"the manifest needs {', '.join(sorted(needed))} and allows {', '.join(patterns)}"
     need(

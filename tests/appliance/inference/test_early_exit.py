@@ -323,14 +323,16 @@ def test_one_run_of_the_graph_at_each_step(
     """
     asked: list[int] = []
     looked: list[int] = []
-    heads, look = Classifier.early, SweepCutter._seq_at
+    heads, look = Classifier.unfinished, SweepCutter._seq_at
     monkeypatch.setattr(
         SweepCutter,
         "_seq_at",
         lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns),
     )
     monkeypatch.setattr(
-        Classifier, "early", lambda self, x: asked.append(box.box.answered) or heads(self, x)
+        Classifier,
+        "unfinished",
+        lambda self, *given: asked.append(box.box.answered) or heads(self, *given),
     )
     box = rigged(simulated_slides(slid(10), slid(-10, 60)), SETS, toy())
     all_of(box)
@@ -342,8 +344,10 @@ def test_the_rest_of_the_window_repeats_the_newest_frame(monkeypatch: pytest.Mon
     """The graph gets the frames so far, and the last of them repeated to the end of the window."""
     given: list[np.ndarray] = []
     classifier = Classifier(toy(), rig.VirtualClock())
-    heads = classifier.early
-    monkeypatch.setattr(classifier, "early", lambda x: given.append(x) or heads(x))
+    heads = classifier.unfinished
+    monkeypatch.setattr(
+        classifier, "unfinished", lambda x, *outputs: given.append(x) or heads(x, *outputs)
+    )
     verdict = EarlyExit(classifier)(so_far(slid(60)[:40], 0.4))
     assert verdict is not None
     assert verdict.share == 0.4

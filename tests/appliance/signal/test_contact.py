@@ -78,7 +78,9 @@ def test_only_the_normal_axis_of_several_counts():
     tares = np.stack([np.full((4, 4), 77.0), np.zeros((4, 4)), tare], axis=-1)
     assert centre(three, tares, 5.0) == centre(flat, tare, 5.0)
     means = three.mean(axis=0), flat.mean(axis=0)
-    moved = [displacement(m, t, 5.0, MIDDLE) for m, t in zip(means, (tares, tare), strict=True)]
+    moved = [
+        displacement(m, t, 5.0, MIDDLE).text for m, t in zip(means, (tares, tare), strict=True)
+    ]
     assert moved[0] == moved[1] != ""
 
 
@@ -87,7 +89,7 @@ def test_without_contact_there_is_no_centre():
     displacement."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
-        assert displacement(counts(load).mean(axis=0), TARE, 5.0, MIDDLE) == ""
+        assert displacement(counts(load).mean(axis=0), TARE, 5.0, MIDDLE).text == ""
     one = np.where(np.indices((4, 4)).sum(0) == 6, INF, patch(1.5, 1.5))
     assert centre(counts(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
 
@@ -135,7 +137,7 @@ def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: t
             skin.LEVEL_BLIND,
         )[:200]
         found.append(centre(window, TARE, 5.4)[axis])
-        text = displacement(window.mean(axis=0), TARE, 5.4, MIDDLE)
+        text = displacement(window.mean(axis=0), TARE, 5.4, MIDDLE).text
         assert text == "" if mm == 0 else text.endswith(f"mm too far towards {towards[mm > 0]}")
     assert (np.diff(found) < 0).all()
 

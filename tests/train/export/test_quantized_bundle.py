@@ -524,12 +524,14 @@ def test_the_command_exports_what_fit_wrote(
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
     lines = capsys.readouterr().out.splitlines()
-    lines = [line for line in lines if not line.startswith("  ")]  # each fault of broken taxels
+    lines = [line for line in lines if not line.startswith("  ")]  # each fault, each alteration
     assert [line.split(":")[0] for line in lines] == [
         "held-out recording, as the box answers",
         "held-out recording, network alone",
         "held-out recording, by recording",
         "broken taxels",
+        "altered sweeps",
+        "a finger that rests",
         "bundle",
         "to score it on sweeps that the fit has not seen",
         "for a page about it and its limits",

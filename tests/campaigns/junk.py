@@ -1,0 +1,398 @@
+"""Counts the answers of the packaged bundle to sweeps that no one can name.
+
+`python -m tests.campaigns junk` prints a row for each kind of sweep: how many the box names with
+status ok, and how many of these wrongly, for whole sweeps and with early answers. A sweep of two
+materials, or of none, is wrong under any label. Takes some minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from appliance.bundle import bundle
+from appliance.core.types import Frames, Status, Sweep, Verdict
+from appliance.inference.classifier import Classifier
+from appliance.inference.early_exit import EarlyExit
+from appliance.sim import skin
+from appliance.sim.rig import VirtualClock
+
+Counts = NDArray[np.float64]
+N, RATE = skin.FORMAT.window, skin.FORMAT.rate_hz
+TIMES = np.arange(N)[:, None, None]
+SECONDS = TIMES / RATE
+EACH, STEPS = 200, 10
+
+
+@dataclass(frozen=True)
+class SweepDraw:
+    """Draws sweeps of the materials at trained placements in a world."""
+
+    world: skin.World
+    rng: Generator
+
+    def place(self) -> skin.Placement:
+        """A random trained placement."""
+        places = skin.placements("T-REAL", int(self.rng.integers(1000, 2000)))
+        return places[self.rng.integers(len(places))]
+
+    def slide(self, material: str, **changed: float) -> Counts:
+        """A window of a slide. changed: parameters of the world."""
+        world = replace(self.world, **changed)  # type: ignore[arg-type]
+        return skin.window(material, self.place(), self.rng, world).astype(float)
+
+    def touch(self, material: str, rest: float, slid: float, dx_mm: float = 0.0) -> Counts:
+        """A window of a finger that rests, slides and rests again; shares of the window."""
+        place, s = self.place(), N / RATE
+        place = replace(place, dx_mm=place.dx_mm + dx_mm)
+        parts = {"rest_s": rest * s, "slide_s": slid * s, "after_s": (1 - rest - slid) * s + 0.1}
+        return skin.sweep(material, place, self.rng, self.world, **parts)[:N].astype(float)
+
+    def other(self, material: str) -> str:
+        """Another material."""
+        return str(self.rng.choice([m for m in skin.MATERIALS if m != material]))
+
+
+Make = Callable[[SweepDraw, str], Counts]
+"""Raw counts [T, R, C], not yet rounded, of a scene and a material."""
+
+
+def rests(scene: SweepDraw, material: str) -> Counts:
+    """A window of a finger that rests."""
+    return scene.touch(material, 1.0, 0.0)
+
+
+def level(scene: SweepDraw, material: str) -> Counts:
+    """The mean load of a slide [1, R, C]."""
+    return scene.slide(material).mean(axis=0, keepdims=True)
+
+
+def strength(x: Counts) -> float:
+    """The deviation of counts [T, R, C] within the window."""
+    return float(np.sqrt(x.var(axis=0).mean()))
+
+
+def added(base: Make, wave: Callable[[SweepDraw], Counts], share: float) -> Make:
+    """`base` and a wave of `share` deviations of a slide."""
+
+    def make(scene: SweepDraw, material: str) -> Counts:
+        size = share * strength(scene.slide(material))
+        return base(scene, material) + size * wave(scene)
+
+    return make
+
+
+def sine(hz: float) -> Callable[[SweepDraw], Counts]:
+    """A sine on all taxels, of deviation 1."""
+
+    def wave(scene: SweepDraw) -> Counts:
+        turns = hz * SECONDS + scene.rng.random()
+        return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * turns))
+
+    return wave
+
+
+def chirp(scene: SweepDraw) -> Counts:
+    """A sine that rises from 5 to 300 Hz, of deviation 1."""
+    turns = 5 * SECONDS + (300 - 5) / (2 * N / RATE) * SECONDS**2
+    return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * turns))
+
+
+def square(scene: SweepDraw) -> Counts:
+    """A square wave of 10 Hz."""
+    return np.sign(np.sin(2 * np.pi * (10 * SECONDS + scene.rng.random())))
+
+
+def white(scene: SweepDraw) -> Counts:
+    """White noise of each taxel."""
+    return scene.rng.standard_normal((N, 4, 4))
+
+
+def common_white(scene: SweepDraw) -> Counts:
+    """White noise that all taxels share."""
+    return scene.rng.standard_normal((N, 1, 1))
+
+
+def coloured(power: float) -> Callable[[SweepDraw], Counts]:
+    """Noise that all taxels share, of deviation 1, whose power falls with the frequency."""
+
+    def wave(scene: SweepDraw) -> Counts:
+        bins = np.fft.rfft(scene.rng.standard_normal(N))
+        bins[1:] /= np.arange(1, len(bins)) ** (power / 2)
+        bins[0] = 0
+        found = np.fft.irfft(bins, N)
+        return np.asarray((found / found.std())[:, None, None])
+
+    return wave
+
+
+def clicks(scene: SweepDraw) -> Counts:
+    """Short pulses at random times, of deviation 1."""
+    found = (scene.rng.random((N, 1, 1)) < 0.01) * 1.0
+    return found / max(found.std(), 1e-9)
+
+
+def taps(scene: SweepDraw, material: str) -> Counts:
+    """A finger that taps five times a second."""
+    load = np.maximum(np.sin(2 * np.pi * (5 * SECONDS + scene.rng.random())), 0)
+    return rests(scene, material) * load
+
+
+def rocks(scene: SweepDraw, material: str) -> Counts:
+    """A finger that rests and rocks to and fro once a second."""
+    lean = 0.3 * np.sin(2 * np.pi * (SECONDS + scene.rng.random()))
+    return rests(scene, material) * (1 + lean * np.linspace(-1, 1, 4)[:, None])
+
+
+def presses(scene: SweepDraw, material: str) -> Counts:
+    """A finger that rests and presses more and more."""
+    return rests(scene, material) * np.linspace(0.4, 1.2, N)[:, None, None]
+
+
+def lifted(first: float, last: float) -> Make:
+    """A slide that is lifted between two shares of the window."""
+
+    def make(scene: SweepDraw, material: str) -> Counts:
+        x, idle = scene.slide(material), skin.idle(N, scene.rng, scene.world)
+        off = (first * N <= TIMES) & (last * N > TIMES)
+        return np.where(off, idle, x)
+
+    return make
+
+
+def flutters(scene: SweepDraw, material: str) -> Counts:
+    """A slide that is lifted half of each fifth of a second."""
+    idle = skin.idle(N, scene.rng, scene.world)
+    return np.where(SECONDS % 0.2 < 0.1, scene.slide(material), idle)
+
+
+def part(rest: float, slid: float) -> Make:
+    """A finger that slides in a part of the window and rests in the others."""
+    return lambda scene, material: scene.touch(material, rest, slid)
+
+
+def pauses(scene: SweepDraw, material: str) -> Counts:
+    """A slide that rests between a quarter and three quarters of the window."""
+    x, still = scene.slide(material), rests(scene, material)
+    return np.where((N // 4 <= TIMES) & (3 * N // 4 > TIMES), still, x)
+
+
+def gained(gain: float) -> Make:
+    """A slide with another gain of all taxels."""
+    return lambda scene, material: gain * scene.slide(material)
+
+
+def shaken(share: float) -> Make:
+    """A slide with a share of its vibration, around the same load."""
+
+    def make(scene: SweepDraw, material: str) -> Counts:
+        x = scene.slide(material)
+        middle = x.mean(axis=0, keepdims=True)
+        return middle + share * (x - middle)
+
+    return make
+
+
+def at_speed(speed: float) -> Make:
+    """A slide at another speed."""
+    return lambda scene, material: scene.slide(material, speed=speed)
+
+
+def rows_off(rows: float) -> Make:
+    """A slide with the skin displaced by some rows."""
+    return lambda scene, material: scene.touch(material, 0.0, 1.0, rows * skin.PITCH_MM)
+
+
+def permuted(scene: SweepDraw, material: str) -> Counts:
+    """A slide whose taxels are confused."""
+    order = scene.rng.permutation(16)
+    return scene.slide(material).reshape(N, 16)[:, order].reshape(N, 4, 4)
+
+
+def mosaic(scene: SweepDraw, material: str) -> Counts:
+    """Taxels of sixteen slides of different materials."""
+    names = scene.rng.permutation(np.tile(skin.MATERIALS, 3))[:16]
+    parts = [scene.slide(str(name)).reshape(N, 16)[:, i] for i, name in enumerate(names)]
+    return np.stack(parts, axis=1).reshape(N, 4, 4)
+
+
+def halves(scene: SweepDraw, material: str) -> Counts:
+    """Half of a slide over a material, half of a slide over another one."""
+    return np.where(TIMES * 2 < N, scene.slide(material), scene.slide(scene.other(material)))
+
+
+def mixed(scene: SweepDraw, material: str) -> Counts:
+    """The mean of two slides over different materials."""
+    return (scene.slide(material) + scene.slide(scene.other(material))) / 2
+
+
+def interleaved(scene: SweepDraw, material: str) -> Counts:
+    """Frames of two slides over different materials in turn."""
+    return np.where(TIMES % 2, scene.slide(material), scene.slide(scene.other(material)))
+
+
+def shuffled(scene: SweepDraw, material: str) -> Counts:
+    """The frames of a slide in random order."""
+    return scene.slide(material)[scene.rng.permutation(N)]
+
+
+def held(scene: SweepDraw, material: str) -> Counts:
+    """A slide of which each tenth frame is repeated ten times."""
+    return scene.slide(material)[::10].repeat(10, axis=0)
+
+
+def phases(scene: SweepDraw, material: str) -> Counts:
+    """A slide whose taxels keep their spectra and get random phases."""
+    bins = np.fft.rfft(scene.slide(material), axis=0)
+    turns = np.exp(2j * np.pi * scene.rng.random(bins.shape))
+    turns[0] = 1
+    return np.fft.irfft(bins * turns, N, axis=0)
+
+
+def one_taxel(scene: SweepDraw, material: str) -> Counts:
+    """A slide that loads one taxel."""
+    x, keep = skin.idle(N, scene.rng, scene.world).astype(float), scene.rng.integers(4, size=2)
+    x[:, keep[0], keep[1]] = scene.slide(material)[:, keep[0], keep[1]]
+    return x
+
+
+def random_bytes(scene: SweepDraw, material: str) -> Counts:
+    """Random bytes."""
+    return scene.rng.integers(0, 256, (N, 4, 4)).astype(float)
+
+
+def random_frames(scene: SweepDraw, material: str) -> Counts:
+    """Random bytes, the same on all taxels."""
+    return scene.rng.integers(0, 256, (N, 1, 1)) * np.ones((1, 4, 4))
+
+
+def walks(scene: SweepDraw, material: str) -> Counts:
+    """A random walk of each taxel around the load of a slide."""
+    steps = scene.rng.standard_normal((N, 4, 4)).cumsum(axis=0)
+    return level(scene, material) + steps / 4
+
+
+KINDS: dict[str, tuple[Make, bool]] = {
+    "finger rests": (rests, False),
+    "rests, skin two rows off": (lambda s, m: s.touch(m, 1.0, 0.0, 8.0), False),
+    "rests, 50 Hz hum": (added(rests, sine(50), 0.5), False),
+    "rests, 50 Hz hum, strong": (added(rests, sine(50), 2.0), False),
+    "rests, noise": (added(rests, white, 0.5), False),
+    "rests, common noise": (added(rests, common_white, 0.5), False),
+    "rests, common pink noise": (added(rests, coloured(1.0), 1.0), False),
+    "rests, clicks": (added(rests, clicks, 0.5), False),
+    "rests and taps": (taps, False),
+    "rests and rocks": (rocks, False),
+    "rests and presses more": (presses, False),
+    "load and white noise": (added(level, white, 1.0), False),
+    "load and loud white noise": (added(level, white, 3.0), False),
+    "load and common noise": (added(level, common_white, 1.0), False),
+    "load and pink noise": (added(level, coloured(1.0), 1.0), False),
+    "load and brown noise": (added(level, coloured(2.0), 1.0), False),
+    "load and a 20 Hz sine": (added(level, sine(20), 1.0), False),
+    "load and a 50 Hz sine": (added(level, sine(50), 1.0), False),
+    "load and a 100 Hz sine": (added(level, sine(100), 1.0), False),
+    "load and a chirp": (added(level, chirp, 1.0), False),
+    "load and a square wave": (added(level, square, 1.0), False),
+    "load and clicks": (added(level, clicks, 1.0), False),
+    "random bytes": (random_bytes, False),
+    "random bytes, all taxels alike": (random_frames, False),
+    "random walk": (walks, False),
+    "first half lifted": (lifted(0, 0.5), True),
+    "second half lifted": (lifted(0.5, 1), True),
+    "middle lifted": (lifted(0.25, 0.75), True),
+    "lifted ten times": (flutters, True),
+    "slides the first half": (part(0, 0.5), True),
+    "slides the second half": (part(0.5, 0.5), True),
+    "slides the first fifth": (part(0, 0.2), True),
+    "slides the last fifth": (part(0.8, 0.2), True),
+    "slides, rests, slides": (pauses, True),
+    "gain x 0.2": (gained(0.2), True),
+    "gain x 0.33": (gained(1 / 3), True),
+    "gain x 3": (gained(3.0), True),
+    "vibration x 0.1": (shaken(0.1), True),
+    "vibration x 0.33": (shaken(1 / 3), True),
+    "vibration x 3": (shaken(3.0), True),
+    "speed x 0.33": (at_speed(1 / 3), True),
+    "speed x 3": (at_speed(3.0), True),
+    "one row off": (rows_off(1), True),
+    "two rows off": (rows_off(2), True),
+    "two rows off, backwards": (rows_off(-2), True),
+    "taxels confused": (permuted, True),
+    "sixteen slides, a taxel of each": (mosaic, False),
+    "two halves": (halves, False),
+    "mean of two slides": (mixed, False),
+    "two slides in turn": (interleaved, False),
+    "frames shuffled": (shuffled, True),
+    "each tenth frame held": (held, True),
+    "random phases": (phases, True),
+    "one taxel loaded": (one_taxel, True),
+}
+"""By name: how to draw a sweep, and whether its material is in it, so that its name is right."""
+
+
+def window(name: str, world: skin.World, number: int) -> tuple[NDArray[np.uint8], str]:
+    """The raw counts [T, R, C] of a sweep of a kind, and the label that is right, "" for none."""
+    scene = SweepDraw(world, np.random.default_rng([number, *name.encode()]))
+    make, named = KINDS[name]
+    material = skin.MATERIALS[number % len(skin.MATERIALS)]
+    counts = np.clip(np.rint(make(scene, material) * np.ones((N, 4, 4))), 0, 255)
+    return counts.astype(np.uint8), material * named
+
+
+def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) -> Verdict:
+    """The first answer to a sweep whose frames arrive in tenths."""
+    n, t_ns = len(taxels), (np.arange(N) * skin.FORMAT.period_ns).astype(np.int64)
+    frames = Frames(t_ns, np.arange(n), taxels)
+    whole = Sweep(1, 0, int(t_ns[-1]), Status.OK, frames)
+    for step in range(1, STEPS if early else 1):
+        seen = slice(0, step * n // STEPS)
+        part = Frames(t_ns[seen], frames.seq[seen], taxels[seen])
+        sweep = replace(whole, frames=part, share=step / STEPS)
+        if early and (verdict := early(sweep)):
+            return verdict
+    return box(whole)
+
+
+def main() -> None:
+    """Print the counts of each kind, and of all."""
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns junk", description=__doc__)
+    parser.add_argument("--each", type=int, default=EACH, help="sweeps of a kind (default: 200)")
+    parser.add_argument("--bundle", type=Path, default=bundle.DEFAULT)
+    parser.add_argument("--world", choices=skin.WORLDS, default="level-blind")
+    options = parser.parse_args()
+    box = Classifier(bundle.load(options.bundle), VirtualClock())
+    early = EarlyExit(box) if box.bundle.manifest.early else None
+    total = Counter[str]()
+    print(
+        f"{'of ' + str(options.each):32} whole: ok, wrong; early: ok, wrong; most frequent status"
+    )
+    for name in KINDS:
+        found, statuses = Counter[str](), Counter[str]()
+        for number in range(options.each):
+            taxels, right = window(name, skin.WORLDS[options.world], number)
+            for how, by in (("whole", None), ("early", early)):
+                verdict = answer(box, by, taxels)
+                ok = verdict.status is Status.OK
+                found.update({how: ok, f"{how} wrong": ok and verdict.label != right})
+                statuses.update([str(verdict.status)] if by is None else [])
+        total += found
+        usual = ", ".join(f"{status} {n}" for status, n in statuses.most_common(2))
+        print(_row(name, found), usual, flush=True)
+    print(_row(f"all {len(KINDS)} kinds", total))
+
+
+def _row(name: str, found: Counter[str]) -> str:
+    keys = "whole", "whole wrong", "early", "early wrong"
+    return f"{name:32} {' '.join(f'{found[key]:5}' for key in keys)} "
+
+
+if __name__ == "__main__":
+    main()
