@@ -92,8 +92,9 @@ class Classifier(Observer):
 
     fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 means the bundle's
     thresholds.unsure. max_sweeps, conflict, object_s: as in ObjectRule; by default only NEW OBJECT
-    ends an object. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared
-    its inputs and outputs with the manifest.
+    ends an object. slides: whether answers have the speed of the slide; without it they take less
+    time. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared its inputs
+    and outputs with the manifest.
 
     taxels: the broken taxels. As an observer of the loop it searches the stream for them; without a
     stream they are found in each window alone.
@@ -108,6 +109,7 @@ class Classifier(Observer):
         max_sweeps: int = 0,
         conflict: str = "fuse",
         object_s: float = 0.0,
+        slides: bool = True,
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
@@ -121,7 +123,7 @@ class Classifier(Observer):
             ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
         )
         rule, place = bundle.manifest.displacement, bundle.manifest.contact
-        self._slide = SlideMeter(bundle.format, place.pitch_mm if place else None)
+        self._slide = SlideMeter(bundle.format, place.pitch_mm if place and slides else None)
         self._displaced_means = (
             ClassDistances(classes, known, bundle.manifest.labels, rule)
             if rule and known and classes

@@ -67,7 +67,9 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
     trial = replace(limits, taxels=rows * cols - 1, row=True, column=True)
     test = EvaluationSweeps.of(held_out, JUDGED, seed)
     box = Classifier(
-        replace(bundle, manifest=replace(bundle.manifest, bridging=trial)), SystemClock()
+        replace(bundle, manifest=replace(bundle.manifest, bridging=trial)),
+        SystemClock(),
+        slides=False,
     )
     sample = EvaluationSweeps.of(test.sweeps, SEARCHED, seed)
     bench = _Bench(box, test, sample, seed)

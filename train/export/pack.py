@@ -402,7 +402,7 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
 
     Raises ExportRefused if the box gives another label than the graph, or refuses too many sweeps.
     """
-    box = Classifier(bundle.load(folder), SystemClock())
+    box = Classifier(bundle.load(folder), SystemClock(), slides=False)
     box.self_test()
     answers = bundle_score.answers_to(box, held_out, logits)
     refused, unknown = answers.labels == REFUSED, answers.labels == UNKNOWN

@@ -283,7 +283,7 @@ def _box_under_stress(
 ) -> dict[str, Any]:
     """The answers of a bundle under corruption. Raises FormatError if it cannot answer these
     sweeps; for the packaged one (None) the curves are then missing."""
-    box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock())
+    box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock(), slides=False)
     try:
         curves = bundle_stress.under_corruptions(box, test, seeds, log)
     except FormatError:
