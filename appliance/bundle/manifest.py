@@ -183,6 +183,7 @@ class Manifest:
             )
         _check_age(self)
         _check_files(self.files)
+        _check_labels(self.labels)
         _check_parts(self)
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
@@ -200,7 +201,6 @@ class Manifest:
                 "bundle again"
             )
         version(self.runtime)
-        _check_labels(self.labels)
 
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""

@@ -47,6 +47,7 @@ CHAPTERS = {
     "Reference": ["docs/reference/*", "firmware_config/PROTOCOL", "firmware_config/*/README"],
     "Explanation": [
         "docs/explanation/*",
+        "docs/recipe",
         "docs/architecture",
         "docs/security",
         "docs/skins",

@@ -137,7 +137,7 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    assert json.loads(again).keys() | {"unloaded", "speeds", "bridging"} == {
+    assert json.loads(again).keys() | {"unloaded", "speeds", "bridging", "sliding"} == {
         FILE_KEYS.get(field.name, field.name) for field in fields(read)
     }
     assert bundle.Manifest.parse(again).json() == again, (

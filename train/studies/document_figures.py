@@ -85,7 +85,7 @@ PICTURES = (
         lambda results: plots.matrix(results, count="recording"),
     ),
 )
-HEADED = {ALIGNMENT: "alignment", FABRICS: "fabrics"}
+HEADED = {ALIGNMENT: "alignment", FABRICS: "fabrics", RECIPE: "recipe"}
 """Pages about one file of results, which have its provenance behind their title."""
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from train.reports.formatting import amount
-from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, MEDIUM, SMALL, WIDTH, to_svg, write
+from train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, WIDTH, to_svg, write
 
 Json = Mapping[str, Any]
 VIEWS = {
@@ -35,14 +35,14 @@ VIEWS = {
         "unless held-out sweeps are named better without it",
     ),
     "relations": (
-        "deviations of taxels and correlations of their pairs, over up to six lags",
+        "deviations of taxels and correlations of their pairs, at up to seven time scales",
         "how taxels move together: a new force, speed or direction",
         "only if held-out groups show a gain, and several taxels exist",
     ),
     "loads": (
-        "mean count of each taxel",
+        "mean count of each taxel; the change of all in the first and the last tenth",
         "hardness, which the level shows",
-        "only if held-out groups show a gain; never with means removed",
+        "only if held-out groups show a gain",
     ),
     "stages": (
         "log mean responses of three trained convolutions",
@@ -80,18 +80,19 @@ def draw(results: Json) -> str:
     page.axis("off")
     costs = {view["view"]: view["us"] for view in results["views"]}
     middle, height = HIGH / 2, 0.34
-    _box(page, 0.75, middle, 1.3, 0.8, "raw counts\n[T, R, C]", BLACK)
+    _box(page, 0.8, middle, 1.5, 0.8, "raw counts\n[T, R, C]", BLACK)
     step = (HIGH - 0.2) / len(VIEWS)
     for i, name in enumerate(VIEWS):
         y = HIGH - 0.1 - (i + 0.5) * step
-        _arrow(page, (1.4, middle), (2.25, y))
+        _arrow(page, (1.55, middle), (2.25, y))
         _box(page, 3.15, y, 1.8, height, name, ACCENT)
-        write(page, 4.15, y, amount(costs[name], "µs"), GREY, SMALL, ha="left")
-        _arrow(page, (4.85, y), (5.6, middle))
-    _box(page, 6.5, middle, 1.8, 0.8, "discriminants\nin closed form", BLACK)
-    _arrow(page, (7.4, middle), (8.2, middle))
-    _box(page, 9.05, middle, 1.7, 0.8, "sum of logits\nprobability", BLACK)
-    write(page, 6.5, middle - 0.75, "held-out groups choose\nthe views of each", GREY, SMALL)
+        write(page, 4.12, y, amount(costs[name], "µs"), GREY, SMALL - 0.5, ha="left")
+        _arrow(page, (5.08, y), (5.45, middle))
+    _box(page, 6.4, middle, 1.9, 0.8, "discriminants\nin closed form", BLACK)
+    _arrow(page, (7.35, middle), (7.95, middle))
+    _box(page, 8.9, middle, 1.9, 0.8, "sum of logits,\nprobability", BLACK)
+    for line, text in enumerate(("held-out groups choose", "the views of each")):
+        write(page, 6.75, middle - 0.75 - 0.25 * line, text, GREY, SMALL - 0.5)
     return to_svg(figure, "The views of the recipe between raw counts and the answer")
 
 
@@ -107,7 +108,9 @@ def _box(page: Axes, x: float, y: float, width: float, height: float, text: str,
             lw=1,
         )
     )
-    write(page, x, y, text, BLACK, MEDIUM)
+    lines = text.split("\n")
+    for line, words in enumerate(lines):
+        write(page, x, y + 0.13 * (len(lines) - 1) - 0.26 * line, words, BLACK, SMALL - 0.5)
 
 
 def _arrow(page: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:

@@ -203,7 +203,7 @@ def test_altered_and_missing_files_are_named(tmp_path: Path, name: str):
             },
             "`place` without `thresholds.contact`",
         ),
-        ({"labels": ["a", "b"]}, "logits"),
+        ({"labels": ["a", "b"], "sliding": None}, "logits"),
     ],
 )
 def test_broken_manifests_are_named(tmp_path: Path, changes: dict, hint: str):

@@ -85,7 +85,7 @@ def test_the_table_has_a_row_for_each_view_with_its_sets():
 def test_the_picture_has_every_view_with_its_time():
     """From raw counts to the sum of logits."""
     svg = recipe_page.draw(RESULTS)
-    for text in (*recipe_page.VIEWS, "23.5 µs", "raw counts", "sum of logits"):
+    for text in (*recipe_page.VIEWS, "23.5 µs", "raw counts", "sum of logits,"):
         assert f">{text}</text>" in svg, text
 
 
