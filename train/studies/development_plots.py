@@ -39,7 +39,14 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
     {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 4},
     {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5)), "marker": "o", "markersize": 3},
 )
-RING: Mapping[str, Any] = {"marker": "o", "markersize": 11, "mfc": "none", "color": ACCENT}
+RING: Mapping[str, Any] = {
+    "marker": "o",
+    "markersize": 13,
+    "markerfacecolor": "none",
+    "markeredgewidth": 1.3,
+    "color": ACCENT,
+    "clip_on": False,
+}
 THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
 MARKERS = {"int8": "o", "float": "s"}
 HEAD, HEIGHT, FOOT = 0.56, 2.2, 0.42
@@ -149,12 +156,7 @@ def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
         look: dict[str, Any] = {"markeredgecolor": shade, "markerfacecolor": face, "clip_on": False}
         axes.plot(spot.ms, y, mark, markersize=5.5, zorder=4, **look)
         if spot.method == PACKAGED and not spot.form:
-            ring: dict[str, Any] = {
-                "markeredgecolor": ACCENT,
-                "markerfacecolor": "none",
-                "clip_on": False,
-            }
-            axes.plot(spot.ms, spot.mean, "o", markersize=13, markeredgewidth=1.3, **ring)
+            axes.plot(spot.ms, y, **RING)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))
     for spot in order:
         text = "" if spot.method in named or spot.mean < bottom else _label(spot)
