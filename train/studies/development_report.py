@@ -295,6 +295,7 @@ def _costs(figures: Json, table: Mapping[str, Accuracies], names: Sequence[str])
     times = _times(figures)
     return {
         "times": times,
+        "box": times.get("box"),
         "machine": machine(figures),
         "relative": relative_times(times["entries"], names),
         "costs": [_cost(one) for one in times["entries"]],

@@ -12,12 +12,13 @@ from xml.etree import ElementTree
 
 import pytest
 
-from appliance.core.errors import FormatError
+from appliance.core.errors import BundleError, FormatError
 from tests.factories import rendered
 from tests.factories.development_data import SERIES, case, entry, figures, timed, times
 from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
 from tests.factories.sweep_sets import tones
+from train.data import sets
 from train.evaluation.evaluate import Where
 from train.metrics.score import Score
 from train.models import methods
@@ -28,6 +29,7 @@ from train.studies import (
     development_report,
     development_times,
     method_names,
+    precisions,
     ranks,
 )
 from train.studies.command import main
@@ -68,6 +70,7 @@ def test_the_page_shows_every_figure():
         "QUANT 1.50",
         "QUANT float onnx 22 ms 44 ms",
         "a processor, one thread, all methods in turns in one process",
+        "with that, the packaged bundle takes 0.7 ms",
         "DS-CNN: one: a force it never felt; two: a force it never felt",
     )
     for fact in facts:
@@ -538,13 +541,13 @@ def test_networks_of_peers_are_trained_briefly_for_their_time():
         development_times._briefly(name, methods.FULL_EFFORT).effort
         for name in ("ds-cnn", "palpate-bands")
     )
-    assert (brief, whole) == ("16 iterations", methods.every()["palpate-bands"].effort)
+    assert (brief, whole) == ("200 iterations", methods.every()["palpate-bands"].effort)
 
 
 @pytest.mark.slow
 @pytest.mark.thorough  # trains and times every method
 def test_all_methods_are_timed_in_one_run(tmp_path: Path):
-    """The box's classifier times bundles, also in int8; aeon times its methods.
+    """Graphs are timed also in int8; aeon times its methods.
 
     A method that cannot take the sweeps is left out with a reason.
     """
@@ -574,6 +577,29 @@ def test_all_methods_are_timed_in_one_run(tmp_path: Path):
     assert all(0 < one["ms_p50"] <= one["ms_p99"] for one in found["entries"])
     assert list(found["left_out"]) == ["spectrogram-svm"]
     assert found["format"] == str(tones().format)
+
+
+def test_a_model_that_the_box_refuses_is_timed_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """It has times and counts, no memory, and the reason. The packaged bundle is timed only with
+    sweeps of its own format.
+    """
+
+    def refuse(*given: Any) -> None:
+        raise BundleError("it needs too much memory")
+
+    monkeypatch.setattr(precisions, "packed", refuse)
+    found = development_times.measured(["L-gauss"], tones(), 1, tmp_path, lambda line: None)
+    (one,) = found["entries"]
+    assert (one["runs_on_box"], one["refused"]) == (False, "it needs too much memory")
+    assert 0 < one["ms_p50"] <= one["ms_p99"]
+    assert one["weights"] > 0 < one["file_kb"]
+    assert "rss_mb" not in one
+    assert found["box"] == {}
+    skin_sweeps = sets.load("sim:T-REAL/level-blind:1001:1").select(["position<=1"])
+    found = development_times.measured([], skin_sweeps, 1, tmp_path, lambda line: None, rounds=1)
+    assert 0 < found["box"]["ms_p50"] <= found["box"]["ms_p99"]
 
 
 @pytest.mark.parametrize(
