@@ -55,8 +55,8 @@ TOUCHED = (0.1, 0.2, 0.5, 1, 2, 4)
 """Ticks of seconds of touch."""
 STEPS = 40
 """Points between two marks of a line that keep names away from it."""
-BELOW = 0.35
-"""The axis ends this far below the least accurate peer, as a share of the range above it."""
+SPAN = 0.22
+"""Longest axis of accuracy. What is less accurate is drawn at its end and named below."""
 LETTERS = 74
 """Most letters of a line of small text."""
 KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ╷ not run here"
@@ -136,11 +136,9 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
 
 
 def _ends(panel: ChartPanel) -> tuple[float, float]:
-    """Lowest and highest accuracy on the axis. What is far below all peers is drawn at its end."""
+    """Lowest and highest accuracy on the axis."""
     means = [spot.mean for spot in panel.spots]
-    peers = [spot.mean for spot in panel.spots if spot.method not in OURS]
-    high, lowest = max(means), min(peers or means)
-    return max(min(means), lowest - BELOW * (high - lowest)), high
+    return max(min(means), max(means) - SPAN), max(means)
 
 
 def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
