@@ -90,7 +90,7 @@ def _below(panels: Sequence[ChartPanel]) -> str:
         bottom, _ = _ends(panel)
         those = [_label(spot) for spot in panel.spots if spot.mean < bottom and not spot.form]
         if those:
-            parts.append(f"{panel.kind}: {', '.join(those)}")
+            parts.append(f"{panel.kind}: {' · '.join(those)}")
     return f"▾ less than the axis shows ({'; '.join(parts)})" if parts else ""
 
 
@@ -105,7 +105,7 @@ def _gaps(panels: Sequence[ChartPanel]) -> str:
         count = len(panel.cases)
         those = [f"{short_name(name)} {count - n}" for name, n in panel.lacking().items()]
         if those:
-            parts.append(f"{panel.kind}: {', '.join(those)} of {count}")
+            parts.append(f"{panel.kind}: {' · '.join(those)} of {count}")
     return f"Hollow: not run in all tests ({'; '.join(parts)})" if parts else ""
 
 
