@@ -39,7 +39,14 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
     {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 4},
     {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5)), "marker": "o", "markersize": 3},
 )
-RING: Mapping[str, Any] = {"marker": "o", "markersize": 11, "mfc": "none", "color": ACCENT}
+RING: Mapping[str, Any] = {
+    "marker": "o",
+    "markersize": 13,
+    "markerfacecolor": "none",
+    "markeredgewidth": 1.3,
+    "color": ACCENT,
+    "clip_on": False,
+}
 THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
 MARKERS = {"int8": "o", "float": "s"}
 HEAD, HEIGHT, FOOT = 0.56, 2.2, 0.42
@@ -48,8 +55,8 @@ TOUCHED = (0.1, 0.2, 0.5, 1, 2, 4)
 """Ticks of seconds of touch."""
 STEPS = 40
 """Points between two marks of a line that keep names away from it."""
-BELOW = 0.35
-"""The axis ends this far below the least accurate peer, as a share of the range above it."""
+SPAN = 0.22
+"""Longest axis of accuracy. What is less accurate is drawn at its end and named below."""
 LETTERS = 74
 """Most letters of a line of small text."""
 KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ╷ not run here"
@@ -83,7 +90,7 @@ def _below(panels: Sequence[ChartPanel]) -> str:
         bottom, _ = _ends(panel)
         those = [_label(spot) for spot in panel.spots if spot.mean < bottom and not spot.form]
         if those:
-            parts.append(f"{panel.kind}: {', '.join(those)}")
+            parts.append(f"{panel.kind}: {' · '.join(those)}")
     return f"▾ less than the axis shows ({'; '.join(parts)})" if parts else ""
 
 
@@ -98,7 +105,7 @@ def _gaps(panels: Sequence[ChartPanel]) -> str:
         count = len(panel.cases)
         those = [f"{short_name(name)} {count - n}" for name, n in panel.lacking().items()]
         if those:
-            parts.append(f"{panel.kind}: {', '.join(those)} of {count}")
+            parts.append(f"{panel.kind}: {' · '.join(those)} of {count}")
     return f"Hollow: not run in all tests ({'; '.join(parts)})" if parts else ""
 
 
@@ -129,11 +136,9 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
 
 
 def _ends(panel: ChartPanel) -> tuple[float, float]:
-    """Lowest and highest accuracy on the axis. What is far below all peers is drawn at its end."""
+    """Lowest and highest accuracy on the axis."""
     means = [spot.mean for spot in panel.spots]
-    peers = [spot.mean for spot in panel.spots if spot.method not in OURS]
-    high, lowest = max(means), min(peers or means)
-    return max(min(means), lowest - BELOW * (high - lowest)), high
+    return max(min(means), max(means) - SPAN), max(means)
 
 
 def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
@@ -149,12 +154,7 @@ def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
         look: dict[str, Any] = {"markeredgecolor": shade, "markerfacecolor": face, "clip_on": False}
         axes.plot(spot.ms, y, mark, markersize=5.5, zorder=4, **look)
         if spot.method == PACKAGED and not spot.form:
-            ring: dict[str, Any] = {
-                "markeredgecolor": ACCENT,
-                "markerfacecolor": "none",
-                "clip_on": False,
-            }
-            axes.plot(spot.ms, spot.mean, "o", markersize=13, markeredgewidth=1.3, **ring)
+            axes.plot(spot.ms, y, **RING)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))
     for spot in order:
         text = "" if spot.method in named or spot.mean < bottom else _label(spot)

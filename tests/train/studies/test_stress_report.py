@@ -139,7 +139,8 @@ def test_the_page_holds_the_figures():
 
     A refused method has its reason.
     """
-    page, pictures = stress_report.render(stress_data.figures())
+    earlier = [{"methods": ["H-svm"], "commit": "0ld"}]
+    page, pictures = stress_report.render(stress_data.figures() | {"earlier": earlier})
     reader = PageReader(page)
     assert (reader.wrong, reader.open) == ([], [])
     assert not re.search(r"[{}]|\bNone\b|\bnan\b|Undefined", reader.text)
@@ -157,6 +158,7 @@ def test_the_page_holds_the_figures():
         "bundle six 3, 8933e0d5",
         "silent 6 answer no-contact",
         "Commit c0ffee, abacus, 2 cores",
+        "Of an earlier run, commit 0ld: H-svm.",
     ):
         assert fact in reader.text, fact
 
