@@ -26,6 +26,7 @@ from train.studies import (
     overview_plot,
     paper_report,
     plots,
+    recipe_page,
     stress_report,
     uncertainty_report,
 )
@@ -73,6 +74,7 @@ PICTURES: dict[str, Callable[[], Any]] = {
         {"labels": ["a", "b"], "answers": {"a": {"a": 3, "b": 1}}}
     ),
     "overview": lambda: overview_plot.draw("paper"),
+    "recipe": lambda: recipe_page.draw(committed("recipe")),
 }
 
 
