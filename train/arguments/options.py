@@ -47,6 +47,16 @@ def add_set(command: argparse.ArgumentParser, usual: str = "", required: bool = 
     add_rename(command)
 
 
+def add_seed(command: argparse.ArgumentParser) -> None:
+    """Add --seed."""
+    command.add_argument(
+        "--seed",
+        type=numbers.whole("--seed", 0),
+        required=True,
+        help="seed of the training, and of simulated sets without one",
+    )
+
+
 def add_rename(command: argparse.ArgumentParser) -> None:
     """Add --rename."""
     command.add_argument(

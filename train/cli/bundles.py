@@ -70,12 +70,7 @@ def _add_bundles(add: Add) -> None:
     pack_command.add_argument(
         "--method", required=True, metavar="NAME", help="see palpate-train evaluate --list"
     )
-    pack_command.add_argument(
-        "--seed",
-        type=numbers.whole("--seed", 0),
-        required=True,
-        help="seed of the training, and of simulated sets without one",
-    )
+    options.add_seed(pack_command)
     options.add_effort(pack_command)
     for command in (export, pack_command):
         command.add_argument(
@@ -159,8 +154,8 @@ def run_widen(args: argparse.Namespace) -> None:
     manifest = nuisances.write(*given)
     if manifest.early:
         manifest = early_checks.write(*given)
-    displacement_limit.write(args.bundle, given[1])
-    manifest = sliding.write(args.bundle, given[1])
+    train = given[1]
+    manifest = bridging.rewritten(args.bundle, train, lambda held: pack.limited(held, train))
     _print_checks(manifest)
     print(f"bundle: {manifest.name} {manifest.version}, {bundle.load(args.bundle).id}")
 

@@ -42,12 +42,7 @@ def register(add: Add) -> None:
     command.add_argument(
         "--scene", type=Path, metavar="FILE", help="options in a file, as docs/choose/tubes.toml"
     )
-    command.add_argument(
-        "--seed",
-        type=numbers.whole("--seed", 0),
-        required=True,
-        help="seed of the training, and of simulated sets without one",
-    )
+    options.add_seed(command)
     command.add_argument(
         "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
     )

@@ -37,10 +37,6 @@ class Progress:
         self._total, self._log, self._clock = total, log, clock
         self._start, self.done = clock(), 0
 
-    def left(self, most: int) -> None:
-        """Correct the total: at most `most` tasks are left. For work whose extent is found late."""
-        self._total = self.done + most
-
     def __call__(self, what: str) -> None:
         """The task `what` is done."""
         self.done += 1

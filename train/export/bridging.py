@@ -238,6 +238,14 @@ def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
     return manifest
 
 
+def rewritten(folder: Path, sweeps: Dataset, change: Callable[[Manifest], Manifest]) -> Manifest:
+    """Write the manifest of the bundle in `folder` as `change` makes it; its other files stay as
+    they are. Raises FormatError as `measurable`."""
+    manifest = change(measurable(folder, sweeps).manifest)
+    put(folder / MANIFEST, manifest.json())
+    return manifest
+
+
 def measurable(folder: Path, sweeps: Dataset) -> Bundle:
     """The bundle in `folder`, to measure it on `sweeps` and to write the result into it.
 

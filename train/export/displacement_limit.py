@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from appliance.bundle.manifest import MANIFEST, Manifest
-from appliance.core.storage import put
+from appliance.bundle.manifest import Manifest
 from appliance.signal.contact import displacement
 from train.data.sets import Dataset
-from train.export.bridging import measurable
 from train.models.recipe.augment import Augmentation, augment
 
 MOST = 360
@@ -49,14 +46,6 @@ def _shift(made: Mapping[str, Any]) -> float:
     recipe = made.get("recipe", {})
     used = recipe.get("augmentation", recipe.get("scene", {}))
     return float(used.get("shift", Augmentation().shift))
-
-
-def write(folder: Path, train: Dataset) -> Manifest:
-    """Add the limit to the manifest of the bundle in `folder`. train: its training sweeps. Raises
-    FormatError as bridging.measurable."""
-    manifest = limited(measurable(folder, train).manifest, train)
-    put(folder / MANIFEST, manifest.json())
-    return manifest
 
 
 def text(manifest: Manifest) -> str:

@@ -120,7 +120,7 @@ def pack(
     content = _early_checked(_widened(content))
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
-    manifest = sliding.limited(displacement_limit.limited(manifest, content.train), content.train)
+    manifest = limited(manifest, content.train)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
         for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
@@ -132,6 +132,11 @@ def pack(
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         bundle.load(folder)
     return manifest
+
+
+def limited(manifest: bundle.Manifest, train: Dataset) -> bundle.Manifest:
+    """`manifest` with the limits that the training sweeps set: of displacement and of sliding."""
+    return sliding.limited(displacement_limit.limited(manifest, train), train)
 
 
 def _widened(content: Content) -> Content:
@@ -276,12 +281,9 @@ def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Co
     )
 
 
-def pack_to_measure(
-    content: Content, target: Path, full_scale: float | None = None
-) -> bundle.Manifest:
-    """Pack `content` under the name of its method, so that every command that measures a method
-    measures the same bundle."""
-    return pack(content, target, content.about["method"], "1", provenance.commit(), full_scale)
+def pack_to_measure(content: Content, target: Path) -> bundle.Manifest:
+    """Pack `content` under the name of its method, only to measure its cost."""
+    return pack(content, target, content.about["method"], "1", provenance.commit(), proven=False)
 
 
 def logits_of_means(content: Content, sweeps: Dataset) -> Array:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from appliance.bundle.manifest import MANIFEST, Manifest
-from appliance.core.storage import put
+from appliance.bundle.manifest import Manifest
 from appliance.signal.vibration import PARTS, TINY, SlideLimits, vibration
 from train.data.sets import Dataset
-from train.export.bridging import measurable
 
 MARGIN = 0.05
 """A part rests if it vibrates less than any part in training by this much (natural logarithm)."""
@@ -38,14 +35,6 @@ def limited(manifest: Manifest, train: Dataset) -> Manifest:
     if not all(np.isfinite(v) and v > STILL for v in found):
         return manifest
     return replace(manifest, sliding=SlideLimits(tuple(round(v - MARGIN, 3) for v in found)))
-
-
-def write(folder: Path, train: Dataset) -> Manifest:
-    """Add the limits to the manifest of the bundle in `folder`. train: its training sweeps. Raises
-    FormatError as bridging.measurable."""
-    manifest = limited(measurable(folder, train).manifest, train)
-    put(folder / MANIFEST, manifest.json())
-    return manifest
 
 
 def text(manifest: Manifest) -> str:

@@ -16,7 +16,7 @@ from appliance.inference.novelty import EarlyDistances
 from tests.factories import toy_bundle
 from train.calibration import early_exit
 from train.data import sets
-from train.export import displacement_limit, early_checks
+from train.export import bridging, displacement_limit, early_checks
 
 
 @pytest.fixture
@@ -85,7 +85,9 @@ def test_an_older_bundle_gets_the_check_and_keeps_its_answers(older: Path):
             for of in (was, now)
         )
         assert before.tolist() == after.tolist()
-    manifest = displacement_limit.write(older, train)
+    manifest = bridging.rewritten(
+        older, train, lambda held: displacement_limit.limited(held, train)
+    )
     assert manifest.displacement
     assert manifest.displacement.farthest_mm == pytest.approx(1.9, abs=0.4)  # of a pitch of 4 mm
     assert "named up to" in displacement_limit.text(manifest)
