@@ -53,6 +53,14 @@ def _source(args: argparse.Namespace) -> Source:
     return LineSource(*_port(args), baud=args.baud)
 
 
+def _warn(args: argparse.Namespace) -> None:
+    """Warn about a serial line that is not there: it may be plugged in later."""
+    if args.port and "://" not in args.port and not Path(args.port).exists():
+        log.warning(f"--port {args.port} does not exist; trying again until it does, or correct it")
+    if args.feed and not Path(args.feed).exists():
+        log.warning(f"--feed {args.feed} does not exist; waiting until palpate runs there")
+
+
 def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
     """Name of the box's serial line, and a function that opens it."""
     if args.link:
@@ -68,9 +76,10 @@ def run_modbus(args: argparse.Namespace) -> int:
     settle("modbus", args, config.load(None))
     host, port = address(args.listen)
 
-    async def serve() -> None:
+    async def serve() -> int:
         stop = stop_event()
         source = _source(args)
+        _warn(args)
         try:
             server = TcpServer(
                 ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most
@@ -80,9 +89,9 @@ def run_modbus(args: argparse.Namespace) -> int:
             await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
         finally:
             source.close()
+        return stop.code
 
-    asyncio.run(serve())
-    return 0
+    return asyncio.run(serve())
 
 
 def run_tcp(args: argparse.Namespace) -> int:
@@ -92,8 +101,9 @@ def run_tcp(args: argparse.Namespace) -> int:
     settle("tcp", args, config.load(None))
     host, port = address(args.listen)
 
-    async def serve() -> None:
+    async def serve() -> int:
         stop = stop_event()
+        _warn(args)
         name, opener = _port(args)
         bridge = TcpBridge(
             name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop()
@@ -104,9 +114,9 @@ def run_tcp(args: argparse.Namespace) -> int:
             await until(stop, EVERY_S, partial(asyncio.sleep, 0))
         finally:
             bridge.close()
+        return stop.code
 
-    asyncio.run(serve())
-    return 0
+    return asyncio.run(serve())
 
 
 def run_ros(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,12 +13,14 @@ from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
-from appliance.core.config import Config
+from appliance.core.config import Config, StoreConfig
 from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
+from appliance.io import skins
 from appliance.runtime import assembly
+from appliance.service.status import note_ending
 from appliance.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
@@ -26,7 +29,18 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
-    settings, stopped = load_settings(args), stop_flag()
+    path = StoreConfig().status
+    try:
+        settings = load_settings(args)
+        path = settings.store.status
+        return _run(args, settings)
+    except ApplianceError as e:
+        note_ending(path, e)
+        raise
+
+
+def _run(args: argparse.Namespace, settings: Config) -> int:
+    stopped = stop_flag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
@@ -66,7 +80,9 @@ def _reports(
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
     source: origin of the frames."""
-    observers: list[Observer] = [VerdictLog()] if in_journal() else []
+    # without a serial port, a terminal shows the sentences
+    shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
+    observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
 
@@ -80,7 +96,7 @@ def _reports(
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 
-    expected = Expected.by(current, settings.skin.fingertip)
+    expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     return [
         *observers,

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import load_bundle, load_settings, stop_flag
+from appliance.cli.common import check_output, load_bundle, load_settings, stop_flag
 from appliance.cli.devices import simulated
+from appliance.core import storage
 from appliance.core.config import Config
+from appliance.core.errors import BundleDenied
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.io.robot_link import SerialSink
@@ -30,11 +32,8 @@ def _played_bundle(settings: Config) -> Bundle:
     user may not read the deployed bundle."""
     try:
         return load_bundle(settings, answers=False)
-    except PermissionError as e:
-        log.warning(
-            f"{e.filename}: {e.strerror}, so the packaged bundle plays; use"
-            " sudo -u palpate for the deployed bundle"
-        )
+    except BundleDenied as e:
+        log.warning(f"{e}; the packaged bundle plays now")
         return bundles.load(bundles.DEFAULT)
 
 
@@ -67,6 +66,8 @@ def run_bench(args: argparse.Namespace) -> int:
     """Measure this machine; see appliance/tools/bench.py."""
     from appliance.tools import bench_process, pseudo_terminal
 
+    if args.json:
+        check_output(args.json)
     settings = load_settings(args)
     bundle = _played_bundle(settings)
 
@@ -88,7 +89,7 @@ def run_bench(args: argparse.Namespace) -> int:
         bundle, build, args.references, args.seed, lambda line: print(line, flush=True)
     )
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        storage.put(args.json, (json.dumps(figures, indent=1) + "\n").encode())
     return 0
 
 

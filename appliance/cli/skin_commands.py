@@ -17,7 +17,7 @@ from appliance.cli.devices import open_devices
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ConfigError, SensorMismatch
 from appliance.core.log import log
 from appliance.io import serial_port, skin_profile, skins
 from appliance.io.serial_port import PortInfo
@@ -140,10 +140,9 @@ def run_show(args: argparse.Namespace) -> int:
             SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
         )
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        name = settings.skin.profile
-        skin_show.run(
-            sensor, format, name, devices.source, devices.clock, [screen, *pages], stopped
-        )
+        shown_on, unit = [screen, *pages], skins.profile(settings).unit
+        name, source = settings.skin.profile, devices.source
+        skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
     return 0
 
 
@@ -163,7 +162,7 @@ def run_new(args: argparse.Namespace) -> int:
         " skin"
     )
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, seconds, clock)
-    for number, proposal in enumerate(heard.proposals, 1):
+    for number, proposal in enumerate(heard.proposals[: skin_new.MOST_SHOWN], 1):
         print(f"{number}: {skin_new.words(proposal)}")
     if args.grid:
         _write(path, heard, args)
@@ -184,6 +183,11 @@ def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
     there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
+    if frames < skin_new.FEWEST:
+        raise SensorMismatch(
+            f"the profile reads {frames} frames of what the skin has just sent, so {path} is not "
+            "written; choose another --proposal or --grid, or listen longer with --seconds"
+        )
     storage.put_all({path: text.encode()}, mode=0o644)
     use = (
         f"--skin {shlex.quote(str(path))}"

@@ -30,6 +30,10 @@ class BundleError(ApplianceError):
     exit_code = EX_CONFIG
 
 
+class BundleDenied(BundleError):
+    """This user may not read the deployed bundle."""
+
+
 class SensorError(ApplianceError):
     """The skin cannot be read. `state`: the sensor state of the STA sentence (PROTOCOL.md, sensor
     states)."""

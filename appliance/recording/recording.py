@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.bundle.manifest import LABEL
-from appliance.core import storage
+from appliance.core import storage, wall_clock
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import TroubleLog, log
@@ -75,7 +75,7 @@ class SweepFolder:
             self.path(number),
             sweep,
             self._format,
-            {**about, "run": self.run, "verdict": verdict.as_dict()},
+            {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
         )
         self.numbers.append(number)
         return number

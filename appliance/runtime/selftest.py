@@ -18,7 +18,7 @@ from appliance.io import skin_profile, skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_sensor import fits
+from appliance.io.usb_sensor import Sensor, fits
 from appliance.runtime.assembly import UNSIGNED, gpio
 from appliance.signal.slide import SlideMeter
 
@@ -26,8 +26,11 @@ UNPROVEN = "broken taxels are refused: export it again to measure how many can b
 """Text of a bundle without `bridging`."""
 UNCHECKED = "early answers do not detect unknown materials: export it again"
 """Text of a bundle with early answers, but without limits for them."""
-LISTEN_S = 1.0
-"""Time for which frames of the skin are counted."""
+LISTEN_S, LONGEST_S, LEAST_FRAMES = 1.0, 5.0, 50
+"""Time for which frames of the skin are counted, and for a slow skin the longest time and the
+number of frames that show its rate."""
+BOOT_S = 8.0
+"""Longest wait for the first frame of a skin that was opened; many boards boot then."""
 MOST_READING = 0.5
 """Share of a core that reading a skin may take. The loop has one core; answers, recordings and
 readers of the feed need the rest."""
@@ -131,19 +134,22 @@ def _listened(
     with the first frame, since the start takes more processor time."""
     sensor = skins.sensor(settings, format, devices)
     now_ns = devices.clock.now_ns
-    until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
     try:
-        while now_ns() < until_ns:
+        first_ns = _first_frame(sensor, now_ns)
+        begun_ns, counters, first = spent_ns(), sensor.counters, sensor.counters.frames
+        seconds, last_ns = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz)), first_ns
+        while now_ns() < first_ns + seconds * 1e9:
+            before = counters.frames
             sensor.read()
-            if streams == (0, 0) and sensor.counters.frames:
-                streams = now_ns(), spent_ns()
-        share = (spent_ns() - streams[1]) / max(now_ns() - streams[0], 1)
-        if sensor.trouble or not sensor.counters.frames:
-            raise sensor.trouble or SensorError(
-                f"the skin sent no frame within {LISTEN_S} s; replug it"
-            )
+            last_ns = now_ns() if counters.frames > before else last_ns
+        share = (spent_ns() - begun_ns) / max(now_ns() - first_ns, 1)
+        if sensor.trouble:
+            raise sensor.trouble
+        came = counters.frames - first
+        if "time" in skins.profile(settings).lacks and last_ns > first_ns:
+            taken = came + counters.lost_frames
+            _check_rate(taken, taken * 1e9 / (last_ns - first_ns), format.rate_hz)
         who = sensor.identity
-        counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
         sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
         lost = (
@@ -152,8 +158,9 @@ def _listened(
             else "whether frames were lost cannot be seen"
         )
         sends = (
-            f"{name.strip()}, {sent}, {counters.frames} frames in {LISTEN_S} s, {lost}, "
-            f"{100 * share:.1f} % of a core"
+            f"{name.strip()}, {sent}, {came} frames in {seconds:.1f} s, {lost}, "
+            + (f"{counters.foreign_frames} foreign, " if counters.foreign_frames else "")
+            + f"{100 * share:.1f} % of a core"
         )
         if share > MOST_READING:
             raise SensorError(
@@ -165,8 +172,40 @@ def _listened(
         sensor.close()
 
 
+def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
+    """The time of the first frame. Raises SensorError if none comes within LISTEN_S, or within
+    BOOT_S from a skin that was opened: its board may boot first."""
+    begun_ns = now_ns()
+    while not sensor.counters.frames:
+        sensor.read()
+        opened = sensor.counters.enumerations and (
+            sensor.trouble is None or sensor.trouble.state in ("silent", "mismatch")
+        )
+        if now_ns() > begun_ns + (BOOT_S if opened else LISTEN_S) * 1e9:
+            raise sensor.trouble or SensorError(
+                f"the skin sent no frame within {BOOT_S} s; replug it"
+            )
+    return now_ns()
+
+
+def _check_rate(frames: int, measured_hz: float, wanted_hz: float) -> None:
+    """Raises SensorMismatch if a skin without a clock sends at another rate. frames: that were
+    counted; one of them more or less is no evidence."""
+    from appliance.io import skin_stream  # boxes whose skin has a clock do without it
+
+    if abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1):
+        raise SensorMismatch(skin_stream.another_rate(measured_hz, wanted_hz))
+
+
 def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
-    if not settings.trigger.by_lines:
+    if settings.trigger.mode == "serial" and not settings.serial.port:
+        hint = "set serial.port, or trigger.mode to two-lines, key or timed"
+        yield CheckResult(
+            "trigger",
+            False,
+            f"serial: START and STOP come over serial.port, which is not set; {hint}",
+        )
+    elif not settings.trigger.by_lines:
         yield CheckResult("trigger", True, f"{settings.trigger.mode}, no lines")
     elif settings.trigger.start:
         yield _try("gpio lines", lambda: _lines(settings, devices))

@@ -25,6 +25,8 @@ from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 LISTEN_S = 2.0
 """Time for each speed of a port: 56 frames of the slowest skin."""
+BOOT_S = 3.0
+"""Additional time for the first byte after a port was opened; many boards boot then."""
 FITS = 0.9
 """Share of the bytes that must be in frames of a profile."""
 FEWEST = 4
@@ -159,11 +161,17 @@ def listen(
     return HeardBytes(reads)
 
 
-def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, int]]:
-    """The reads of an open port within `seconds`, with their times. Raises SensorError."""
-    reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
+def collect(
+    port: BytePort, clock: Clock, seconds: float, boot_s: float = 0.0
+) -> list[tuple[bytes, int]]:
+    """The reads of an open port within `seconds` of its first byte, with their times. boot_s: time
+    beyond `seconds` in which the first byte may come. Raises SensorError."""
+    reads: list[tuple[bytes, int]] = []
+    until_ns = clock.now_ns() + round((seconds + boot_s) * 1e9)
     while (left_ns := until_ns - clock.now_ns()) > 0:
         if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
+            if not reads:
+                until_ns = clock.now_ns() + round(seconds * 1e9)
             reads.append((data, clock.now_ns()))
     return reads
 

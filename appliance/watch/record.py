@@ -119,7 +119,8 @@ class RecordPage(Observer):
 
     format: of the sweeps. source: of the frames. trigger: its settings. about: see
     RecordingSession.about. obey: carries out the orders of the page, in the loop's thread. clock:
-    the host's real clock. Raises ConfigError if the address cannot be used.
+    the host's real clock. unit: of the skin's profile. Raises ConfigError if the address cannot be
+    used.
     """
 
     def __init__(
@@ -131,9 +132,10 @@ class RecordPage(Observer):
         about: Callable[[], Mapping[str, Any]],
         obey: Obey,
         clock: Clock,
+        unit: str = "",
     ) -> None:
         self._about, self._obey, self._clock = about, obey, clock
-        self._tracker = ContactTracker(Expected(format), source)
+        self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
         self._commands = (
             *LABELS,

@@ -50,10 +50,7 @@ def register(add: Add) -> None:
         "--trained-on", required=True, metavar="SET", help="its training sweeps, which are altered"
     )
     options.add_set(widen)
-    parity = add(
-        "parity",
-        lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
-    )
+    parity = add("parity", run_parity)
     parity.add_argument(
         "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which holds no float model"
     )
@@ -122,6 +119,13 @@ def run_pack(args: argparse.Namespace) -> None:
             "float form where int8 differs"
         ) from e
     _print(pack.pack(content, *_packing(args)), args.out)
+
+
+def run_parity(args: argparse.Namespace) -> None:
+    """Compare the graphs of a model."""
+    if args.json:
+        options.writable_file(args.json, "--json")
+    print(quantized_bundle.compared(args.model, options.load(args), args.json))
 
 
 def run_score(args: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -195,10 +195,10 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     }
 
 
-def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
+def write_hdf5(target: BinaryIO, arrays: dict[str, Any]) -> None:
     """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
-    Samples are compressed."""
-    with h5py.File(path, "w") as file:
+    Samples are compressed. target: opened for reading and writing."""
+    with h5py.File(target, "w") as file:
         for name, values in arrays.items():
             file.create_dataset(
                 name, data=values, compression="gzip" if name == "samples" else None

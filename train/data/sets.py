@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from appliance.core import sweep_set
+from appliance.core import storage, sweep_set
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
@@ -188,10 +188,10 @@ class Dataset(sweep_set.SweepSet):
         } | groups
         if self.unloaded is not None:
             arrays["unloaded"] = self.unloaded
-        if path.suffix in readers.HDF5:
-            readers.write_hdf5(path, arrays | {"materials": list(self.materials)})
-        else:
-            with path.open("wb") as f:
+        with storage.file(path) as f:
+            if path.suffix in readers.HDF5:
+                readers.write_hdf5(f, arrays | {"materials": list(self.materials)})
+            else:
                 np.savez_compressed(
                     f, allow_pickle=False, materials=np.array(self.materials), **arrays
                 )

@@ -1,5 +1,7 @@
 /* The skin as a picture: the load of each taxel, the contact, where it lay in training, and the way back. */
 
+import {figure} from "/parts.js";
+
 const SVG = "http://www.w3.org/2000/svg", TAXEL = 100, RING = 21, TIP = 90, RIM = 14, SIDE = 62;
 const NUMBERED = 8; // a larger skin gets no numbers, and names every fourth row and column
 const PLAIN = 5; // signs and letters grow with a larger skin
@@ -50,7 +52,7 @@ export class SkinPicture {
       tile.style.fill = back;
       if (!this.counts.length) return;
       this.counts[i].style.fill = front;
-      this.counts[i].textContent = loads.length ? Math.round(loads[i]) : "";
+      this.counts[i].textContent = loads.length ? figure(loads[i], view.full, view.load_unit) : "";
     });
     this.centre.style.visibility = view.centre ? "visible" : "hidden";
     this.way.style.visibility = "hidden";

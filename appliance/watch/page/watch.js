@@ -121,7 +121,7 @@ function drawSkin() {
   if (!view) return;
   SKIN.show(view);
   const axes = known.hello?.format.axes > 1 ? "; the axis along the normal" : "";
-  put("contact", `raw counts above the lowest seen${axes}`);
+  put("contact", `${view.load_unit || "raw counts"} above the lowest seen${axes}`);
   document.body.dataset.state = view.state;
 }
 

@@ -58,6 +58,15 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_a_file_from_another_editor_is_read(signers: Signers, encoding: str):
+    """A byte order mark, UTF-16 and CR LF, as editors on other systems write them."""
+    text = "# who may\r\n" + line(signers.ours, SIGNER).replace("\n", " \r\n")
+    mark = "" if encoding in ("utf-8-sig", "utf-16") else "\ufeff"
+    signers.file.write_bytes((mark + text).encode(encoding))
+    assert signers.verify() == SIGNER
+
+
 @pytest.mark.slow
 def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
     """Another key, namespace or message, and a cut, empty or huge signature are refused with their
