@@ -132,7 +132,7 @@ class SerialSensor(LinkSensor):
         if not bytes_came:
             return super()._no_frame(bytes_came=False)
         remedy = (
-            self._stream.doubt
+            self._stream.misfit
             or "correct skin.profile, skin.grid or the profile's baud; `palpate skin detect` "
             "listens for what fits; a board that boots when it is opened needs a longer "
             "skin.silence_ms"

@@ -90,7 +90,7 @@ class CountedStream:
 
     def __init__(self, profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> None:
         self._profile, self._format, self._counters = profile, format, counters
-        self._codec, self.doubt = skin_codecs.codec(profile), ""
+        self._codec, self.misfit = skin_codecs.codec(profile), ""
         self._wrap = 1 << 8 * np.dtype(profile.sequence).itemsize if profile.sequence else 0
         self._epoch, self._count, self._skipped = -1, 0, 0
         self._rest, self._bytes = Rest(), 0
@@ -123,7 +123,7 @@ class CountedStream:
         found = self._codec(self._rest, data)
         self._rest = found.rest
         # the first reason stays until a frame comes, so that the log shows it once
-        self.doubt = "" if len(found) else self.doubt or found.doubt
+        self.misfit = "" if len(found) else self.misfit or found.misfit
         self._counters.foreign_frames += found.foreign
         if found.wrong:
             raise SensorMismatch(_of_another(found.wrong))

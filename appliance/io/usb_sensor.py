@@ -135,7 +135,7 @@ class FrameStream(Protocol):
         ...
 
     @property
-    def doubt(self) -> str:
+    def misfit(self) -> str:
         """Why bytes are not frames, and the remedy, as far as it shows; "" if it does not."""
         ...
 
@@ -155,7 +155,7 @@ class Stream:
     does."""
 
     loss_known = True
-    doubt = ""
+    misfit = ""
 
     def __init__(
         self,

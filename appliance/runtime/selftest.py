@@ -133,22 +133,16 @@ def _listened(
     """The frames of the skin and the share of a core for reading them, in words. Counting begins
     with the first frame, since the start takes more processor time."""
     sensor = skins.sensor(settings, format, devices)
-    now_ns = devices.clock.now_ns
+    clocked = "time" not in skins.profile(settings).lacks
     try:
-        first_ns = _first_frame(sensor, now_ns)
+        first_ns = _first_frame(sensor, devices.clock.now_ns)
         begun_ns, counters, first = spent_ns(), sensor.counters, sensor.counters.frames
-        seconds, last_ns = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz)), first_ns
-        while now_ns() < first_ns + seconds * 1e9:
-            before = counters.frames
-            sensor.read()
-            last_ns = now_ns() if counters.frames > before else last_ns
-        share = (spent_ns() - begun_ns) / max(now_ns() - first_ns, 1)
+        why, passed_s = _counted(sensor, format, first_ns, devices.clock.now_ns, clocked=clocked)
+        share = (spent_ns() - begun_ns) / max(round(passed_s * 1e9), 1)
         if sensor.trouble:
             raise sensor.trouble
-        came = counters.frames - first
-        if "time" in skins.profile(settings).lacks and last_ns > first_ns:
-            taken = came + counters.lost_frames
-            _check_rate(taken, taken * 1e9 / (last_ns - first_ns), format.rate_hz)
+        if why:
+            raise SensorMismatch(why)
         who = sensor.identity
         name = f"{who.board} {who.serial}" if who else ""
         sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
@@ -158,7 +152,8 @@ def _listened(
             else "whether frames were lost cannot be seen"
         )
         sends = (
-            f"{name.strip()}, {sent}, {came} frames in {seconds:.1f} s, {lost}, "
+            f"{name.strip()}, {sent}, {counters.frames - first} frames in {passed_s:.1f} s, "
+            + f"{lost}, "
             + (f"{counters.foreign_frames} foreign, " if counters.foreign_frames else "")
             + f"{100 * share:.1f} % of a core"
         )
@@ -170,6 +165,25 @@ def _listened(
         return sends
     finally:
         sensor.close()
+
+
+def _counted(
+    sensor: Sensor, format: SweepFormat, first_ns: int, now_ns: Callable[[], int], *, clocked: bool
+) -> tuple[str, float]:
+    """Read frames for a while: why their rate is another one, "" if it is not, and the time in
+    seconds. clocked: the skin has a clock, so that the sensor compares the rate."""
+    counters, first = sensor.counters, sensor.counters.frames
+    seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
+    points, why = [(0, first_ns)], ""
+    # a busy machine reads late: a rate that seems wrong is measured for longer
+    while (passed_s := (now_ns() - first_ns) / 1e9) < seconds or (why and passed_s < LONGEST_S):
+        before = counters.frames
+        sensor.read()
+        if counters.frames > before and not clocked:
+            points.append((counters.frames + counters.lost_frames - first, now_ns()))
+        if (now_ns() - first_ns) / 1e9 >= seconds and not clocked:
+            why = _another_rate(points, format.rate_hz)
+    return why, passed_s
 
 
 def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
@@ -188,13 +202,23 @@ def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
     return now_ns()
 
 
-def _check_rate(frames: int, measured_hz: float, wanted_hz: float) -> None:
-    """Raises SensorMismatch if a skin without a clock sends at another rate. frames: that were
-    counted; one of them more or less is no evidence."""
+def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
+    """Why a skin without a clock sends at another rate than wanted, "" if it does not. points:
+    frames so far, and the time. One frame more or less is no evidence."""
     from appliance.io import skin_stream  # boxes whose skin has a clock do without it
 
-    if abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1):
-        raise SensorMismatch(skin_stream.another_rate(measured_hz, wanted_hz))
+    third = len(points) // 3
+    if third < 2:
+        return ""
+    # a frame may be read late, never early: compare the promptest of the first and the last third
+    late = [t_ns - frames * 1e9 / wanted_hz for frames, t_ns in points]
+    first, last = (
+        min(part, key=late.__getitem__) for part in (range(third), range(2 * third, len(points)))
+    )
+    frames, passed_ns = (points[last][i] - points[first][i] for i in (0, 1))
+    measured_hz = frames * 1e9 / max(passed_ns, 1)
+    wrong = abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1)
+    return skin_stream.another_rate(measured_hz, wanted_hz) if wrong else ""
 
 
 def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:

@@ -339,39 +339,29 @@ def _numbers(
 ) -> Iterator[tuple[tuple[float, ...], Proposal]]:
     """Possible numbers in the bytes of `span`."""
     first, last = span
-    length = framing.frames.shape[1]
-    mark = framing.frames[len(framing.frames) // 2]
-    marker = mark[: framing.marker].tobytes()
-    trailer = mark[length - framing.trailer :].tobytes()
+    frame = framing.frames[len(framing.frames) // 2]
+    marker = frame[: framing.marker].tobytes()
+    trailer = frame[len(frame) - framing.trailer :].tobytes()
+    kind: Literal["marker", "trailer"] = "marker" if marker else "trailer"
     for rank, (dtype, big_endian) in enumerate(framing.columns.types(first, last)):
-        values = (last - first) // np.dtype(dtype).itemsize
+        size = np.dtype(dtype).itemsize
+        values = (last - first) // size
         fits = grids(values)
         flat = not fits or max(fits[0][:2]) > LONGEST * min(fits[0][:2])
-        against = cost + SMALL * rank + FLAT * flat
         keys = _keys(framing, count, span, "big" if big_endian else "little")
-        if marker and trailer:
-            keys["trailer"] = trailer.hex(" ")
-        rough = framing.columns.roughness(first, last, dtype, big_endian)
+        keys |= {"trailer": trailer.hex(" ")} if marker and trailer else {}
+        against = (
+            cost + SMALL * rank + FLAT * flat,
+            -size,
+            -framing.marker - framing.trailer,
+            count.at - count.end if count else 0,
+            framing.columns.roughness(first, last, dtype, big_endian),
+        )
+        mark, sequence, length = marker or trailer, count.kind if count else "", len(frame)
         yield (
-            (
-                against,
-                -np.dtype(dtype).itemsize,
-                -framing.marker - framing.trailer,
-                count.at - count.end if count else 0,
-                rough,
-            ),
+            against,
             Proposal(
-                "marker" if marker else "trailer",
-                marker or trailer,
-                length,
-                count.kind if count else "",
-                dtype,
-                big_endian,
-                values,
-                fits,
-                rate,
-                share,
-                keys,
+                kind, mark, length, sequence, dtype, big_endian, values, fits, rate, share, keys
             ),
         )
 

@@ -137,7 +137,7 @@ def _checked(layout: FixedLayout, table: NDArray[np.uint8], found: Decoded) -> D
         return found
     # bytes that are skipped before a frame include the damaged frames before it
     skipped = np.cumsum(found.skipped + layout.period * ~right)[right]
-    doubt = (
+    misfit = (
         f"the {layout.profile.checksum} of {np.count_nonzero(~right)} frames is wrong; "
         "correct checksum, checksum_from or checksum_order in its profile, or check the cable"
     )
@@ -149,7 +149,7 @@ def _checked(layout: FixedLayout, table: NDArray[np.uint8], found: Decoded) -> D
         found.garbage + layout.period * int(np.count_nonzero(~right)),
         found.rest,
         found.counts[right] if len(found.counts) else found.counts,
-        doubt=doubt,
+        misfit=misfit,
     )
 
 

@@ -55,11 +55,11 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     skipped: list[int] = []
     rows: list[NDArray[Any]] = []
     at = begun = garbage = before = size = 0  # begun: where the lines in `rows` begin
-    broken, doubt = False, ""
+    broken, misfit = False, ""
     while (end := data.find(mark, at)) >= 0:
         line, at = data[at:end], end + 1
         row, why = _numbers(profile, line, per_line)
-        doubt = why or doubt
+        misfit = why or misfit
         if row is not None and len(row) == per_line:
             rows.append(row)
         closed = profile.lines == "frames" or row is None or len(row) < per_line or closes(line)
@@ -78,7 +78,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     if len(data) - begun > MOST_PACKET * lines:
         garbage, begun = garbage + len(data) - begun, len(data)
     left = Rest(data[begun:])
-    return collected(profile, numbers, ends, skipped, garbage, left, size, doubt=doubt)
+    return collected(profile, numbers, ends, skipped, garbage, left, size, misfit=misfit)
 
 
 def split(line: bytes, decimal: str = ".") -> tuple[list[bytes], str]:

@@ -33,11 +33,9 @@ not a CAN frame."""
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """One CAN frame for each taxel, in the order of taxel numbers. A frame of the skin is complete
     with its last taxel. CAN frames of other nodes on the bus are passed over and counted."""
-    data = rest.data + new
-    taxels = profile.rows * profile.cols
+    data, taxels = rest.data + new, profile.rows * profile.cols
     numbers: list[NDArray[Any]] = []
-    ends: list[int] = []
-    skipped: list[int] = []
+    ends, skipped = list[int](), list[int]()
     found: list[bytes] = []  # the bytes of taxels 0, 1, 2, ... of the current frame
     lines: list[bytes] = []  # its lines
     at = garbage = before = size = beyond = foreign = 0
@@ -57,11 +55,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         good = taxel >= 0 and values[0] < _NO_VALUE
         if not (good and taxel == len(found)):
             # out of order, without a value, or damaged: the current frame is incomplete
-            waste = sum(map(len, lines))
-            found, lines = [], []
-            if not (good and taxel == 0):
-                waste += len(line)
-            garbage, before = garbage + waste, before + waste
+            waste = sum(map(len, lines)) + len(line) * (not good or taxel > 0)
+            garbage, before, found, lines = garbage + waste, before + waste, [], []
         if good and taxel == len(found):
             found.append(values)
             lines.append(line)
@@ -73,14 +68,12 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     left = b"".join(lines) + data[at:]
     if len(data) - at > MOST_PACKET:
         garbage, left = garbage + len(left), b""
-    wrong = (
-        f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
-        if beyond >= _WRONG_TAXELS
-        else ""
-    )
-    return collected(
-        profile, numbers, ends, skipped, garbage, Rest(left), size, wrong=wrong, foreign=foreign
-    )
+    grid = shown((profile.rows, profile.cols))
+    more = {
+        "wrong": f"it sends taxels beyond {grid}" if beyond >= _WRONG_TAXELS else "",
+        "foreign": foreign,
+    }
+    return collected(profile, numbers, ends, skipped, garbage, Rest(left), size, **more)
 
 
 def _taxel(line: bytes) -> tuple[int, bytes]:

@@ -84,7 +84,7 @@ def test_a_frame_with_count_checksum_and_ignored_bytes():
     ]
     size = len(frames[0])
     assert (found.garbage, found.size, found.skipped.tolist()[3]) == (size, size, size)
-    assert "the crc16-modbus of 1 frames is wrong" in found.doubt
+    assert "the crc16-modbus of 1 frames is wrong" in found.misfit
     # in parts, too
     rest, counts = Rest(), []
     for at in range(0, len(frames) * size, 17):
@@ -133,7 +133,7 @@ def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
     p = replace(TEXT, cols=4, **keys)
     end = p.line_end.encode()
     found = decoded(p, line + end + b"boot: 1 2 3 4" + end + line + end)
-    assert len(found) == 2, found.doubt
+    assert len(found) == 2, found.misfit
     np.testing.assert_array_equal(found.taxels[0, 0], np.float32([1, -2.5, 300, np.nan]))
 
 
@@ -144,7 +144,7 @@ def test_a_sentence_with_another_sum_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("number", "line", "doubt"),
+    ("number", "line", "misfit"),
     [
         ("uint16", b"1 -3 2 4", 'it sends -3, which uint16 cannot hold; set number = "float32"'),
         ("uint16", b"1 2.5 2 4", "it sends 2.5, which uint16 cannot hold"),
@@ -153,11 +153,11 @@ def test_a_sentence_with_another_sum_is_refused():
         ("uint16", b"a:1 b:2 c:3 d:4", "'a:b:c:d:' stands around its numbers, none is expected"),
     ],
 )
-def test_the_value_that_does_not_fit_is_named(number: str, line: bytes, doubt: str):
+def test_the_value_that_does_not_fit_is_named(number: str, line: bytes, misfit: str):
     """A line that is refused says why."""
     found = decoded(replace(TEXT, cols=4, number=number), line + b"\n")
     assert (len(found), found.garbage) == (0, len(line) + 1)
-    assert doubt in found.doubt
+    assert misfit in found.misfit
 
 
 def test_rows_between_other_lines():
