@@ -83,8 +83,10 @@ def analyse(reads: Sequence[Read], values: int = 0) -> list[Proposal]:
     if not data:
         return []
     seconds = max((reads[-1].t_ns - reads[0].t_ns) / 1e9, 1e-9)
-    if text_analysis.is_text(data) and (found := _text(data, seconds)):
-        return found
+    if text_analysis.is_text(data):
+        found = _text(data, seconds)
+        if found or (data.isascii() and len(data.splitlines()) > LEAST_FRAMES):
+            return found  # hexadecimal digits, too, would have the pattern of a frame
     boundaries = np.cumsum([len(read.data) for read in reads])[:-1]
     return _binary(data, boundaries, seconds, values)
 

@@ -122,7 +122,7 @@ TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="
         ({"around": "#:#:#:#:"}, b"0:1 1:-2.5 2:300 3:nan"),
         ({"around": "->"}, b"12:00:59.123 -> 1 -2.5 300 nan"),
         ({"around": "mVmVmVmV"}, b"1mV -2.5mV 300.0mV nan mV"),
-        ({"around": "$SKIN"}, b"$SKIN,1,-2.5,300,nan*4C"),
+        ({"around": "$SKIN"}, b"$SKIN,1,-2.5,300,nan*78"),
         ({"decimal": ","}, b"1;-2,5;300,0;nan"),
         ({"line_end": "\r"}, b"1 -2.5 300 nan"),
     ],
@@ -140,7 +140,7 @@ def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
 def test_a_sentence_with_another_sum_is_refused():
     """A damaged NMEA sentence gives no frame."""
     p = replace(TEXT, cols=4, around="$SKIN")
-    assert len(decoded(p, b"$SKIN,1,-2.6,300,nan*4C\n")) == 0
+    assert len(decoded(p, b"$SKIN,1,-2.6,300,nan*78\n")) == 0
 
 
 @pytest.mark.parametrize(
