@@ -24,6 +24,7 @@ from appliance.io.serial_port import PortInfo
 from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 if TYPE_CHECKING:
+    from appliance.tools.skin_monitor import SkinDisplay
     from appliance.tools.skin_new import PortSample
 
 CHECK_S = 10.0
@@ -140,7 +141,8 @@ def run_show(args: argparse.Namespace) -> int:
             SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
         )
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        shown_on, unit = [screen, *pages], skins.profile(settings).unit
+        shown_on: list[SkinDisplay] = [screen, *pages]
+        unit = skins.profile(settings).unit
         name, source = settings.skin.profile, devices.source
         skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
     return 0

@@ -16,6 +16,8 @@ Order = Literal["little", "big"]
 FITS = 0.95
 """Share of the frames, or of the steps between them, in which a field must be right; the rest may
 be damaged or lost."""
+STEPS = 0.85
+"""The same for steps from frame to frame, as single frames may be passed over."""
 SAMPLE = 48
 """Frames in which checksums are searched. One wrong checksum of 8 bits fits once in 256 frames."""
 LEAST_DISTINCT = 4
@@ -187,7 +189,9 @@ def _by_name(
 def counts(frames: NDArray[np.uint8], places: set[int]) -> list[CountField]:
     """Numbers that grow by one from frame to frame, the most likely first. places: where such a
     number may begin."""
-    low = np.flatnonzero((np.diff(frames.astype(np.int16), axis=0) % 256 == 1).mean(axis=0) >= FITS)
+    low = np.flatnonzero(
+        (np.diff(frames.astype(np.int16), axis=0) % 256 == 1).mean(axis=0) >= STEPS
+    )
     if len(low) > max(2, 0.5 * frames.shape[1]):
         return []  # all taxels of a test pattern may count
     found: dict[CountField, None] = {}
@@ -200,7 +204,7 @@ def counts(frames: NDArray[np.uint8], places: set[int]) -> list[CountField]:
                 step = np.diff(number) % (1 << 8 * size)
                 carried = step[number[:-1] % 256 == 255]
                 # else the next byte is a taxel that stays at zero
-                if (step == 1).mean() >= FITS and (not len(carried) or carried[0] == 1):
+                if (step == 1).mean() >= STEPS and (not len(carried) or carried[0] == 1):
                     field = CountField(at, f"uint{8 * size}", order)  # type: ignore[arg-type]
                     found[field if size > 1 else replace(field, order="little")] = None
     return list(found)
@@ -217,7 +221,7 @@ def is_clock(frames: NDArray[np.uint8], at: int, size: int) -> bool:
         even = np.abs(step - middle) <= 0.5 * middle
         # all bytes of a test pattern grow evenly, of a clock the highest byte changes seldom
         high = np.diff(frames[:, at + (size - 1) * (order == "little")].astype(np.int16))
-        if 1 < middle < 1e9 and even.mean() >= FITS and (high != 0).mean() < SELDOM:
+        if 1 < middle < 1e9 and even.mean() >= STEPS and (high != 0).mean() < SELDOM:
             return True
     return False
 
