@@ -210,17 +210,22 @@ class InnerPart:
     out: Array
 
 
-def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
+def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> list[InnerPart]:
     """The parts of each group that can be left out, at most `most` for a group. If no group can,
-    the parts are recordings, with materials spread evenly.
+    the parts are recordings, with materials spread evenly. varies: only these groups.
 
     The first part of every group comes first, then the second parts, and so on. A group can be left
     out if it does not cut recordings in two, and if the other sweeps hold every material that is
-    tested. Raises FormatError if nothing can be left out.
+    tested. Raises FormatError if nothing can be left out, or a group of `varies` cannot.
     """
-    of_all = [
-        _parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET
-    ]
+    names = varies or sorted(set(sweeps.groups) - set(OF_THE_SET))
+    of_all = [_parts_of(sweeps, name, most) for name in names]
+    for name, parts in zip(varies, of_all, strict=False):
+        if not parts:
+            raise FormatError(
+                f"{sweeps.source}: no value of {name!r} can be left out; it needs two values, "
+                "materials under several of them, and no recording under two"
+            )
     if any(of_all):
         return [part for turn in zip_longest(*of_all) for part in turn if part]
     fewest = min(

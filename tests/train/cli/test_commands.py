@@ -57,8 +57,8 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     assert len(made.train) + len(made.held) + len(rest) == len(whole)
     out = capsys.readouterr().out
     figure = r"\d+\.\d % \[\d+\.\d, \d+\.\d\] of \d+"
-    assert re.search(f"held-out recording, as the box answers: {figure}; ", out)
-    assert re.search(f"held-out recording, network alone: {figure}\n", out)
+    assert re.search(f"held-out speed, as the box answers: {figure}; ", out)
+    assert re.search(f"held-out speed, network alone: {figure}\n", out)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ class HeldOutScores:
 
     def accuracy(self, scored: ScoredPlan) -> float:
         """Accuracy on held-out sweeps; every group counts the same."""
-        return float(self.weights @ self._right(scored))
+        return float(self.weights @ self.right(scored))
 
     def better(self, one: ScoredPlan, other: ScoredPlan) -> bool:
         """Whether `one` has a lower loss and a higher accuracy, by more than ERRORS standard errors
@@ -148,10 +148,11 @@ class HeldOutScores:
 
     def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
         """The share [n] of each sweep in the accuracy of `other` minus that of `one`."""
-        lost: Array = self.weights * (self._right(other).astype(float) - self._right(one))
+        lost: Array = self.weights * (self.right(other).astype(float) - self.right(one))
         return lost
 
-    def _right(self, scored: ScoredPlan) -> Array:
+    def right(self, scored: ScoredPlan) -> Array:
+        """bool [n], what it names rightly."""
         right: Array = scored.logits.argmax(axis=1) == self.labels
         return right
 
@@ -257,6 +258,10 @@ class Candidates:
     columns: FeatureColumns
     copies: bool = False
     loads: bool = False
+
+    def usual(self) -> Heads:
+        """The usual candidate."""
+        return next(iter(self.plain().values()))
 
     def plain(self) -> dict[str, Heads]:
         """The usual candidate, and magnitudes alone; the spectrum, if the size has no filters.
