@@ -21,7 +21,7 @@ from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from appliance.inference.novelty import ClassDistances
+from appliance.inference.novelty import ClassDistances, UnknownSweeps
 from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
@@ -122,6 +122,7 @@ class Classifier(Observer):
         self._means = (
             ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
         )
+        self._unknown = UnknownSweeps(self._means) if self._means else None
         rule, place = bundle.manifest.displacement, bundle.manifest.contact
         self._slide = SlideMeter(bundle.format, place.pitch_mm if place and slides else None)
         self._displaced_means = (
@@ -185,7 +186,7 @@ class Classifier(Observer):
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""
-        return self._classify(taxels)[0]
+        return self._logits_of(self._run(self._outputs, taxels), self._means)
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C,
@@ -260,7 +261,7 @@ class Classifier(Observer):
             return self._verdict(sweep, finding)
         touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
         displaced = bool(touch.displacement.text)
-        logits, novelty = self._classify(sweep.frames.taxels, displaced)
+        logits, novelty = self._classify(sweep, displaced)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
             return self._verdict(sweep, finding, touch=touch)
@@ -352,21 +353,31 @@ class Classifier(Observer):
         )
         return self._model(outputs, graph_input)
 
-    def _classify(
-        self, taxels: NDArray[Any], displaced: bool = False
-    ) -> tuple[NDArray[np.float32], str]:
+    def _classify(self, sweep: Sweep, displaced: bool) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and a message with its distance from the known materials, ""
         if the material is known.
 
         displaced: whether the contact is displaced. Changes caused by a displacement then do not
         make a material unknown.
         """
-        values = self._run(self._outputs, taxels)
+        values = self._run(self._outputs, sweep.frames.taxels)
         means = self._displaced_means if displaced and self._displaced_means else self._means
         if means is None:
-            return values[0], ""
-        logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
-        return logits, means.novelty(values[-1])
+            return self._logits_of(values), ""
+        novelty = means.novelty(values[-1])
+        if novelty and means is self._means and self._unknown:
+            alike = self._unknown.put(sweep.id, values[-1])
+            novelty += f"; as sweep {alike}" * (alike > 0)
+        return self._logits_of(values, means), novelty
+
+    def _logits_of(
+        self, values: list[NDArray[np.float32]], means: ClassDistances | None = None
+    ) -> NDArray[np.float32]:
+        """Logits [K] from the outputs of the graph, or from class means once a label is
+        enrolled."""
+        if means and len(self._outputs) == 1:
+            return means.logits(means.distances(values[-1]))
+        return values[0]
 
     def _touch(self, sweep: Sweep, mean: NDArray[np.float64] | None) -> Touched:
         """The displacement of the contact from its positions in training, and the slide, which is

@@ -75,10 +75,10 @@ def measure(
     return Widened(shapes, rule.limit, rule, training, _figures(rule, held))
 
 
-def hardest_limit(found: Widened, given: CalibrationInputs) -> float:
-    """The limit for widened shapes that keeps sweeps of each condition, judged by embeddings and
-    shapes that did not see their value of it."""
-    limits, trained = [found.limit], len(found.training.labels)
+def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
+    """The limit for widened shapes, from sweeps judged by embeddings and shapes that did not see
+    their value of a condition; all conditions count."""
+    every, trained = [], len(found.training.labels)
     for values in given.conditions.values():
         distances = np.full(len(given.labels), np.nan)
         for seen, judging in novelty.parts(values, given.judged):
@@ -91,8 +91,8 @@ def hardest_limit(found: Widened, given: CalibrationInputs) -> float:
             judging = judging[np.isin(given.labels[judging], present)]
             away = embedding(given.whole[judging])[:, None] - means
             distances[judging] = shaped_distances(away, shapes).min(axis=1)
-        limits.append(novelty.limit(distances))
-    return max(limits)
+        every.append(distances)
+    return novelty.limit(np.concatenate(every))
 
 
 def altered(features: Embed, sweeps: Dataset, seed: int) -> AlteredSweeps:

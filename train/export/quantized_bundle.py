@@ -131,15 +131,15 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
 def _widened(
     fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
 ) -> nuisances.Widened | None:
-    """Shapes of known materials that know how altered sweeps differ, and the limit that keeps the
-    sweeps of each condition; see nuisances. apart: an embedding that did not see the held-out
+    """Shapes of known materials that know how altered sweeps differ, and their limit; see
+    nuisances. apart: an embedding that did not see the held-out
     sweeps."""
     trunk, spaces = fit.trunk(), [(of, of.means) for of in (apart, whole)]
     seed = int(fit.about["seed"])
     found = nuisances.measure(
         lambda samples: run(trunk, samples), fit.train, fit.held, *spaces, seed=seed
     )
-    return found and replace(found, limit=nuisances.hardest_limit(found, given))
+    return found and replace(found, limit=nuisances.limit_of_conditions(found, given))
 
 
 def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:

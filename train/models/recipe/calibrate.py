@@ -215,7 +215,7 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     embedding, last = novelty.embed(whole, labels, given.fixed), float(temperatures[-1])
     steps = early_exit.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
     distances = {name: _distances(given, values) for name, values in given.conditions.items()}
-    limit = max(map(novelty.limit, distances.values()))
+    limit = novelty.limit(np.concatenate(list(distances.values())))
     held = {}
     for name, values in given.conditions.items():
         judging, named = _named(given, values)
