@@ -202,6 +202,12 @@ CAMPAIGNS = {
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),
+    "promises": Campaign(
+        "compare the accuracy that fit prints with that of its bundle under a new condition",
+        _module("tests.campaigns.promises"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
     "slide-speed": Campaign(
         "measure how well the speed of a slide is measured from the counts (docs/decisions/0021)",
         _module("tests.campaigns.slide_speed"),
