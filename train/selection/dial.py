@@ -180,6 +180,16 @@ class Judgement:
         trunk, plan = recipe.pruned(self.setup.fixed.trunk, one.trunk, one.judged.chosen.plan)
         return recipe.finish(trunk, plan, one.judged, self.setup)
 
+    def first_equals(self) -> dict[str, str]:
+        """For each size the first one whose model is the same, often itself: a larger size may
+        choose nothing more."""
+        first: dict[tuple[object, ...], str] = {}
+        equal = {}
+        for name, one in self.sizes.items():
+            parts = [(p.columns, p.copies, p.factor) for p in one.judged.chosen.plan.parts]
+            equal[name] = first.setdefault((one.trunk is None, *parts), name)
+        return equal
+
     def reduced(self, name: str) -> Settings:
         """The settings for a fit of this size to reduced sweeps: stages only if the size has them
         for the whole ones."""
@@ -364,15 +374,19 @@ def choose(sweeps: Dataset, seed: int, settings: Settings, wanted: SizeWish, log
     Raises NothingFits if no size can be used, and FormatError as recipe.fit.
     """
     judged = judge(sweeps, seed, settings, wanted.sizes, log)
-    fits = {name: judged.fit(name) for name in judged.sizes}
-    costs, refused = bundle_costs(fits, sweeps, log)
+    first = judged.first_equals()
+    fits = {name: judged.fit(name) for name in dict.fromkeys(first.values())}
+    measured, unpacked = bundle_costs(fits, sweeps, log)
+    costs = {name: measured[same] for name, same in first.items() if same in measured}
+    refused = {name: unpacked[same] for name, same in first.items() if same in unpacked}
     over = {name: why for name, cost in costs.items() if (why := wanted.budget.over(cost))}
     why_not = judged.refused | refused | over
-    order = sorted(costs.keys() - over.keys(), key=lambda name: costs[name].order(wanted.budget))
+    within = [name for name in costs if name not in over]
+    order = sorted(within, key=lambda name: costs[name].order(wanted.budget))
     if not order:
         raise NothingFits(_nearest(costs, why_not, wanted.budget))
     chosen = judged.choose(order, wanted.accuracy, np.ones(len(judged.labels), bool))
-    return Selection(judged, wanted, order, costs, why_not, chosen, fits[chosen])
+    return Selection(judged, wanted, order, costs, why_not, chosen, fits[first[chosen]])
 
 
 def reduced(choice: Selection, change: Change, log: Log) -> tuple[Fit, BundleCost]:
