@@ -115,7 +115,7 @@ def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
 
 def test_an_unknown_material_that_comes_again_is_noticed(displaced_box: Classifier):
     """A sweep as near to an earlier unknown one as two of one material names it, the nearest if
-    there are several. A known sweep between them changes nothing; another stranger is like none."""
+    there are several. A known sweep between them changes nothing; another unknown one is like none."""
 
     def said(z1: float, z2: float, number: int) -> str:
         verdict = displaced_box(toy_bundle.sweep(z1, z2, number))
@@ -130,7 +130,7 @@ def test_an_unknown_material_that_comes_again_is_noticed(displaced_box: Classifi
 
 
 def test_only_the_latest_unknown_sweeps_are_kept(displaced_box: Classifier):
-    """After as many other strangers as are remembered, the first is forgotten."""
+    """After as many others as are remembered, the first is forgotten."""
     displaced_box(toy_bundle.sweep(-9, 0, 1))
     for number in range(KEPT):
         displaced_box(toy_bundle.sweep(0, -9 - 6 * number, number + 2))

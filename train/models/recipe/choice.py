@@ -21,6 +21,7 @@ from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
 from train.models.recipe import relations
+from train.models.recipe.bank import LEAST_FILTERS
 from train.models.recipe.sizes import ModelSize
 
 Array = NDArray[Any]
@@ -393,8 +394,8 @@ def with_fewer_filters(
     scores: HeldOutScores,
     chosen: ScoredPlan,
     filters: Array,
-    least: int,
     log: Log,
+    least: int = LEAST_FILTERS,
 ) -> ScoredPlan:
     """`chosen` with half of its filters, a quarter and so on, but at least `least`, as long as
     this `holds` on held-out parts. filters: the filter [F] of each feature, -1 if it has none."""

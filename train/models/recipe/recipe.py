@@ -294,7 +294,8 @@ def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
     """Step 3: the best candidate by held-out groups, with as few filters as suffice."""
     scores = setup.held_out_scores
     chosen = choice.choose(scores, heads, setup.part(2))
-    return HeadChoice(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
+    filters = fixed.columns.filters()
+    return HeadChoice(scores, choice.with_fewer_filters(scores, chosen, filters, setup.part(2)))
 
 
 def with_stages(
@@ -321,7 +322,7 @@ def with_stages(
         return None, judged
     if joined is full:
         filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
-        joined = fewer_filters(scores, full, filters, log)
+        joined = choice.with_fewer_filters(scores, full, filters, log)
     return stages, HeadChoice(scores, joined)
 
 
@@ -417,13 +418,6 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         bank.fitted(drawn, seen, rng).weights() | distribution.fitted(some, scale, rng).weights()
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def fewer_filters(
-    scores: HeldOutScores, chosen: ScoredPlan, filters: Array, log: Log
-) -> ScoredPlan:
-    """See choice.with_fewer_filters."""
-    return choice.with_fewer_filters(scores, chosen, filters, bank.LEAST_FILTERS, log)
 
 
 def _trained(setup: Setup) -> Trunk:
