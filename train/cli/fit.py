@@ -52,12 +52,6 @@ def register(add: Add) -> None:
     command.add_argument(
         "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
     )
-    _add_use(command)
-    _add_dial(command)
-
-
-def _add_use(command: argparse.ArgumentParser) -> None:
-    """Options for the use of the skin."""
     command.add_argument(
         "--varies",
         type=lambda text: tuple(text.split(",")),
@@ -66,6 +60,12 @@ def _add_use(command: argparse.ArgumentParser) -> None:
         help="groups that will have other values in service, e.g. force,speed; each is held out "
         "for the limits and for the printed accuracy (default: all that can be)",
     )
+    _add_use(command)
+    _add_dial(command)
+
+
+def _add_use(command: argparse.ArgumentParser) -> None:
+    """Options for the use of the skin."""
     command.add_argument(
         "--reattached",
         action="store_true",

@@ -115,7 +115,7 @@ def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
 
 def test_an_unknown_material_that_comes_again_is_noticed(displaced_box: Classifier):
     """A sweep as near to an earlier unknown one as two of one material names it, the nearest if
-    there are several. A known sweep between them changes nothing; another unknown one is like none."""
+    there are several. A known sweep between them changes nothing; a third material is like none."""
 
     def said(z1: float, z2: float, number: int) -> str:
         verdict = displaced_box(toy_bundle.sweep(z1, z2, number))
