@@ -253,6 +253,29 @@ class Verdict:
     measured_mm_s: float | None = None
     direction: str | None = None
 
+    @classmethod
+    def without_label(
+        cls, sweep: Sweep, status: Status, detail: str, now_ns: int, bundle: str
+    ) -> Verdict:
+        """The answer to a sweep that was not classified."""
+        return cls(
+            sweep=sweep.id,
+            time_ns=now_ns,
+            status=status,
+            label="",
+            probability=0.0,
+            margin=0.0,
+            scores=np.empty(0),
+            fused=0,
+            lost=sweep.lost,
+            latency_ns=now_ns - sweep.complete_ns,
+            bundle=bundle,
+            detail=detail,
+            share=sweep.share,
+            speed_mm_s=sweep.speed_mm_s,
+            force_n=sweep.force_n,
+        )
+
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
         None. arrays: include `scores` and `own`, as lists."""

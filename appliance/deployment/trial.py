@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.core.status import Status
 from appliance.deployment.state import STATE_FILE
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Trial(Observer):
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
         self._last_ns: int | None = None  # time of the last turn if it had frames
-        self._next_ns, self._over = 0, False
+        self._next_ns, self._over, self._stale = 0, False, False
         self._log = TroubleLog(
             f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
         )
@@ -73,8 +74,11 @@ class Trial(Observer):
         )
 
     def answered(self, verdict: Verdict) -> None:
-        """Count a sweep to which the bundle gave a label."""
+        """Count a sweep to which the bundle gave a label. A sweep on which it failed begins the
+        trial anew."""
         self._sweeps += bool(verdict.label)
+        if verdict.status is Status.FAILED:
+            self._sweeps, self._streamed_ns, self._stale = 0, 0, True
 
     def turn(self, health: Health) -> None:
         """Add the time in which the skin streamed. Record changes, or commit after enough sweeps
@@ -112,14 +116,14 @@ class Trial(Observer):
         settings = self._store.settings
         if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
             return health.sweeping or self._log.attempt(self._commit, ERRORS)
-        return health.streams == self._counted or self._log.attempt(
+        return (health.streams == self._counted and not self._stale) or self._log.attempt(
             lambda: self._note(health.streams), ERRORS
         )
 
     def _note(self, counts: bool) -> None:
         starts = self._starts - (not counts)
         self._store.note(self._sha, starts, counts, self._sweeps, self._streamed_ns / 1e9)
-        self._counted = counts
+        self._counted, self._stale = counts, False
 
     def _commit(self) -> None:
         done = self._store.commit(self._sha, 0.0)

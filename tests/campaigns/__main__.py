@@ -191,6 +191,12 @@ CAMPAIGNS = {
         _module("tests.cuts"),
         nice=True,
     ),
+    "exceptions": Campaign(
+        "throw an exception at every call of the loop and count the answers (10 minutes)",
+        _module("tests.campaigns.exceptions"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
     "objects": Campaign(
         "count wrong answers with NEW OBJECT forgotten, by several rules (docs/decisions/0020)",
         _module("tests.campaigns.objects"),
