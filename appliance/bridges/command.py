@@ -22,6 +22,7 @@ from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import log, to_stderr
 from appliance.core.menu import CommandParser
+from appliance.core.patience import patiently
 
 EVERY_S = 1.0
 
@@ -81,7 +82,7 @@ def run_modbus(args: argparse.Namespace) -> int:
         finally:
             source.close()
 
-    asyncio.run(serve())
+    patiently(lambda: asyncio.run(serve()), SystemClock())
     return 0
 
 
@@ -105,7 +106,7 @@ def run_tcp(args: argparse.Namespace) -> int:
         finally:
             bridge.close()
 
-    asyncio.run(serve())
+    patiently(lambda: asyncio.run(serve()), SystemClock())
     return 0
 
 

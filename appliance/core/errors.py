@@ -100,6 +100,12 @@ class PortError(ApplianceError):
     exit_code = EX_UNAVAILABLE
 
 
+class AddressError(ApplianceError):
+    """An address of this machine cannot be listened on: it is not there yet, or in use."""
+
+    exit_code = EX_UNAVAILABLE
+
+
 class FeedError(ApplianceError):
     """The feed of the running box cannot be read, or is silent."""
 

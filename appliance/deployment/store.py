@@ -35,7 +35,7 @@ from appliance.bundle.manifest import version
 from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
-from appliance.core.errors import ApplianceError, BundleError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
 from appliance.core.log import log
 from appliance.deployment import signature
 from appliance.deployment.enrolment_key import EnrolmentKey
@@ -319,6 +319,9 @@ class Store:
             if not why:
                 try:
                     return self._on_trial(sha)
+                except TemporaryError:
+                    self._uncount(sha)
+                    raise
                 except BundleError as e:
                     why = str(e)
             self._go_back(sha, why)
@@ -418,6 +421,11 @@ class Store:
                 state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts)
             )
         return ""
+
+    def _uncount(self, sha: str) -> None:
+        """Do not count this start, which says nothing about the bundle."""
+        with self._locked() as state:
+            self._write(state.changed(sha, starts=max(0, state.of(sha).starts - 1), boot=""))
 
     @property
     def _boot(self) -> str:

@@ -1,4 +1,4 @@
-"""Fuses the sweeps of one object, and finds where an object ends without NEW OBJECT: it decides whether the next sweep begins another object."""
+"""Fuses the sweeps of one object, and finds where an object ends without NEW OBJECT."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from heapq import merge
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from appliance.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
+from appliance.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
 from appliance.core.log import TroubleLog
 from appliance.watch.access import Access
 
@@ -131,7 +131,8 @@ class PageServer:
 
     kept: as for EventLog. now_ns: the clock of the events' time stamps. answers: functions for
     content on request, by the first part of its path. orders: takes the page's POSTs to /order;
-    None for a page that is read-only. Raises ConfigError if the address cannot be used.
+    None for a page that is read-only. Raises AddressError if the address is in use or not there
+    yet, ConfigError if it cannot be used at all.
     """
 
     def __init__(
@@ -164,7 +165,10 @@ class PageServer:
             )
         except (OSError, ValueError) as e:
             where = f"port {access.port} of {access.address}"
-            raise ConfigError(f"{where} cannot be used: {e}; name another with --web PORT") from e
+            passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
+            raise (AddressError if passing else ConfigError)(
+                f"{where} cannot be used: {e}; name another with --web PORT"
+            ) from e
         self.address = access.url(self._sockets[0].getsockname()[1])
 
     def __enter__(self) -> Self:

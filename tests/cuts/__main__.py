@@ -24,8 +24,10 @@ from tests.cuts.scene import ROOT, CrashPoint, CutScene, ScenePlay, stage
 
 SCENES: dict[str, Callable[[Path], CutScene]] = {
     "recording": lambda beside: recording.scene(),
+    "recording-thread": lambda beside: recording.scene(recording.THREAD),
     "palpate-record": lambda beside: recording.palpate(),
     "black-box": lambda beside: black_box.scene(),
+    "black-box-thread": lambda beside: black_box.scene("thread"),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
     "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
 }
