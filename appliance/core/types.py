@@ -34,6 +34,8 @@ MOST_AXES = 8
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
 enumerations of the skin are never adjacent."""
+EPOCHS = 1 << 22
+"""Enumerations are counted modulo this number, so that a frame number always fits int64."""
 SCHEMA = 3
 """Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
 sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""

@@ -20,7 +20,7 @@ from appliance.core.schema import typed
 FILE = "ended.json"
 AGAIN_NS = 60_000_000_000
 """A failure within this time after the last one lengthens the pause."""
-PAUSES_S = (0.0, 1.0, 2.0, 4.0, 8.0)
+PAUSES_S = (0.0, 1.0, 2.0, 4.0, 6.0)
 """Pauses after the first failure, the second and so on, beside RestartSec of the unit. The last is
 shorter than TimeoutStopSec."""
 MOST_BYTES = 1 << 14
